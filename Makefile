@@ -1,0 +1,91 @@
+# Everything runs in .venv, which is made when it is missing or stale. Needs make and Python 3.11 or later.
+#   make PYTHON=/path/to/python3.12 test     choose the interpreter
+#   make WORKERS=8 test                      choose the number of test processes
+#   make OUT=elsewhere reproduce             choose where the figures go
+
+SHELL    := /bin/sh
+VENV     := .venv
+BIN      := $(VENV)/bin
+OUT      ?= results
+WORKERS  ?= 2
+PYTHON   ?=
+ARGS     ?=
+
+# The problems are small: more BLAS threads slow them down and let the last digits vary from run to run.
+export OMP_NUM_THREADS        := 1
+export OPENBLAS_NUM_THREADS   := 1
+export MKL_NUM_THREADS        := 1
+export VECLIB_MAXIMUM_THREADS := 1
+# Figures are written to files, so no display is needed.
+export MPLBACKEND             := Agg
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+# A virtual environment copied along with its tree, or whose Python is gone, would run the wrong code: make it anew.
+SOUND := $(shell grep -qsF "$(CURDIR)/$(VENV)" $(VENV)/pyvenv.cfg && $(BIN)/python -c "" 2>/dev/null && echo yes)
+ifneq ($(SOUND),yes)
+ANEW := anew
+endif
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help reproduce benchmark test check format dev build clean anew
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+reproduce: $(VENV)/run.stamp ## run every paper script: figures, tables and summary.json into results/
+	$(BIN)/python scripts/reproduce.py --out "$(OUT)"
+
+benchmark: $(VENV)/run.stamp ## time model functions, builds and solves
+	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
+
+test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/check.stamp ## reformat the code and apply the safe lint fixes
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+dev: $(VENV)/dev.stamp ## install everything a developer needs and the pre-commit hooks
+	$(BIN)/pre-commit install
+
+build: $(VENV)/run.stamp ## build the wheel into dist/
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+clean: ## remove .venv, caches and build output (never results/)
+	rm -rf $(VENV) dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/made.stamp: $(ANEW)
+	@python="$(PYTHON)"; \
+	suitable='import sys; sys.exit(sys.version_info < (3, 11))'; \
+	if [ -n "$$python" ]; then \
+	  "$$python" -c "$$suitable" 2>/dev/null || { \
+	    echo "make: PYTHON=$$python is not a Python 3.11 or later that runs." >&2; exit 1; }; \
+	else \
+	  for candidate in python3 python3.13 python3.12 python3.11 python; do \
+	    if "$$candidate" -c "$$suitable" 2>/dev/null; then python="$$candidate"; break; fi; \
+	  done; \
+	  if [ -z "$$python" ]; then \
+	    echo "make: no Python 3.11 or later on the PATH; install one, or name it: make PYTHON=/path/to/python3.12 ..." >&2; \
+	    exit 1; \
+	  fi; \
+	fi; \
+	echo "making $(VENV) with $$("$$python" --version)"; \
+	"$$python" -m venv --clear $(VENV) || { \
+	  echo "make: $$python cannot make a virtual environment (on Debian and Ubuntu: apt install python3-venv)." >&2; \
+	  rm -rf $(VENV); exit 1; }
+	@touch $@
+
+$(VENV)/run.stamp: $(VENV)/made.stamp pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/%.stamp: $(VENV)/made.stamp pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable ".[$*]"
+	@touch $@

@@ -1,0 +1,315 @@
+"""Arms on an unactuated, freely floating base whose momentum is zero (Kim, Kim 2011).
+
+The base moves so that E1 x1' + E2 x2' = 0 (24), with x1' the base twist and x2' the joint rates; the tip
+moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25).
+
+The reaction is computed about the centre of mass of the machine, where linear and angular momentum decouple,
+and in the axes of the base, where nothing depends on the base's own pose: one rotational inertia, of size 3
+(1 when planar), is left to invert instead of E1 of size 6 (3). Instructions of the SX function of G, against
+the same through solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the
+paper's planar example 177 (337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240,
+292).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.kinematics import (
+    checked_vector,
+    frames_and_axes,
+    joint_vector,
+    point_jacobian,
+    robot_inertia,
+    subtree_moments,
+    tip_frame,
+)
+from models.kinematics import momentum_matrix as joint_momentum_matrix
+from models.linear import solve_spd
+from models.machine import TWIST_SIZE, jacobian_manipulability, require_joints
+from models.parts import Array, Link
+from models.robot import Robot, planar_chain
+from models.spatial import (
+    Expression,
+    Frame,
+    angular_velocity_from_quaternion,
+    force_transform,
+    motion_transform,
+    on_scalars,
+    quaternion_rate,
+    rotation,
+    rotation_from_quaternion,
+    skew,
+)
+
+BaseKind: TypeAlias = Literal["planar", "spatial"]
+
+PLANAR_ROWS = [2, 3, 4]
+"""Of a spatial vector, what a motion in the plane z = constant has:
+
+Rotation about z, translation along x and y.
+"""
+
+
+class _Reaction(NamedTuple):
+    """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each."""
+
+    base_angular: Expression
+    base_linear: Expression
+    tip_angular: Expression
+    tip_linear: Expression
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFloating:
+    """A robot whose root link floats freely, the total momentum being zero at all times.
+
+    The configuration of the base is the pose of the root link's frame in an inertial world: (x, y, angle) for
+    a planar base, (x, y, z, qw, qx, qy, qz) for a spatial one, with a unit quaternion. A base twist is
+    (angular velocity, velocity of the root frame's origin) in world axes, shape (6, 1); for a planar base
+    (angular velocity, vx, vy), shape (3, 1).
+
+    Attributes:
+        robot: The kinematic tree.
+        base: "planar" or "spatial".
+
+    Raises:
+        ModelError: Unknown kind of base, no moving joint, no mass, no rotational inertia, or a joint that
+            would move a planar machine out of its plane.
+    """
+
+    robot: Robot
+    base: BaseKind = "spatial"
+
+    def __post_init__(self) -> None:
+        if self.base not in ("planar", "spatial"):
+            raise ModelError(f"unknown kind of base {self.base!r}; use 'planar' or 'spatial'")
+        require_joints(self.robot)
+        if self.base == "planar":
+            _require_planar(self.robot)
+        _require_inertia(self.robot, self.twist_rows)
+
+    @property
+    def base_size(self) -> int:
+        """3 for a planar base, 7 for a spatial one."""
+        return 3 if self.base == "planar" else 7
+
+    @property
+    def joint_size(self) -> int:
+        """Number of moving joints."""
+        return self.robot.dof
+
+    @property
+    def twist_rows(self) -> list[int]:
+        """Which rows of a spatial twist or momentum the base has:
+
+        (rotation z, x, y) if planar, else all six.
+        """
+        return PLANAR_ROWS if self.base == "planar" else list(range(6))
+
+    def base_home(self) -> Array:
+        """Base at the world's origin, axes parallel. Shape (base_size,)."""
+        return np.zeros(3) if self.base == "planar" else np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+    def world_from_base(self, base: Expression) -> Frame:
+        """Placement of the root link's frame in the world."""
+        meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
+        base = checked_vector(base, self.base_size, "base", meaning)
+        if self.base == "planar":
+            return Frame(rotation((0, 0, 1), base[2]), ca.vertcat(base[0:2], type(base)(1, 1)))
+        return Frame(rotation_from_quaternion(base[3:7]), base[0:3])
+
+    @on_scalars
+    def tip_pose(self, base: Expression, q: Expression) -> Frame:
+        """Frame of the tip in the world."""
+        world_from_base = self.world_from_base(base)
+        tip = tip_frame(self.robot, frames_and_axes(self.robot, q)[0])
+        turned = ca.mtimes(world_from_base.rotation, tip.rotation)
+        return Frame(ca.densify(turned), ca.densify(world_from_base.point(tip.position)))
+
+    @on_scalars
+    def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
+        """Generalized Jacobian G (25). Shape (6, joint_size)."""
+        return self._tip_motion(base, self._reaction(q, None))
+
+    @on_scalars
+    def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
+        """Twist of the tip, G joint_rates (25). Shape (6, 1)."""
+        rates = joint_vector(self.robot, joint_rates, "joint_rates")
+        return self._tip_motion(base, self._reaction(q, rates))
+
+    @on_scalars
+    def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
+        """Twist of the base that keeps the momentum zero, -E1^-1 E2 joint_rates (24).
+
+        Shape (6, 1) or (3, 1).
+        """
+        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"))
+        turn = self.world_from_base(base).rotation
+        twist = ca.vertcat(ca.mtimes(turn, reaction.base_angular), ca.mtimes(turn, reaction.base_linear))
+        return ca.densify(twist)[self.twist_rows, :]
+
+    @on_scalars
+    def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
+        """Time derivative of the base configuration that keeps the momentum zero. Shape (base_size, 1)."""
+        twist = self.base_twist(base, q, joint_rates)
+        if self.base == "planar":
+            return ca.vertcat(twist[1:3], twist[0])
+        return ca.vertcat(twist[3:6], quaternion_rate(base[3:7], twist[0:3]))
+
+    @on_scalars
+    def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
+        """Twist of a base whose configuration changes with `base_rate`. Shape (6, 1), or (3, 1) if planar."""
+        rate = checked_vector(
+            base_rate, self.base_size, "base_rate", "the derivative of the base configuration"
+        )
+        base = checked_vector(base, self.base_size, "base", "the base configuration")
+        if self.base == "planar":
+            return ca.vertcat(rate[2], rate[0:2])
+        return ca.vertcat(angular_velocity_from_quaternion(base[3:7], rate[3:7]), rate[0:3])
+
+    @on_scalars
+    def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
+        """E1 and E2 of (24): momentum = E1 base_twist + E2 joint_rates.
+
+        Returns:
+            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's
+            origin, linear momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a
+            planar base.
+        """
+        to_world = force_transform(self.world_from_base(base))
+        turn = motion_transform((self.world_from_base(base).rotation, ca.DM(3, 1)))
+        locked = ca.mtimes([to_world, robot_inertia(self.robot, q), turn.T])
+        joints = ca.mtimes(to_world, joint_momentum_matrix(self.robot, q))
+        rows = self.twist_rows
+        return ca.densify(locked)[rows, rows], ca.densify(joints)[rows, :]
+
+    @on_scalars
+    def momentum(
+        self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression
+    ) -> Expression:
+        """Total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
+
+        Shape (6, 1) or (3, 1).
+        """
+        locked, joints = self.momentum_matrices(base, q)
+        twist = checked_vector(
+            base_twist, len(self.twist_rows), "base_twist", "angular velocity, then linear"
+        )
+        return ca.mtimes(locked, twist) + ca.mtimes(
+            joints, joint_vector(self.robot, joint_rates, "joint_rates")
+        )
+
+    @on_scalars
+    def momentum_residual(
+        self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
+    ) -> Expression:
+        """Momentum, as above, of a motion given by its configuration's derivatives:
+
+        Zero if the motion is possible.
+        """
+        return self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
+
+    @on_scalars
+    def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
+        """F1 and F2 of (25).
+
+        Tip twist = F1 base_twist + F2 joint_rates, base and joints taken as independent.
+
+        Returns:
+            F1 of shape (6, 6), (6, 3) for a planar base; F2 of shape (6, joint_size).
+        """
+        turn = self.world_from_base(base).rotation
+        frames, axes = frames_and_axes(self.robot, q)
+        tip = tip_frame(self.robot, frames).position
+        tip_from_base: Expression = ca.mtimes(turn, tip)
+        lever = motion_transform((ca.DM.eye(3), -tip_from_base))
+        joints = point_jacobian(self.robot, axes, str(self.robot.tip), tip)
+        both = motion_transform((turn, ca.DM(3, 1)))
+        return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
+
+    def manipulability(
+        self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)
+    ) -> Expression:
+        """Of the generalized Jacobian, as jacobian_manipulability. Shape (1, 1)."""
+        return jacobian_manipulability(self.tip_jacobian(base, q), rows)
+
+    def _tip_motion(self, base: Expression, reaction: _Reaction) -> Expression:
+        turn = self.world_from_base(base).rotation
+        angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
+        return ca.densify(ca.vertcat(angular, linear))
+
+    def _reaction(self, q: Expression, joint_rates: Expression | None) -> _Reaction:
+        """Reaction to unit rate of each joint (n columns), or to the given joint rates (one column)."""
+        frames, axes = frames_and_axes(self.robot, q)
+        moments = subtree_moments(self.robot, frames)
+        columns = [moments[joint.child].momentum(*axes[joint.name]) for joint in self.robot.moving_joints]
+        momentum: Expression = ca.horzcat(*(ca.vertcat(*column) for column in columns))
+        tip = tip_frame(self.robot, frames).position
+        joints = point_jacobian(self.robot, axes, str(self.robot.tip), tip)
+        if joint_rates is not None:
+            momentum, joints = ca.mtimes(momentum, joint_rates), ca.mtimes(joints, joint_rates)
+
+        total = moments[self.robot.root]
+        center = total.first / total.mass
+        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
+        inertia = total.second - total.mass * arm  # about the centre of mass
+        about_center = momentum[0:3, :] - ca.mtimes(skew(center), momentum[3:6, :])
+        if self.base == "planar":
+            turning = ca.vertcat(ca.DM(2, about_center.shape[1]), -about_center[2, :] / inertia[2, 2])
+        else:
+            turning = -solve_spd(inertia, about_center)
+        # The centre of mass stands still: P = 0 fixes the velocity of the base's origin.
+        linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
+        tip_linear = ca.mtimes(skew(center - tip), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
+        return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
+
+
+def paper_example() -> FreeFloating:
+    """The planar three-joint machine of Kim, Kim 2011, section 5.
+
+    Printed: base 100 kg and 66.67 kg m^2 (a plate of 2 m x 2 m), links of 2 kg and 0.7083 kg m^2 (plates of
+    2 m x 0.5 m). Not printed, identified from the pattern of Table 1 and therefore assumptions: links 2 m
+    long, arm mounted at (1, 0) m of the base, centres of mass at mid-link. The paper starts it from base pose
+    0 and joints at 45, 60, -60 deg, with the tip moving at (-1, -1) m/s and its orientation free.
+    """
+    base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
+    robot = planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
+    return FreeFloating(robot, base="planar")
+
+
+def _require_planar(robot: Robot) -> None:
+    _, axes = frames_and_axes(robot, np.zeros(robot.dof))
+    for joint in robot.moving_joints:
+        angular, linear = (np.array(part).ravel() for part in axes[joint.name])
+        if joint.kind == "prismatic" and abs(linear[2]) > 1e-9:
+            raise ModelError(
+                f"joint {joint.name!r} moves along {linear.tolist()} of the base link, out of the plane of "
+                "a planar base; use base='spatial'"
+            )
+        if joint.kind != "prismatic" and np.hypot(angular[0], angular[1]) > 1e-9:
+            raise ModelError(
+                f"joint {joint.name!r} turns about {angular.tolist()} of the base link, not about z as a "
+                "planar base needs; use base='spatial'"
+            )
+
+
+def _require_inertia(robot: Robot, rows: list[int]) -> None:
+    if robot.total_mass == 0:
+        raise ModelError("the robot has no mass: a free-floating base needs links with mass")
+    # A stretched chain of point masses can lack inertia about one axis in one configuration: try others too.
+    spread = np.linspace(0.3, 1.1, robot.dof)
+    for q in (np.zeros(robot.dof), spread, -2 * spread[::-1]):
+        inertia = np.array(ca.DM(robot_inertia(robot, q)))[np.ix_(rows, rows)]
+        if np.linalg.cond(inertia) < 1e12:
+            return
+    raise ModelError(
+        f"the links {[link.name for link in robot.links]} have no rotational inertia about some axis, "
+        "so that the momentum does not fix the motion of the base; give the base link an inertia"
+    )

@@ -1,0 +1,248 @@
+"""Where the links of a robot are and how they move: frames, Jacobians, centre of mass, momentum.
+
+Every function takes the joint positions q, shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM
+or numbers, and the placement of the root link in the world, `world_from_base` = (rotation, position), the
+world's own frame if None. Velocities and momenta are those of the joints alone: the base stands still unless
+said otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array
+from models.robot import Robot
+from models.spatial import Expression, Frame, cross, expression, rotation, skew
+
+Placement = tuple[Expression, Expression]
+
+
+class _Turn(NamedTuple):
+    before: Expression  # rotation of the link before the first of the parallel axes
+    axis: Array
+    angle: Expression
+
+
+class MassMoments(NamedTuple):
+    """Mass, first and second moments of a set of bodies about the world's origin.
+
+    Their spatial inertia in ten numbers.
+
+    Attributes:
+        mass: kg.
+        first: Sum of m c. Shape (3, 1), kg m.
+        second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
+    """
+
+    mass: float
+    first: Expression
+    second: Expression
+
+    def plus(self, other: MassMoments) -> MassMoments:
+        """Moments of both sets of bodies together."""
+        return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
+
+    def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
+        """(Moment of momentum about the origin, linear momentum) when all bodies share one motion vector."""
+        turned = ca.mtimes(ca.tril2symm(self.second), angular)
+        return turned + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
+
+    def spatial_inertia(self) -> Expression:
+        """Spatial inertia about the origin. Shape (6, 6)."""
+        arm = skew(self.first)
+        return ca.vertcat(
+            ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3))
+        )
+
+
+def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
+    """`q` as a column; ModelError unless it has one entry for each moving joint."""
+    return checked_vector(q, robot.dof, what, f"one entry for each of the joints {list(robot.joint_names)}")
+
+
+def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Expression:
+    """`value` as a column of `size`; ModelError naming `what` and `meaning` otherwise."""
+    value = expression(value)
+    if value.shape != (size, 1) and not (size == 0 and value.numel() == 0):
+        raise ModelError(f"{what} has shape {tuple(value.shape)}, expected ({size}, 1): {meaning}")
+    return value
+
+
+def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
+    """Frames of all links in the world, by link name, root first."""
+    return frames_and_axes(robot, q, world_from_base)[0]
+
+
+def tip_pose(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Frame:
+    """Frame of the tip in the world."""
+    return tip_frame(robot, link_frames(robot, q, world_from_base))
+
+
+def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
+    """Frame of the tip in the world, given the frames of the links."""
+    link = frames[str(robot.tip)]
+    return Frame(ca.mtimes(link.rotation, _constant(robot.tip_rotation)), link.point(robot.tip_translation))
+
+
+def centers_of_mass(
+    robot: Robot, q: Expression, world_from_base: Placement | None = None
+) -> dict[str, Expression]:
+    """Centre of mass of each link in the world, by link name. Shape (3, 1) each, m."""
+    frames = link_frames(robot, q, world_from_base)
+    return {link.name: frames[link.name].point(link.center_of_mass) for link in robot.links}
+
+
+def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Centre of mass of the whole robot in the world. Shape (3, 1), m.
+
+    Raises:
+        ModelError: The robot has no mass.
+    """
+    if robot.total_mass == 0:
+        raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
+    frames = link_frames(robot, q, world_from_base)
+    moment = sum(
+        link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass
+    )
+    return ca.densify(moment / robot.total_mass)
+
+
+def frame_jacobian(
+    robot: Robot,
+    q: Expression,
+    link: str,
+    point: Expression = (0.0, 0.0, 0.0),
+    world_from_base: Placement | None = None,
+) -> Expression:
+    """Geometric Jacobian of a point fixed in a link.
+
+    Joint rates to (angular velocity, velocity of the point), world axes.
+
+    Args:
+        link: Name of the link.
+        point: In the link's frame. Shape (3,), m.
+
+    Returns:
+        Shape (6, dof). Columns of joints that do not carry the link are zero.
+
+    Raises:
+        ModelError: Unknown link, q of a wrong size.
+    """
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    robot.link(link)
+    return ca.densify(point_jacobian(robot, axes, link, frames[link].point(point)))
+
+
+def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Geometric Jacobian of the tip: joint rates to (angular, linear) velocity of the tip frame, world axes.
+
+    Shape (6, dof).
+    """
+    return frame_jacobian(robot, q, str(robot.tip), robot.tip_translation, world_from_base)
+
+
+def center_of_mass_jacobian(
+    robot: Robot, q: Expression, world_from_base: Placement | None = None
+) -> Expression:
+    """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
+    if robot.total_mass == 0:
+        raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
+    return momentum_matrix(robot, q, world_from_base)[3:6, :] / robot.total_mass
+
+
+def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Joint rates to (moment of momentum about the world's origin, linear momentum), the base standing still.
+
+    Shape (6, dof).
+    """
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    moments = subtree_moments(robot, frames)
+    columns = [ca.vertcat(*moments[joint.child].momentum(*axes[joint.name])) for joint in robot.moving_joints]
+    return ca.densify(ca.horzcat(ca.DM(6, 0), *columns))
+
+
+def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Spatial inertia of the robot with locked joints about the world's origin, world axes. Shape (6, 6)."""
+    frames = link_frames(robot, q, world_from_base)
+    return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
+
+
+def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
+    """Moments of each link together with all links it carries, by link name, about the world's origin."""
+    moments: dict[str, MassMoments] = {}
+    for link in robot.links:
+        turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
+        inertia: Expression = ca.mtimes(turn, _constant(link.inertia))
+        second = [[ca.mtimes(inertia[i, :], turn[j, :].T) for j in range(i + 1)] for i in range(3)]
+        own = ca.vertcat(*(ca.horzcat(*row, ca.DM(1, 2 - i)) for i, row in enumerate(second)))
+        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
+        moments[link.name] = MassMoments(link.mass, link.mass * center, own + link.mass * arm)
+    for joint in reversed(robot.joints):
+        moments[joint.parent] = moments[joint.parent].plus(moments[joint.child])
+    return moments
+
+
+def point_jacobian(
+    robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
+) -> Expression:
+    """As frame_jacobian, from the axes of frames_and_axes and a point in the world. Shape (6, dof)."""
+    carriers = {joint.name for joint in robot.path_to(link)}
+    columns = [
+        ca.vertcat(axes[name][0], axes[name][1] + cross(axes[name][0], point))
+        if name in carriers
+        else ca.DM(6, 1)
+        for name in robot.joint_names
+    ]
+    return ca.horzcat(ca.DM(6, 0), *columns)
+
+
+def frames_and_axes(
+    robot: Robot, q: Expression, world_from_base: Placement | None = None
+) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
+    """Frames of the links, and motion vectors of the moving joints, both by name.
+
+    A motion vector is (angular velocity, velocity at the world's origin) per unit rate, world axes.
+    """
+    q = joint_vector(robot, q)
+    base = (
+        Frame(ca.DM.eye(3), ca.DM(3, 1))
+        if world_from_base is None
+        else Frame(*map(expression, world_from_base))
+    )
+    frames: dict[str, Frame] = {robot.root: base}
+    axes: dict[str, tuple[Expression, Expression]] = {}
+    column = 0
+    turns: dict[str, _Turn] = {}
+    for joint in robot.joints:
+        parent, turn = frames[joint.parent], turns.get(joint.parent)
+        frame = Frame(ca.mtimes(parent.rotation, _constant(joint.rotation)), parent.point(joint.translation))
+        if not np.array_equal(joint.rotation, np.eye(3)):
+            turn = None
+        if joint.kind == "prismatic":
+            axis = ca.mtimes(frame.rotation, _constant(joint.axis))
+            axes[joint.name] = (ca.DM(3, 1), axis)
+            frame = Frame(frame.rotation, frame.position + q[column] * axis)
+        elif joint.moves:
+            # Parallel axes in a row: the angles add up, which is cheaper than a product of rotations.
+            if turn is not None and np.array_equal(turn.axis, joint.axis):
+                turn = turn._replace(angle=turn.angle + q[column])
+            else:
+                turn = _Turn(frame.rotation, joint.axis, q[column])
+            axis = ca.mtimes(turn.before, _constant(joint.axis))
+            axes[joint.name] = (axis, cross(frame.position, axis))
+            turned = ca.mtimes(turn.before, rotation(_constant(joint.axis), turn.angle))
+            frame = Frame(turned, frame.position)
+        column += joint.moves
+        frames[joint.child] = frame
+        if turn is not None:
+            turns[joint.child] = turn
+    return frames, axes
+
+
+def _constant(array: Array) -> Expression:
+    # What rounding leaves of cos(pi / 2) would hide the structure of the robot: drop it.
+    return ca.sparsify(ca.DM(array), 1e-15 * float(np.abs(array).max(initial=0.0)))

@@ -1,0 +1,177 @@
+"""Links and joints, the parts of a robot, checked when they are made.
+
+Attributes that are arrays are given as anything numpy reads and stored as read-only float arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+
+Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
+Array: TypeAlias = NDArray[np.float64]
+ArrayInput: TypeAlias = Any
+
+KINDS = ("fixed", "revolute", "continuous", "prismatic")
+INERTIA_TOLERANCE = 1e-6
+"""Relative slack of the inertia checks: inertias printed to six digits still pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A rigid body.
+
+    Attributes:
+        name: Unique within the robot.
+        mass: kg, not negative.
+        center_of_mass: In the link frame. Shape (3,), m.
+        inertia: About the centre of mass, in link axes. Shape (3, 3), kg m^2.
+
+    Raises:
+        ModelError: Negative or non-finite mass, wrong sizes, an inertia that no mass distribution has (not
+            symmetric, not positive semidefinite, a principal moment above the sum of the two others).
+    """
+
+    name: str
+    mass: float = 0.0
+    center_of_mass: ArrayInput = (0.0, 0.0, 0.0)
+    inertia: ArrayInput = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def __post_init__(self) -> None:
+        owner = f"link {self.name!r}"
+        mass = checked_array(self.mass, (), owner, "mass").item()
+        if mass < 0:
+            raise ModelError(f"{owner}: mass {mass} kg is negative")
+        inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
+        _check_inertia(inertia, owner)
+        object.__setattr__(self, "mass", mass)
+        object.__setattr__(
+            self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass")
+        )
+        object.__setattr__(self, "inertia", frozenchecked_array((inertia + inertia.T) / 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A connection of a child link to a parent link.
+
+    The joint frame stands in the parent link frame at `translation`, `rotation` (URDF convention). The child
+    link frame is the joint frame turned about `axis` (revolute, continuous) or shifted along it (prismatic).
+
+    Attributes:
+        name: Unique within the robot.
+        kind: "fixed", "revolute", "continuous" (a revolute joint without position limits) or "prismatic".
+        parent: Name of the parent link.
+        child: Name of the child link.
+        translation: Joint frame's origin in the parent link frame. Shape (3,), m.
+        rotation: Joint frame's axes, as columns, in the parent link frame. Shape (3, 3).
+        axis: In the joint frame; stored with unit length. Shape (3,).
+        lower: Least position, rad or m.
+        upper: Greatest position, rad or m.
+        velocity: Greatest speed, rad/s or m/s.
+        effort: Greatest torque or force, N m or N.
+
+    Raises:
+        ModelError: Unknown kind, wrong sizes, zero axis, a rotation that is none, lower > upper, a negative
+            limit, position limits of a continuous joint.
+    """
+
+    name: str
+    kind: Kind
+    parent: str
+    child: str
+    translation: ArrayInput = (0.0, 0.0, 0.0)
+    rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    axis: ArrayInput = (0.0, 0.0, 1.0)
+    lower: float = -np.inf
+    upper: float = np.inf
+    velocity: float = np.inf
+    effort: float = np.inf
+
+    def __post_init__(self) -> None:
+        owner = f"joint {self.name!r}"
+        if self.kind not in KINDS:
+            raise ModelError(f"{owner}: unknown kind {self.kind!r}; use one of {', '.join(KINDS)}")
+        axis = checked_array(self.axis, (3,), owner, "axis")
+        length = float(np.linalg.norm(axis))
+        if not length > 0:
+            raise ModelError(f"{owner}: axis {axis.tolist()} has no direction")
+        object.__setattr__(self, "axis", frozenchecked_array(axis / length))
+        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
+        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+        for what in ("lower", "upper", "velocity", "effort"):
+            limit = checked_array(getattr(self, what), (), owner, what, finite=False).item()
+            object.__setattr__(self, what, limit)
+        if self.lower > self.upper:
+            raise ModelError(f"{owner}: lower limit {self.lower} is above upper limit {self.upper}")
+        if self.lower == np.inf or self.upper == -np.inf:
+            raise ModelError(f"{owner}: limits {self.lower} .. {self.upper} leave no position")
+        for what in ("velocity", "effort"):
+            if getattr(self, what) < 0:
+                raise ModelError(f"{owner}: {what} limit {getattr(self, what)} is negative")
+        if self.kind == "continuous" and np.isfinite([self.lower, self.upper]).any():
+            raise ModelError(
+                f"{owner}: a continuous joint has no position limits, but {self.lower} .. {self.upper} is "
+                "given; make it revolute or leave them out"
+            )
+
+    @property
+    def moves(self) -> bool:
+        """Whether the joint has a degree of freedom."""
+        return self.kind != "fixed"
+
+
+def frozenchecked_array(array: Array) -> Array:
+    array.setflags(write=False)
+    return array
+
+
+def checked_array(
+    value: ArrayInput, shape: tuple[int, ...], owner: str, what: str, finite: bool = True
+) -> Array:
+    """Read-only copy of `value` as floats.
+
+    ModelError naming `owner` and `what` for a wrong shape, nan, or inf.
+    """
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{owner}: {what} {value!r} is not numeric") from error
+    if array.shape != shape:
+        raise ModelError(f"{owner}: {what} has shape {array.shape}, expected {shape}")
+    if np.isnan(array).any() or (finite and not np.isfinite(array).all()):
+        raise ModelError(f"{owner}: {what} {array.tolist()} is not finite")
+    return frozenchecked_array(array)
+
+
+def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
+    """Read-only copy of a rotation matrix; ModelError naming `owner` and `what` when it is none."""
+    matrix = checked_array(value, (3, 3), owner, what)
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if error > 1e-6 or np.linalg.det(matrix) < 0:
+        raise ModelError(
+            f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
+        )
+    if error > 1e-12:  # printed to few digits: take the nearest rotation
+        left, _, right = np.linalg.svd(matrix)
+        matrix = frozenchecked_array(left @ right)
+    return matrix
+
+
+def _check_inertia(inertia: Array, owner: str) -> None:
+    slack = INERTIA_TOLERANCE * float(np.abs(inertia).max())
+    if np.abs(inertia - inertia.T).max() > slack:
+        raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric")
+    least, middle, greatest = np.linalg.eigvalsh((inertia + inertia.T) / 2)
+    if least < -slack:
+        raise ModelError(f"{owner}: inertia has the negative principal moment {least:g} kg m^2")
+    if greatest > least + middle + slack:
+        raise ModelError(
+            f"{owner}: principal moments {least:g}, {middle:g}, {greatest:g} kg m^2 violate the triangle "
+            "inequality: none may exceed the sum of the two others"
+        )

@@ -1,0 +1,195 @@
+"""A robot as a kinematic tree of links and joints, checked when it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array, ArrayInput, Joint, Link, checked_array, checked_rotation
+from models.tree import find_root, require_unique, tree_order
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A kinematic tree of links, with one frame of interest, the tip.
+
+    Attributes:
+        links: Every link, in the order given.
+        joints: Every joint, parents first; the order given is kept wherever it already is such an order.
+        tip: Name of the link that carries the tip; the only leaf when not given.
+        tip_translation: Tip frame's origin in the tip link's frame. Shape (3,), m.
+        tip_rotation: Tip frame's axes, as columns, in the tip link's frame. Shape (3, 3).
+        root: Name of the link without a parent, the base.
+
+    Raises:
+        ModelError: Duplicate or unknown names, a loop, several roots, several leaves and no tip, wrong sizes.
+    """
+
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...] = ()
+    tip: str | None = None
+    tip_translation: ArrayInput = (0.0, 0.0, 0.0)
+    tip_rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    root: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        links, joints = tuple(self.links), tuple(self.joints)
+        require_unique((link.name for link in links), "link")
+        require_unique((joint.name for joint in joints), "joint")
+        edges = [(joint.name, joint.parent, joint.child) for joint in joints]
+        root = find_root([link.name for link in links], edges)
+        object.__setattr__(self, "root", root)
+        object.__setattr__(self, "links", links)
+        object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
+        object.__setattr__(self, "tip", self._find_tip())
+        owner = "robot"
+        object.__setattr__(
+            self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation")
+        )
+        object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
+
+    def _find_tip(self) -> str:
+        names = [link.name for link in self.links]
+        if self.tip is not None:
+            if self.tip not in names:
+                raise ModelError(f"tip link {self.tip!r} does not exist; the links are {sorted(names)}")
+            return self.tip
+        parents = {joint.parent for joint in self.joints}
+        leaves = [name for name in names if name not in parents]
+        if len(leaves) > 1:
+            raise ModelError(
+                f"the tree has the leaves {leaves}; say which carries the tip: Robot(..., tip=name)"
+            )
+        return leaves[0]
+
+    @cached_property
+    def moving_joints(self) -> tuple[Joint, ...]:
+        """Joints with a degree of freedom, in tree order: the order of every joint vector."""
+        return tuple(joint for joint in self.joints if joint.moves)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the moving joints, in tree order."""
+        return tuple(joint.name for joint in self.moving_joints)
+
+    @property
+    def dof(self) -> int:
+        """Number of moving joints."""
+        return len(self.moving_joints)
+
+    @property
+    def total_mass(self) -> float:
+        """kg."""
+        return float(sum(link.mass for link in self.links))
+
+    @property
+    def lower(self) -> Array:
+        """Least positions of the moving joints. Shape (dof,), rad or m."""
+        return np.array([joint.lower for joint in self.moving_joints], dtype=float)
+
+    @property
+    def upper(self) -> Array:
+        """Greatest positions of the moving joints. Shape (dof,), rad or m."""
+        return np.array([joint.upper for joint in self.moving_joints], dtype=float)
+
+    @property
+    def velocity(self) -> Array:
+        """Greatest speeds of the moving joints. Shape (dof,), rad/s or m/s."""
+        return np.array([joint.velocity for joint in self.moving_joints], dtype=float)
+
+    @property
+    def effort(self) -> Array:
+        """Greatest torques or forces of the moving joints. Shape (dof,), N m or N."""
+        return np.array([joint.effort for joint in self.moving_joints], dtype=float)
+
+    def link(self, name: str) -> Link:
+        """The link of that name; ModelError when there is none."""
+        for link in self.links:
+            if link.name == name:
+                return link
+        raise ModelError(f"link {name!r} does not exist; the links are {[link.name for link in self.links]}")
+
+    def path_to(self, name: str) -> tuple[Joint, ...]:
+        """Joints from the root to a link, root first; ModelError when there is no such link."""
+        self.link(name)
+        joint_above = {joint.child: joint for joint in self.joints}
+        path: list[Joint] = []
+        while name != self.root:
+            path.append(joint_above[name])
+            name = path[-1].parent
+        return tuple(reversed(path))
+
+    def __str__(self) -> str:
+        head = (
+            f"robot of {len(self.links)} links, {self.dof} degrees of freedom, "
+            f"{self.total_mass:g} kg, tip on {self.tip}"
+        )
+        return "\n".join([head, self._describe(self.root), *self._branches(self.root, "")])
+
+    def _describe(self, name: str) -> str:
+        return f"{name}  {self.link(name).mass:g} kg"
+
+    def _branches(self, name: str, indent: str) -> list[str]:
+        lines = []
+        below = [joint for joint in self.joints if joint.parent == name]
+        for joint in below:
+            last = joint is below[-1]
+            text = f"{joint.name} ({joint.kind}"
+            if joint.moves:
+                unit = "m" if joint.kind == "prismatic" else "rad"
+                text += f", {joint.lower:g} .. {joint.upper:g} {unit}, {joint.velocity:g} {unit}/s"
+            lines.append(f"{indent}{'└─' if last else '├─'} {text}) -> {self._describe(joint.child)}")
+            lines += self._branches(joint.child, indent + ("   " if last else "│  "))
+        return lines
+
+
+def planar_chain(
+    lengths: ArrayInput,
+    masses: ArrayInput,
+    inertias: ArrayInput | None = None,
+    *,
+    mount: ArrayInput = (0.0, 0.0),
+    base: Link | None = None,
+) -> Robot:
+    """Arm of revolute joints about z whose links lie along x at zero joint angles.
+
+    Centres of mass at mid-link.
+
+    Args:
+        lengths: Link lengths. Shape (n,), m.
+        masses: Link masses. Shape (n,), kg.
+        inertias: Moments about z through the centres of mass. Shape (n,), kg m^2; slender rods, m l^2 / 12,
+            if None.
+        mount: First joint in the base link frame (x, y). Shape (2,), m.
+        base: Root link; a massless "base" if None.
+
+    Returns:
+        Robot with links "link1".. on joints "joint1".. and the tip at the end of the last link.
+
+    Raises:
+        ModelError: Sizes that differ, no link, a mass or an inertia that is impossible.
+    """
+    lengths = np.atleast_1d(np.asarray(lengths, dtype=float))
+    count = lengths.shape[0]
+    if lengths.ndim != 1 or count == 0:
+        raise ModelError(
+            f"planar chain: lengths must be a vector of at least one length, not of shape {lengths.shape}"
+        )
+    lengths = checked_array(lengths, (count,), "planar chain", "lengths")
+    masses = checked_array(masses, (count,), "planar chain", "masses")
+    moments = checked_array(
+        masses * lengths**2 / 12 if inertias is None else inertias, (count,), "planar chain", "inertias"
+    )
+    mount = checked_array(mount, (2,), "planar chain", "mount")
+    root = base if base is not None else Link("base")
+    links, joints = [root], []
+    for i in range(count):
+        # Only the moment about z matters to a planar machine; the others are those of a lamina.
+        inertia = np.diag([moments[i] / 2, moments[i] / 2, moments[i]])
+        links.append(Link(f"link{i + 1}", masses[i], (lengths[i] / 2, 0.0, 0.0), inertia))
+        place = (*mount, 0.0) if i == 0 else (lengths[i - 1], 0.0, 0.0)
+        joints.append(Joint(f"joint{i + 1}", "revolute", links[i].name, links[i + 1].name, translation=place))
+    return Robot(tuple(links), tuple(joints), tip_translation=(lengths[-1], 0.0, 0.0))

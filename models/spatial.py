@@ -1,0 +1,223 @@
+"""Spatial vector algebra of rigid bodies (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapter 2).
+
+Spatial vectors are (angular, linear): a motion vector is (angular velocity, velocity of the point at the
+frame's origin), a force vector is (moment about the frame's origin, force), a momentum is (moment of momentum
+about the origin, linear momentum). Every function takes SX, MX, DM, numpy arrays or nested lists, and keeps
+structural zeros, so that a planar machine written in three dimensions costs no more than one written in two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar, cast
+
+import casadi as ca
+import numpy as np
+
+Expression = Any
+"""A casadi SX, MX or DM, or whatever numpy reads as an array of floats."""
+
+_Callable = TypeVar("_Callable", bound=Callable[..., Any])
+
+
+class Frame(NamedTuple):
+    """Placement of a frame B in a frame A: x_in_a = rotation x_in_b + position.
+
+    Attributes:
+        rotation: Axes of B as columns, in A. Shape (3, 3).
+        position: Origin of B in A. Shape (3, 1), m.
+    """
+
+    rotation: Expression
+    position: Expression
+
+    def point(self, position: Expression) -> Expression:
+        """Coordinates in A of a point given in B. Shape (3, 1), m."""
+        return self.position + ca.mtimes(self.rotation, expression(position))
+
+
+def expression(value: Expression) -> Expression:
+    """`value` itself if it is a casadi matrix, else a DM without its exact zeros; vectors become columns."""
+    if isinstance(value, ca.SX | ca.MX | ca.DM):
+        return value
+    return ca.sparsify(ca.DM(np.asarray(value, dtype=float)))
+
+
+def on_scalars(function: _Callable) -> _Callable:
+    """Let a function written element by element take MX arguments through one call of its SX form.
+
+    Element-wise MX graphs are slow to build and to run. When an argument is MX, the function is evaluated on
+    SX symbols of the same sparsity and the result is called; other arguments pass through untouched.
+    """
+
+    @wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        given = [value for value in (*args, *kwargs.values()) if isinstance(value, ca.MX)]
+        if not given:
+            return function(*args, **kwargs)
+        symbols = [ca.SX.sym(f"x{i}", value.sparsity()) for i, value in enumerate(given)]
+        supply = iter(symbols)
+        scalar_args = [next(supply) if isinstance(value, ca.MX) else value for value in args]
+        scalar_kwargs = {k: next(supply) if isinstance(v, ca.MX) else v for k, v in kwargs.items()}
+        result = function(*scalar_args, **scalar_kwargs)
+        parts = result if isinstance(result, tuple) else (result,)
+        called = ca.Function(function.__name__.strip("_"), symbols, list(parts)).call(given)
+        if not isinstance(result, tuple):
+            return called[0]
+        return Frame(*called) if isinstance(result, Frame) else tuple(called)
+
+    return cast(_Callable, wrapper)
+
+
+def skew(vector: Expression) -> Expression:
+    """Matrix [a x] with [a x] b = a x b. Shape (3, 3)."""
+    a = expression(vector)
+    zero = type(a)(1, 1)
+    return ca.vertcat(
+        ca.horzcat(zero, -a[2], a[1]), ca.horzcat(a[2], zero, -a[0]), ca.horzcat(-a[1], a[0], zero)
+    )
+
+
+def cross(a: Expression, b: Expression) -> Expression:
+    """Vector product, which unlike casadi's own keeps structural zeros. Shape (3, 1)."""
+    a, b = expression(a), expression(b)
+    return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def rotation(axis: Expression, angle: Expression) -> Expression:
+    """Rotation by `angle` (rad) about the unit vector `axis`. Shape (3, 3).
+
+    Rodrigues' formula as a a' + cos (1 - a a') + sin [a x]: about a coordinate axis the zeros and the one are
+    exact.
+    """
+    a, angle = expression(axis), expression(angle)
+    along = ca.mtimes(a, a.T)
+    across = ca.DM.eye(3) - along
+    if isinstance(across, ca.DM):
+        along, across = ca.sparsify(along), ca.sparsify(across)
+    return along + ca.cos(angle) * across + ca.sin(angle) * skew(a)
+
+
+def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> Expression:
+    """Rotation about the fixed x, then y, then z axis (URDF): Rz(yaw) Ry(pitch) Rx(roll). Angles in rad.
+
+    Shape (3, 3).
+    """
+    return ca.mtimes(
+        [rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)],
+    )
+
+
+def quaternion_about(axis: Expression, angle: Expression) -> Expression:
+    """Unit quaternion [w, x, y, z] of the rotation by `angle` (rad) about the unit vector `axis`.
+
+    Shape (4, 1).
+    """
+    half = expression(angle) / 2
+    return ca.vertcat(ca.cos(half), ca.sin(half) * expression(axis))
+
+
+def quaternion_product(a: Expression, b: Expression) -> Expression:
+    """Hamilton product a b of quaternions [w, x, y, z]: first turn by b, then by a. Shape (4, 1)."""
+    a, b = expression(a), expression(b)
+    scalar = a[0] * b[0] - ca.dot(a[1:4], b[1:4])
+    return ca.vertcat(scalar, a[0] * b[1:4] + b[0] * a[1:4] + cross(a[1:4], b[1:4]))
+
+
+def quaternion_conjugate(quaternion: Expression) -> Expression:
+    """Conjugate [w, -x, -y, -z]: the inverse rotation of a unit quaternion. Shape (4, 1)."""
+    quaternion = expression(quaternion)
+    return ca.vertcat(quaternion[0], -quaternion[1:4])
+
+
+def rotation_from_quaternion(quaternion: Expression) -> Expression:
+    """Rotation matrix of a quaternion [w, x, y, z]. Shape (3, 3).
+
+    Divided by the squared norm, so that any non-zero quaternion gives a rotation: a state that has drifted
+    off the unit sphere by an integrator's error turns no shape into another.
+    """
+    q = expression(quaternion)
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = 2 / (w * w + x * x + y * y + z * z)
+    sx, sy, sz = s * x, s * y, s * z
+    wx, wy, wz = w * sx, w * sy, w * sz
+    xx, xy, xz, yy, yz, zz = x * sx, x * sy, x * sz, y * sy, y * sz, z * sz
+    return ca.vertcat(
+        ca.horzcat(1 - (yy + zz), xy - wz, xz + wy),
+        ca.horzcat(xy + wz, 1 - (xx + zz), yz - wx),
+        ca.horzcat(xz - wy, yz + wx, 1 - (xx + yy)),
+    )
+
+
+def quaternion_rate(quaternion: Expression, angular_velocity: Expression) -> Expression:
+    """Time derivative of the quaternion of a body that turns with `angular_velocity` (world axes, rad/s).
+
+    Shape (4, 1).
+
+    (0, omega) q / 2, which is orthogonal to q: the norm is conserved.
+    """
+    omega = expression(angular_velocity)
+    return quaternion_product(ca.vertcat(type(omega)(1, 1), omega), quaternion) / 2
+
+
+def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -> Expression:
+    """Angular velocity (world axes, rad/s) of a quaternion that changes with `rate`. Shape (3, 1).
+
+    The inverse of quaternion_rate; the quaternion may have any norm but zero.
+    """
+    quaternion = expression(quaternion)
+    product = quaternion_product(rate, quaternion_conjugate(quaternion))
+    return 2 * product[1:4] / ca.dot(quaternion, quaternion)
+
+
+def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
+    """Pluecker transform of motion vectors from frame B to A, `frame` being the placement of B in A.
+
+    Shape (6, 6).
+    """
+    turn, position = expression(frame[0]), expression(frame[1])
+    zero = type(turn)(3, 3)
+    return ca.vertcat(ca.horzcat(turn, zero), ca.horzcat(ca.mtimes(skew(position), turn), turn))
+
+
+def force_transform(frame: tuple[Expression, Expression]) -> Expression:
+    """Pluecker transform of force vectors (and momenta) from frame B to A, `frame` placing B in A.
+
+    Shape (6, 6).
+
+    The inverse transpose of motion_transform: power does not depend on the frame.
+    """
+    turn, position = expression(frame[0]), expression(frame[1])
+    zero = type(turn)(3, 3)
+    return ca.vertcat(ca.horzcat(turn, ca.mtimes(skew(position), turn)), ca.horzcat(zero, turn))
+
+
+def motion_cross(velocity: Expression) -> Expression:
+    """Operator v x on motion vectors: rate of change of a motion vector fixed in a body that moves with v.
+
+    Shape (6, 6).
+    """
+    v = expression(velocity)
+    zero = type(v)(3, 3)
+    return ca.vertcat(ca.horzcat(skew(v[0:3]), zero), ca.horzcat(skew(v[3:6]), skew(v[0:3])))
+
+
+def force_cross(velocity: Expression) -> Expression:
+    """Operator v x* on force vectors, minus the transpose of motion_cross. Shape (6, 6)."""
+    return -motion_cross(velocity).T
+
+
+def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expression) -> Expression:
+    """Spatial inertia of a rigid body about its frame's origin: maps a motion vector to a momentum.
+
+    Shape (6, 6).
+
+    Args:
+        mass: kg.
+        center_of_mass: In the frame. Shape (3,), m.
+        inertia: About the centre of mass, in the frame's axes. Shape (3, 3), kg m^2.
+    """
+    arm = skew(center_of_mass)
+    about_origin = expression(inertia) + mass * ca.mtimes(arm, arm.T)
+    return ca.vertcat(ca.horzcat(about_origin, mass * arm), ca.horzcat(mass * arm.T, mass * ca.DM.eye(3)))

@@ -1,0 +1,26 @@
+"""Optimal control: declare a problem, transcribe it, solve it, audit it."""
+
+from ocp.audit import Audit, Finding
+from ocp.collocation import Collocation
+from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
+from ocp.problem import Problem
+from ocp.refine import refine
+from ocp.shooting import MultipleShooting
+from ocp.solution import Solution
+from ocp.solve import prepare, solve
+
+__all__ = [
+    "Audit",
+    "AuditError",
+    "Collocation",
+    "Finding",
+    "MultipleShooting",
+    "Problem",
+    "ProblemError",
+    "RefinementWarning",
+    "Solution",
+    "SolveError",
+    "prepare",
+    "refine",
+    "solve",
+]

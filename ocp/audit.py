@@ -1,0 +1,302 @@
+"""The audit: does a plan do what it says, between its nodes too, and is it an extremal?
+
+It trusts nothing that the solver says of its plan. The controls are integrated anew, every constraint is looked at on
+a grid ten times as fine, and the minimum principle is checked with multipliers found anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError, unknown_name
+from ocp.formulation import Formulation
+from ocp.interpolation import PiecewisePolynomial
+from ocp.optimality import Optimality, minimum_principle
+from ocp.problem import Problem
+from ocp.reintegration import Reintegration, reintegrate
+from ocp.solution import Solution, unstack
+
+__all__ = ["Audit", "Finding", "audit"]
+
+FINER = 10
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table.
+
+    Attributes:
+        name: What was looked at.
+        value: How far it is off, in the unit of the thing itself or relative where the name says so.
+        limit: What it may be, or None where it is only told.
+        time: Where it is worst, s, or None.
+        note: What the value means where that is not plain.
+    """
+
+    name: str
+    value: float
+    limit: float | None = None
+    time: float | None = None
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        return self.limit is None or bool(self.value <= self.limit)  # nan does not pass
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What an independent look at a plan found.
+
+    Attributes:
+        name: Of the problem.
+        findings: One for every check.
+        constraints: Worst violation of every bound and constraint by name, on the fine grid; 0 where it holds.
+        integration_error: Largest distance of the plan's states from the re-integrated ones, relative to the size of
+            each state, over the whole horizon. local_errors: the same of each interval alone, from its own start. (N,)
+        t, states, controls: The re-integrated plan: times, s (M,), and values by name, each (M, n). Interior mesh
+            times stand twice, with the controls of both sides.
+        optimality: Stationarity and Hamiltonian.
+    """
+
+    name: str
+    findings: tuple[Finding, ...]
+    constraints: dict[str, float]
+    integration_error: float
+    local_errors: np.ndarray
+    t: np.ndarray
+    states: dict[str, np.ndarray]
+    controls: dict[str, np.ndarray]
+    optimality: Optimality
+
+    @property
+    def passed(self) -> bool:
+        """Whether every finding is within its limit."""
+        return all(finding.passed for finding in self.findings)
+
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        """The findings beyond their limits."""
+        return tuple(finding for finding in self.findings if not finding.passed)
+
+    def __getitem__(self, name: str) -> Finding:
+        """A finding by its name."""
+        for finding in self.findings:
+            if finding.name == name:
+                return finding
+        raise unknown_name("finding", name, [finding.name for finding in self.findings])
+
+    def __str__(self) -> str:
+        width = max(len(finding.name) for finding in self.findings)
+        lines = [f"Audit of {self.name!r}: {'passed' if self.passed else 'FAILED'}"]
+        lines.append(f"  {'check':<{width}}  {'value':>10}  {'limit':>10}  {'at, s':>8}")
+        for f in self.findings:
+            limit = "" if f.limit is None else f"{f.limit:.2e}"
+            time = "" if f.time is None else f"{f.time:.4f}"
+            verdict = "" if f.limit is None else "ok" if f.passed else "FAILED"
+            line = f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {time:>8}  {verdict:<6}  {f.note}"
+            lines.append(line.rstrip())
+        return "\n".join(lines)
+
+
+def audit(
+    problem: Problem,
+    solution: Solution,
+    *,
+    integration: float = 1e-3,
+    constraints: float = 1e-3,
+    stationarity: float = 1e-2,
+    drift: float = 1e-2,
+    tolerances: Mapping[str, float] | None = None,
+) -> Audit:
+    """Check a plan independently of the solver that made it.
+
+    Args:
+        problem: What was asked. solution: The plan.
+        integration: Largest relative distance from the re-integrated states, and relative error of the cost.
+        constraints: Largest violation of a bound or constraint, as a share of its scale: the width of its range, else
+            the size of its bound, else 1.
+        stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts.
+        drift: Largest change of the Hamiltonian where time does not enter, relative to its parts.
+        tolerances: Largest violation by name of a state, control or constraint, in its own unit.
+
+    Raises:
+        ProblemError: The plan does not belong to the problem, or a name in ``tolerances`` is unknown.
+    """
+    form = Formulation(problem)
+    check_belongs(form, solution)
+    p = form.parameter_vector(solution.parameters)
+    bounds = form.bound_values(p)
+    points = max(solution.state_interpolant.values.shape[1] - 1, 1)
+    pieces = (len(solution.state_interpolant.breaks) - 1) // (len(solution.control_interpolant.breaks) - 1)
+    again = reintegrate(form, solution, p, FINER * points * max(pieces, 1))
+    optimality = minimum_principle(form, solution, p, bounds)
+
+    scale = state_scale(form, again.plan)
+    errors = np.abs(again.states - again.plan) / scale
+    local = np.abs(again.local - again.plan) / scale
+    n = int(again.interval[-1]) + 1
+    local_errors = local.reshape(n, -1).max(axis=1)
+    findings = [Finding("solver", 0.0 if solution.success else np.inf, 0.0, None, solution.status)]
+    note = "" if again.broke_down is None else f"the integration broke down at {again.broke_down:.6g} s"
+    findings.append(worst("integration error, relative", errors.max(axis=1), again.t, integration, note))
+    findings.append(worst("integration error of one interval", local.max(axis=1), again.t, integration))
+    findings.append(cost_finding(form, solution, again, p, integration))
+
+    limits = dict(tolerances or {})
+    names = [
+        *form.states,
+        *form.controls,
+        *[c for kind in (form.path, form.start, form.end) for c in kind.names],
+    ]
+    for name in limits:
+        if name not in names:
+            raise unknown_name("name in tolerances", name, names)
+    checks = violations(form, again, bounds, p, solution.horizon)
+    total: dict[str, float] = {}
+    for label, name, misses, times, size in checks:
+        limit = limits.get(name, constraints * size)
+        finding = worst(label, misses, times, limit)
+        findings.append(finding)
+        total[name] = max(total.get(name, 0.0), finding.value)
+
+    for what, interpolant, limit_of in (
+        ("state jump, relative", solution.state_interpolant, integration),
+        ("control jump, relative", solution.control_interpolant, None),
+    ):
+        findings.append(jump(what, interpolant, solution.horizon, limit_of))
+    gradient = optimality.stationarity / optimality.gradient_scale
+    if form.nu:
+        findings.append(worst("stationarity, relative", gradient, optimality.t, stationarity))
+    h = optimality.drift / optimality.hamiltonian_scale
+    if form.autonomous:
+        findings.append(Finding("Hamiltonian drift, relative", h, drift))
+    else:
+        findings.append(Finding("Hamiltonian change, relative", h, None, None, "time enters the problem"))
+    return Audit(
+        form.name,
+        tuple(findings),
+        total,
+        float(np.max(errors)) if np.all(np.isfinite(errors)) else np.inf,
+        np.where(np.isfinite(local_errors), local_errors, np.inf),
+        again.t,
+        unstack(solution.states, again.states),
+        unstack(solution.controls, again.controls),
+        optimality,
+    )
+
+
+def check_belongs(form: Formulation, solution: Solution) -> None:
+    """Raise ProblemError unless the states and controls of a plan are those of a problem."""
+    for what, places, pool in (
+        ("states", form.states, solution.states),
+        ("controls", form.controls, solution.controls),
+    ):
+        have = {name: values.shape[1] for name, values in pool.items()}
+        want = {name: place.stop - place.start for name, place in places.items()}
+        if have != want:
+            raise ProblemError(f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}")
+
+
+def state_scale(form: Formulation, plan: np.ndarray) -> np.ndarray:
+    """Size of each state: the largest entry of the named state it belongs to; 1 where it is all zero. Shape (nx,)."""
+    scale = np.ones(form.nx)
+    for place in form.states.values():
+        size = np.max(np.abs(plan[:, place]))
+        scale[place] = size if size > 0 else 1.0
+    return scale
+
+
+def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
+    """A finding of the largest of some values; one that is not a number is the worst."""
+    if values.size == 0:
+        return Finding(name, 0.0, limit, None, note)
+    clean = np.where(np.isnan(values), np.inf, values)
+    k = int(np.argmax(clean))
+    return Finding(name, float(clean[k]), limit, float(times[k]) if clean[k] > 0 else None, note)
+
+
+def cost_finding(form: Formulation, solution: Solution, again: Reintegration, p: np.ndarray, limit: float) -> Finding:
+    """The cost of the re-integrated plan against the one the solver reports."""
+    symbols = [form.x, form.x0, form.u0, form.t, form.T, form.p]
+    terminal = ca.Function("terminal", symbols, [form.terminal])
+    end = terminal(again.states[-1], again.states[0], again.controls[0], solution.horizon, solution.horizon, p)
+    cost = again.cost + float(end)
+    size = max(abs(cost), abs(again.cost), abs(float(end)), abs(solution.cost))
+    off = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
+    return Finding("cost, relative", off, limit, None, f"reported {solution.cost:.8g}, integrated {cost:.8g}")
+
+
+Check = tuple[str, str, np.ndarray, np.ndarray, float]  # label, name, violations (K,), times (K,), scale
+
+
+def violations(
+    form: Formulation,
+    again: Reintegration,
+    bounds: tuple[np.ndarray, np.ndarray],
+    p: np.ndarray,
+    horizon: float,
+) -> list[Check]:
+    """How far every bound and constraint is missed, at every point of the fine grid."""
+    lower, upper = bounds
+    places = form.bounds.places
+    checks: list[Check] = []
+    states = np.where(np.isfinite(again.states), again.states, np.nan)
+    first, last = slice(0, 1), slice(-1, None)
+    for kind, pool, values, at, what in (
+        ("state", form.states, states, slice(None), "bounds of"),
+        ("control", form.controls, again.controls, slice(None), "bounds of"),
+        ("initial", form.states, states, first, "start of"),
+        ("terminal", form.states, states, last, "end of"),
+    ):
+        for name, place in pool.items():
+            index = places[kind][place]
+            low, high = lower[index], upper[index]
+            given = np.isfinite(low) | np.isfinite(high)
+            if kind in ("initial", "terminal"):
+                given = low == high
+            if np.any(given):
+                miss, size = missed(values[at][:, place][:, given], low[given], high[given])
+                checks.append((f"{what} {name}", name, miss, again.t[at], size))
+    form_symbols = [form.x, form.u, form.t, form.T, form.p, form.x0, form.u0]
+    for rows, at in ((form.path, slice(None)), (form.start, first), (form.end, last)):
+        if len(rows) == 0:
+            continue
+        function = ca.Function("rows", form_symbols, [rows.expression])
+        m = len(again.t[at])
+        ones = np.ones((1, m))
+        inputs = (states[at].T, again.controls[at].T, again.t[at][None, :], horizon * ones, p[:, None] * ones,
+                  states[0][:, None] * ones, again.controls[0][:, None] * ones)  # fmt: skip
+        g = np.asarray(function.map(m, "serial").call([ca.DM(v) for v in inputs])[0].full()).T
+        for name in rows.names:
+            mine = rows.of(name)
+            miss, size = missed(g[:, mine], lower[rows.bounds[mine]], upper[rows.bounds[mine]])
+            checks.append((name, name, miss, again.t[at], size))
+    return checks
+
+
+def missed(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
+    """Largest violation at each of K points (K,), and the scale of the bounds."""
+    over = np.maximum(lower - values, values - upper)
+    miss = np.where(np.isnan(values), np.inf, np.maximum(over, 0.0)).max(axis=1)
+    with np.errstate(invalid="ignore"):
+        width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+    bound = np.max(np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0), axis=0)
+    sizes = np.where(width > 0, width, bound)
+    return miss, float(np.min(np.where(sizes > 0, sizes, 1.0)))
+
+
+def jump(name: str, interpolant: PiecewisePolynomial, horizon: float, limit: float | None) -> Finding:
+    """Largest jump between two pieces, relative to the size of what jumps."""
+    n = len(interpolant.breaks) - 1
+    pieces = np.arange(n)
+    left = interpolant.within(pieces[:-1], np.ones(n - 1))
+    right = interpolant.within(pieces[1:], np.zeros(n - 1))
+    size = np.max(np.abs(interpolant.values), initial=0.0)
+    gaps = np.abs(right - left).max(axis=1, initial=0.0) / (size if size > 0 else 1.0)
+    note = f"{np.max(gaps, initial=0.0) * size:.3g} in its own unit"
+    return worst(name, gaps, interpolant.breaks[1:-1] * horizon, limit, note)

@@ -1,0 +1,1 @@
+"""Ready problems, one module for each family of machines and tasks."""

@@ -1,0 +1,174 @@
+"""Direct collocation: states are polynomials on every interval and obey the dynamics at the collocation points.
+
+Radau points end at the end of the interval (order 2d - 1, stiffly accurate); Legendre points lie inside (order 2d).
+Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5. The costates are the multipliers of the
+collocation equations over the quadrature weights, with which the Hamiltonian is stationary at every point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.formulation import Formulation
+from ocp.fragment import Block, Fragment
+from ocp.interpolation import PiecewisePolynomial, differentiation_matrix, lagrange
+from ocp.transcription import FragmentBuilder, check_intervals, fractions
+
+__all__ = ["Collocation"]
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """Direct collocation on a mesh of intervals.
+
+    Attributes:
+        intervals: Number of intervals.
+        degree: Degree of the state polynomials and number of collocation points an interval, 1 to 9.
+        scheme: ``radau`` or ``legendre``.
+        control: ``points`` (a free value at every collocation point: polynomials of degree - 1, which may overshoot
+            bounds between points where the control switches) or ``held`` (one value an interval).
+        mesh: Fractions 0..1 where intervals begin and end, N + 1 of them; None for equal intervals.
+
+    Raises:
+        ProblemError: For a value outside these.
+    """
+
+    intervals: int
+    degree: int = 3
+    scheme: str = "radau"
+    control: str = "points"
+    mesh: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        check_intervals("Collocation", self.intervals, self.mesh)
+        if self.degree not in range(1, 10):
+            raise ProblemError(f"Collocation: degree must be 1 to 9, not {self.degree!r}")
+        if self.scheme not in ("radau", "legendre"):
+            raise ProblemError(f"Collocation: scheme must be 'radau' or 'legendre', not {self.scheme!r}")
+        if self.control not in ("points", "held"):
+            raise ProblemError(f"Collocation: control must be 'points' or 'held', not {self.control!r}")
+
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
+        return transcribe(self, form, staged)
+
+
+def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment:
+    d, nx, nu = method.degree, form.nx, form.nu
+    radau, held = method.scheme == "radau", method.control == "held"
+    mesh = fractions(method.intervals, method.mesh)
+    n, width = len(mesh) - 1, np.diff(mesh)
+    stages = np.arange(n)
+    points = np.array(ca.collocation_points(d, method.scheme))
+    nodes = np.concatenate([[0.0], points])  # places of the state values in an interval
+    samples = np.array([0.5]) if held else points  # places of the control values
+    weights = quadrature_weights(points)
+    inner = d - 1 if radau else d  # Radau's last point is the end of the interval
+
+    build = FragmentBuilder(form, mesh, 0, inner * nx + len(samples) * nu, staged)
+    lay = build.layout
+    point_at = mesh[:-1, None] + width[:, None] * points  # fractions of the points, (n, d)
+    control_at = mesh[:-1, None] + width[:, None] * samples
+
+    # variables: states[k, j, i], entry i at place j of interval k, and controls[k, j, i]
+    inside = lay.interval[: inner * nx].T.reshape(n, inner, nx)
+    end = lay.node_end.T.reshape(n, 1, nx)
+    states = np.concatenate([lay.node[:, :-1].T.reshape(n, 1, nx), inside, *([end] if radau else [])], axis=1)
+    controls = lay.interval[inner * nx :].T.reshape(n, len(samples), nu)
+    for j in range(inner):
+        build.variables("state", states[:, j + 1].T, point_at[:, j], "state")
+    for j in range(len(samples)):
+        build.variables("control", controls[:, j].T, control_at[:, j], "control")
+
+    # the dynamics at every point: sum_i l_i'(tau_j) X_i - h T f(X_j, u_j, t_j) = 0
+    stage_of, at = np.repeat(stages, d), point_at.ravel()
+    dynamics = build.rows(tuple(f"dynamics of {name}" for name in form.state_labels), None, stage_of, at)
+    derivative = differentiation_matrix(nodes)[1:]
+    for i in range(d + 1):
+        build.linear(dynamics, np.repeat(states[:, i], d, axis=0).T, np.tile(derivative[:, i], n)[None, :])
+    here = np.ones(len(form.path), dtype=bool)
+    if held:  # an equality holds where the held control is sampled, once an interval
+        here = ~form.path.equality
+    rows = form.path.select(here)
+    index = build.rows(rows.labels, rows.bounds, stage_of, at)
+    at_point = build.point(
+        states[:, 1:].reshape(n * d, nx).T,
+        (np.repeat(controls[:, 0], d, axis=0) if held else controls.reshape(n * d, nu)).T,
+        stage_of,
+    )
+    data = form.problem.symbols.sym("d", 3)  # fraction, width, weight
+    function = form.point_function(
+        "point",
+        data,
+        data[2] * form.T * form.running,
+        ca.vertcat(-data[1] * form.T * form.f, rows.expression),
+    )
+    numbers = np.vstack([at, np.repeat(width, d), np.outer(width, weights).ravel()])
+    build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
+
+    # the other places of the path constraints
+    free = ~form.path.uses_control
+    nearest = np.concatenate([controls[:, 0], controls[-1:, 0]]).T  # any control, for rows that use none
+    if held:
+        start = (lay.node[:, :-1], controls[:, 0].T, stages, mesh[:-1])
+        build.path_rows(form.path.select(~free), *start)
+        build.node_rows(form.path.select(free & form.path.equality), nearest)
+        if not radau:
+            build.path_rows(form.path.select(~free & ~form.path.equality), lay.node_end, start[1], stages, mesh[1:])
+    inequality = form.path.select(free & ~form.path.equality)
+    build.node_rows(inequality, nearest, first_only=radau)
+    if not held:
+        build.node_rows(form.path.select(free & form.path.equality), nearest, first_only=True)
+
+    # the end of the interval, where it is not a point
+    at_one = lagrange(nodes, np.array([1.0]))[0]
+    joints = dynamics[:, :0]
+    if not radau:
+        joints = build.rows(tuple(f"continuity of {name}" for name in form.state_labels), None, stages, mesh[1:])
+        build.linear(joints, lay.node_end, 1.0)
+        for i in range(d + 1):
+            build.linear(joints, states[:, i].T, -at_one[i])
+
+    ends = (lagrange(samples, np.array([0.0]))[0], lagrange(samples, np.array([1.0]))[0])
+    build.ends(ends, controls[0], controls[-1], at_nodes=False)
+
+    # what is reported: start, points, and for Legendre the ends of intervals
+    by_interval = dynamics.T.reshape(n, d, nx)
+    scale = np.tile(-1.0 / weights, (n, 1))
+    if radau:
+        report = (np.concatenate([[0], stage_of]), np.concatenate([[0.0], np.tile(points, n)]))
+        report_states = np.vstack([states[0, :1], states[:, 1:].reshape(-1, nx)])
+        costate_rows = np.vstack([np.full((1, nx), -1), by_interval.reshape(-1, nx)])
+        costate_rows[::d] = -1  # at nodes what the next interval says is more accurate
+        costate_scale = np.concatenate([[1.0], scale.ravel()])
+    else:
+        report = (
+            np.concatenate([np.repeat(stages, d + 1), [n - 1]]),
+            np.concatenate([np.tile(nodes, n), [1.0]]),
+        )
+        report_states = np.vstack([states.reshape(-1, nx), lay.node[:, -1]])
+        before = np.vstack([np.full((1, nx), -1), joints.T[:-1]])[:, None, :]
+        costate_rows = np.vstack([np.concatenate([before, by_interval], axis=1).reshape(-1, nx), joints.T[-1:]])
+        at_nodes = np.full((n, 1), -1.0)
+        costate_scale = np.concatenate([np.hstack([at_nodes, scale]).ravel(), [-1.0]])
+
+    def interpolants(
+        values: np.ndarray, parameters: np.ndarray, horizon: float
+    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        return (
+            PiecewisePolynomial(mesh, nodes, values[states]),
+            PiecewisePolynomial(mesh, samples, values[controls]),
+        )
+
+    costate_nodes = report[0] + (report[1] == 1.0)
+    return build.finish(report, report_states, costate_rows, costate_nodes, costate_scale, interpolants)
+
+
+def quadrature_weights(points: np.ndarray) -> np.ndarray:
+    """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
+    at, weight = np.polynomial.legendre.leggauss(len(points))
+    return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))

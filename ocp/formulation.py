@@ -1,0 +1,307 @@
+"""A problem flattened into vectors: the one form that every transcription and the audit read.
+
+Time runs as the fraction ``s`` of the horizon, ``t = s * T``, so that a free final time is one more number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError, unknown_name
+from ocp.problem import (
+    Constraint,
+    Problem,
+    Variable,
+    check_horizon,
+    check_inside,
+    check_order,
+    constant,
+    numeric,
+)
+
+__all__ = ["BoundTable", "Formulation", "Rows"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Scalar constraint rows of one place (path, start or end).
+
+    Attributes:
+        expression: Shape (m, 1), in the symbols of the formulation.
+        labels: Name of each row, ``corridor`` or ``corridor[2]``. owners: Name of its constraint, ``corridor``.
+        bounds: Index of each row in the bound table. Shape (m,).
+        equality: Whether lower and upper bound are one expression. Shape (m,), bool.
+        uses_control: Whether the row contains a control. Shape (m,), bool.
+        uses_state: Which states the row contains. Shape (m, nx), bool.
+    """
+
+    expression: Any
+    labels: tuple[str, ...]
+    owners: tuple[str, ...]
+    bounds: np.ndarray
+    equality: np.ndarray
+    uses_control: np.ndarray
+    uses_state: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the constraints, in order."""
+        return tuple(dict.fromkeys(self.owners))
+
+    def of(self, name: str) -> np.ndarray:
+        """Indices of the rows of a constraint."""
+        return np.array([i for i, owner in enumerate(self.owners) if owner == name])
+
+    def select(self, mask: np.ndarray) -> Rows:
+        """The rows where ``mask`` (m,) holds."""
+        keep = np.flatnonzero(mask)
+        return Rows(
+            self.expression[keep.tolist()] if keep.size else self.expression[:0],
+            tuple(self.labels[i] for i in keep),
+            tuple(self.owners[i] for i in keep),
+            self.bounds[keep],
+            self.equality[keep],
+            self.uses_control[keep],
+            self.uses_state[keep],
+        )
+
+
+@dataclass(frozen=True)
+class BoundTable:
+    """All bounds of a problem in two vectors; variables and rows of an NLP point into them.
+
+    Attributes:
+        function: Parameters -> (lower, upper), each of shape (n, 1).
+        places: Index of every entry by what it bounds: ``free``, ``zero``, ``state``, ``initial``, ``terminal``,
+            ``control``, ``horizon``, ``path``, ``start``, ``end``.
+    """
+
+    function: Any
+    places: dict[str, np.ndarray]
+
+
+class Formulation:
+    """Vectors and functions of a checked problem. Later changes of the problem do not reach it.
+
+    Attributes:
+        x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon.
+        x0, u0: Symbols of states and controls at the start, for what ties both ends.
+        f: State derivative. Shape (nx, 1).
+        running, terminal: Cost densities, scalars.
+        path, start, end: Constraint rows.
+        states, controls, parameters: Slices of the vectors by name. state_labels: A name for every entry.
+        bounds: The bound table.
+        horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
+        initial_is_fixed: Which initial states are given. Shape (nx,), bool.
+        ties_ends: Whether anything at the end refers to the start.
+        autonomous: Whether dynamics, running cost and path are free of time.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        problem.check()
+        declared = problem.declared
+        sym = problem.symbols.sym
+        horizon = declared.horizon
+        assert horizon is not None
+        self.problem = problem
+        self.name = problem.name
+        self.states = slices(declared.states)
+        self.controls = slices(declared.controls)
+        self.parameters = slices(declared.parameters)
+        self.state_labels = labels(declared.states)
+        self.nx, self.nu, self.np = (total(s) for s in (self.states, self.controls, self.parameters))
+        self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
+        self.x0, self.u0 = sym("x0", self.nx), sym("u0", self.nu)
+        self.t, self.T = sym("t"), sym("T")
+        self._declared = declared
+        self.horizon_is_free = not horizon.fixed
+        self.horizon_guess = horizon.guess
+
+        self.f = self._flat(ca.vertcat(*[declared.dynamics[name] for name in self.states]))
+        self.running = self._flat(0 if declared.running is None else declared.running)
+        self.terminal = self._flat(0 if declared.terminal is None else declared.terminal)
+        self.bounds = self._bound_table()
+        self.horizon_value = self._flat(horizon.lower)  # of use where it is fixed
+        self.path = self._rows("path", declared.path)
+        self.start = self._rows("start", declared.start)
+        self.end = self._rows("end", declared.end)
+        inner = ca.vertcat(self.f, self.running, self.path.expression)
+        self.autonomous = not ca.depends_on(inner, self.t)
+        self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
+        both = ca.vertcat(self.end.expression, self.terminal)
+        self.ties_ends = bool(ca.depends_on(both, ca.vertcat(self.x0, self.u0)))
+        self.guesses = {v.name: v.guess for v in (*declared.states.values(), *declared.controls.values())}
+
+    def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
+        """A casadi Function of (x, u, t, T, p)."""
+        return ca.Function(name, [self.x, self.u, self.t, self.T, self.p], outputs, ["x", "u", "t", "T", "p"], names)
+
+    def horizon_at(self, p: Any) -> Any:
+        """The fixed horizon at parameters, numbers or symbols."""
+        return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
+
+    def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
+        """A block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T where free].
+
+        ``cost`` and ``g`` are expressions of x, u, t, T, p and of the data ``d``, whose first entry is the fraction s.
+        """
+        v = self.problem.symbols.sym("v", self.nx + self.nu + self.horizon_is_free)
+        inside = slice(self.nx, self.nx + self.nu)
+        horizon = v[self.nx + self.nu] if self.horizon_is_free else self.horizon_value
+        new = [v[: self.nx], v[inside], d[0] * horizon, horizon]
+        symbols = self.problem.symbols
+        outputs = ca.substitute([symbols(cost), symbols(g)], [self.x, self.u, self.t, self.T], new)
+        return ca.Function(name, [v, d, self.p], outputs, {"cse": True})
+
+    def parameter_vector(self, values: dict[str, Any] | None) -> np.ndarray:
+        """Parameters stacked. Shape (np,).
+
+        Raises:
+            ProblemError: A parameter is missing, unknown, of the wrong size or not finite.
+        """
+        given = dict(values or {})
+        for name in given:
+            if name not in self.parameters:
+                raise unknown_name("parameter", name, self.parameters)
+        vector = np.zeros(self.np)
+        for name, place in self.parameters.items():
+            if name not in given:
+                raise ProblemError(f"parameter {name!r} has no value; give parameters={{{name!r}: ...}}")
+            value = numeric(f"parameter {name!r}", given[name])
+            size = place.stop - place.start
+            if value.size not in (1, size):
+                raise ProblemError(f"parameter {name!r} has {value.size} entries, {size} expected")
+            if not np.all(np.isfinite(value)):
+                raise ProblemError(f"parameter {name!r} is not finite: {value.tolist()}")
+            vector[place] = value
+        return vector
+
+    def bound_values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The bound table at given parameters, checked: (lower, upper), each (n,)."""
+        lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
+        places = self.bounds.places
+        where = f"problem {self.name!r} at these parameters"
+        for kind, pool in (("state", self.states), ("control", self.controls)):
+            for name, part in pool.items():
+                index = places[kind][part]
+                check_order(f"{where}: {kind} {name!r}", lower[index], upper[index])
+                for end in ("initial", "terminal") if kind == "state" else ():
+                    fixed = places[end][part]
+                    values = np.where(lower[fixed] == upper[fixed], lower[fixed], np.nan)
+                    check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
+        for rows in (self.path, self.start, self.end):
+            for label, index in zip(rows.labels, rows.bounds, strict=True):
+                check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
+        index = places["horizon"]
+        check_horizon(f"{where}: horizon", lower[index])
+        check_order(f"{where}: horizon", lower[index], upper[index])
+        if np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
+            raise ProblemError(f"{where}: a bound is not a number")
+        return lower, upper
+
+    # ---- flattening ------------------------------------------------------------------------------------------
+
+    def _flat(self, expression: Any) -> Any:
+        """An expression of the declared symbols as one of the stacked symbols."""
+        d = self._declared
+        old: list[Any] = [self.problem.time]
+        new: list[Any] = [self.t]
+        for pool, vector, places in (
+            (d.states, self.x, self.states),
+            (d.controls, self.u, self.controls),
+            (d.parameters, self.p, self.parameters),
+        ):
+            old += [variable.symbol for variable in pool.values()]
+            new += [vector[places[name]] for name in pool]
+        for name, symbol in d.at_start.items():
+            old.append(symbol)
+            new.append(self.x0[self.states[name]] if name in self.states else self.u0[self.controls[name]])
+        if d.horizon is not None:
+            old.append(d.horizon.symbol)
+            new.append(self.T)
+        column = self.problem.symbols(expression)
+        return ca.densify(ca.substitute([column], old, new)[0])
+
+    def _rows(self, kind: str, pool: dict[str, Constraint]) -> Rows:
+        symbols = self.problem.symbols
+        expression = self._flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
+        names = labels(pool)
+        lower = ca.vertcat(symbols(0, 1), *[c.lower for c in pool.values()])
+        upper = ca.vertcat(symbols(0, 1), *[c.upper for c in pool.values()])
+        equality = np.array([bool(ca.is_equal(lower[i], upper[i], 8)) for i in range(len(names))], dtype=bool)
+        controls = np.asarray(ca.DM(ca.jacobian_sparsity(expression, self.u), 1).full()) != 0
+        states = np.asarray(ca.DM(ca.jacobian_sparsity(expression, self.x), 1).full()) != 0
+        return Rows(
+            expression,
+            names,
+            tuple(c.name for c in pool.values() for _ in range(c.size)),
+            self.bounds.places[kind],
+            equality,
+            controls.reshape(len(names), self.nu).any(axis=1),
+            states.reshape(len(names), self.nx),
+        )
+
+    def _bound_table(self) -> BoundTable:
+        d = self._declared
+        symbols = self.problem.symbols
+        empty = symbols(0, 1)
+
+        def stack(items: Any, what: str) -> Any:
+            return ca.vertcat(empty, *[getattr(item, what) for item in items])
+
+        states, controls = d.states.values(), d.controls.values()
+        low, high = stack(states, "lower"), stack(states, "upper")
+        parts: dict[str, Any] = {
+            "free": (symbols(-np.inf), symbols(np.inf)),
+            "zero": (symbols(0.0), symbols(0.0)),
+            "state": (low, high),
+            "control": (stack(controls, "lower"), stack(controls, "upper")),
+        }
+        for end in ("initial", "terminal"):
+            value = stack(states, end)
+            free = np.concatenate([is_free(getattr(state, end)) for state in states])  # keeps its bounds
+            parts[end] = tuple(
+                ca.vertcat(*[bound[i] if free[i] else value[i] for i in range(len(free))]) for bound in (low, high)
+            )
+        assert d.horizon is not None
+        parts["horizon"] = (d.horizon.lower, d.horizon.upper)
+        for kind in ("path", "start", "end"):
+            pool = getattr(d, kind).values()
+            parts[kind] = (stack(pool, "lower"), stack(pool, "upper"))
+        offset, places = 0, {}
+        for name, (lower, _) in parts.items():
+            places[name] = np.arange(offset, offset + lower.numel())
+            offset += lower.numel()
+        table = [self._flat(ca.vertcat(*[part[i] for part in parts.values()])) for i in (0, 1)]
+        return BoundTable(ca.Function("bounds", [self.p], table), places)
+
+
+def slices(pool: dict[str, Variable]) -> dict[str, slice]:
+    """Where each variable stands in the stacked vector."""
+    places, offset = {}, 0
+    for name, variable in pool.items():
+        places[name] = slice(offset, offset + variable.size)
+        offset += variable.size
+    return places
+
+
+def labels(pool: dict[str, Any]) -> tuple[str, ...]:
+    """A name for every entry: ``q`` alone, ``q[2]`` of several."""
+    return tuple(f"{v.name}[{i}]" if v.size > 1 else v.name for v in pool.values() for i in range(v.size))
+
+
+def is_free(end: Any) -> np.ndarray:
+    """Which entries of an initial or terminal value are nan, that is free. Shape (n,), bool."""
+    numbers = np.array([not ca.symvar(entry) for entry in ca.vertsplit(end)])
+    return np.asarray(numbers & np.isnan(constant(end)))
+
+
+def total(places: dict[str, slice]) -> int:
+    return max((place.stop for place in places.values()), default=0)

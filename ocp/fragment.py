@@ -1,0 +1,122 @@
+"""A partially separable nonlinear program: few small functions, each repeated over many index sets.
+
+A transcription says which variables exist, which small function (a *block*) reads which of them how many times, and
+which rows are linear. :mod:`ocp.assembly` derives gradient, Jacobian and Hessian of every block once and scatters them,
+so building costs the same for 10 intervals and for 1000. Fragments of several phases can be joined at their ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ocp.interpolation import PiecewisePolynomial
+
+__all__ = ["Block", "Fragment", "InterpolantMaker", "Stages", "shifted"]
+
+InterpolantMaker: TypeAlias = Callable[[np.ndarray, np.ndarray, float], tuple[PiecewisePolynomial, PiecewisePolynomial]]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One small function and where it is applied.
+
+    Attributes:
+        function: casadi Function (v (n), d (nd), p) -> (cost, g (m)).
+        variables: Which variables of the program each application reads. Shape (n, K).
+        data: Constants of each application. Shape (nd, K).
+        rows: Which rows of the program each application adds to. Shape (m, K).
+        ends: Whether it belongs to the ends of the horizon rather than to its inside.
+    """
+
+    function: Any
+    variables: np.ndarray
+    data: np.ndarray
+    rows: np.ndarray
+    ends: bool = False
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Sizes of a stage-ordered program, as structure-exploiting solvers ask for them. Each of length N + 1."""
+
+    states: tuple[int, ...]
+    controls: tuple[int, ...]
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Fragment:
+    """The nonlinear program of one phase.
+
+    Attributes:
+        mesh: Fractions of the horizon where intervals begin and end. Shape (N + 1,).
+        size: Number of variables.
+        variable_bounds, row_bounds: Index of each variable and row in the bound table.
+        variable_role: ``state``, ``control`` or ``horizon`` of each variable; variable_entry: which entry of it;
+            variable_fraction: at which fraction of the horizon. Used for guesses. Each of length size.
+        row_labels, row_fractions: What each row says, and where. Each of length n_rows.
+        blocks: Nonlinear parts. linear: linear part as (rows, columns, values).
+        horizon: Index of the horizon at the start, or None where it is fixed.
+        report: Interval and place in it (0..1) of every reported point. Each of shape (M,).
+        report_states: Indices of the states at the reported points. Shape (M, nx).
+        nodes: Indices of the states at the nodes. Shape (nx, N + 1).
+        row_stages: Interval that each row belongs to; -1 for what only ties or bounds the ends. Length n_rows.
+        costate_rows: Rows whose multipliers are the costates at the reported points; -1 where a point is the node
+            that ``costate_nodes`` (M,) names and its costate is what the next intervals say. Shape (M, nx).
+        costate_scale: Factor from multiplier to costate. Shape (M,).
+        interpolants: (variables, parameters, horizon) -> interpolants of states and controls over fractions.
+        stages: Stage structure, where the program is stage-ordered.
+    """
+
+    mesh: np.ndarray
+    size: int
+    variable_bounds: np.ndarray
+    row_bounds: np.ndarray
+    variable_role: np.ndarray
+    variable_entry: np.ndarray
+    variable_fraction: np.ndarray
+    row_labels: tuple[str, ...]
+    row_fractions: np.ndarray
+    blocks: tuple[Block, ...]
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray]
+    horizon: int | None
+    report: tuple[np.ndarray, np.ndarray]
+    report_states: np.ndarray
+    nodes: np.ndarray
+    row_stages: np.ndarray
+    costate_rows: np.ndarray
+    costate_nodes: np.ndarray
+    costate_scale: np.ndarray
+    interpolants: InterpolantMaker
+    stages: Stages | None
+
+    @property
+    def n_rows(self) -> int:
+        return len(self.row_labels)
+
+    @property
+    def start(self) -> np.ndarray:
+        """Indices of the first state, the joint to an earlier phase. Shape (nx,)."""
+        return self.nodes[:, 0]
+
+    @property
+    def end(self) -> np.ndarray:
+        """Indices of the last state, the joint to a later phase. Shape (nx,)."""
+        return self.nodes[:, -1]
+
+
+def shifted(fragment: Fragment, variables: int, rows: int) -> Fragment:
+    """The same fragment with its variables and rows moved up, to stand behind another one in a larger program."""
+    blocks = tuple(replace(b, variables=b.variables + variables, rows=b.rows + rows) for b in fragment.blocks)
+    at, columns, values = fragment.linear
+    return replace(
+        fragment,
+        blocks=blocks,
+        linear=(at + rows, columns + variables, values),
+        nodes=fragment.nodes + variables,
+        horizon=None if fragment.horizon is None else fragment.horizon + variables,
+    )

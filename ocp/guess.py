@@ -1,0 +1,151 @@
+"""Where the solver starts: guesses of every kind, evaluated at the variables of a transcription."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ocp.errors import ProblemError, unknown_name
+from ocp.formulation import Formulation
+from ocp.fragment import Fragment
+from ocp.problem import numeric
+from ocp.solution import Solution
+
+__all__ = ["initial_point"]
+
+Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
+
+
+def initial_point(
+    form: Formulation,
+    fragment: Fragment,
+    guess: Solution | Mapping[str, Any] | None,
+    bounds: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Values of all variables to start from. Shape (size,).
+
+    What ``guess`` says comes first, then the guess declared with the variable, then a straight line between the given
+    ends or the middle of the bounds. A solution of another grid or method is interpolated over fractions of its horizon.
+
+    Raises:
+        ProblemError: An unknown name, a wrong size, a number that is not finite.
+    """
+    entries = dict(form.guesses)
+    horizon = default_horizon(form, bounds)
+    given: dict[str, Any] = {}
+    if isinstance(guess, Solution):
+        given = from_solution(form, guess)
+        horizon = guess.horizon
+    elif isinstance(guess, Mapping):
+        given = {name: value for name, value in guess.items() if name != "t"}
+        known = [*form.states, *form.controls, "horizon", "t"]
+        for name in given:
+            if name not in known:
+                raise unknown_name("variable in guess", name, known)
+    elif guess is not None:
+        raise ProblemError(f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}")
+    if "horizon" in given:
+        horizon = float(numeric("guess of the horizon", given.pop("horizon"))[0])
+        if not (np.isfinite(horizon) and horizon > 0):
+            raise ProblemError(f"guess of the horizon must be positive and finite, not {horizon:g} s")
+    entries.update(given)
+    times = None if guess is None or isinstance(guess, Solution) else guess.get("t")
+
+    point = np.zeros(fragment.size)
+    point[fragment.variable_role == "horizon"] = horizon
+    for role, pool in (("state", form.states), ("control", form.controls)):
+        mine = fragment.variable_role == role
+        where, slot = np.unique(fragment.variable_fraction[mine], return_inverse=True)
+        size = max((place.stop for place in pool.values()), default=0)
+        table = np.zeros((len(where), size))
+        for name, place in pool.items():
+            value = entries.get(name)
+            n = place.stop - place.start
+            line = default(form, role, place, bounds)
+            curve = line if value is None else trajectory(name, value, n, horizon, times)
+            table[:, place] = curve(where)
+            for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
+                raise ProblemError(f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}")
+        point[mine] = table[slot, fragment.variable_entry[mine]]
+    return point
+
+
+def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
+    """A guess as a function of the fraction: from a function of time, samples (M, n) over ``times``, or a value."""
+    if callable(value):
+        return lambda at: np.array([fitted(name, value(float(s) * horizon), size) for s in at])
+    if isinstance(value, OverFraction):
+        return value.curve
+    array = np.asarray(value, dtype=float)
+    if array.ndim == 2 and array.shape[0] > 1:
+        rows = len(array)
+        at = np.linspace(0.0, horizon, rows) if times is None else np.asarray(times, dtype=float).reshape(-1)
+        if len(at) != rows or array.shape[1] != size:
+            raise ProblemError(f"guess of {name!r} has shape {array.shape}, ({len(at)}, {size}) expected")
+        if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):
+            raise ProblemError(f"guess of {name!r}: its times 't' must be finite and increase")
+        return lambda s: np.column_stack([np.interp(s * horizon, at, array[:, i]) for i in range(size)])
+    constant = fitted(name, value, size)
+    return lambda s: np.tile(constant, (len(s), 1))
+
+
+class OverFraction:
+    """A guess that is a function of the fraction of the horizon rather than of time."""
+
+    def __init__(self, curve: Trajectory) -> None:
+        self.curve = curve
+
+
+def from_solution(form: Formulation, guess: Solution) -> dict[str, Any]:
+    """Guesses from an earlier solution, for every state and control that it shares with the problem."""
+    shared: dict[str, Any] = {}
+    for name, place in {**form.states, **form.controls}.items():
+        pool = guess.states if name in guess.states else guess.controls
+        if name not in pool:
+            continue
+        if pool[name].shape[1] != place.stop - place.start:
+            have = pool[name].shape[1]
+            raise ProblemError(f"guess of {name!r} has {have} entries, {place.stop - place.start} expected")
+        shared[name] = OverFraction(lambda s, name=name: guess.at_fraction(s)[name])  # type: ignore[misc]
+    if not shared:
+        raise ProblemError(f"the guess, plan {guess.name!r}, shares no state or control with problem {form.name!r}")
+    return shared
+
+
+def fitted(name: str, value: Any, size: int) -> np.ndarray:
+    array = numeric(f"guess of {name!r}", value)
+    if array.size not in (1, size):
+        raise ProblemError(f"guess of {name!r} has {array.size} entries, {size} expected")
+    return np.broadcast_to(array, size)
+
+
+def default_horizon(form: Formulation, bounds: tuple[np.ndarray, np.ndarray]) -> float:
+    """The declared guess, or a value inside the bounds."""
+    place = form.bounds.places["horizon"][0]
+    low, high = bounds[0][place], bounds[1][place]
+    if form.horizon_guess is not None:
+        return float(np.clip(form.horizon_guess, low, high))
+    return float(np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high))
+
+
+def default(form: Formulation, role: str, place: slice, bounds: tuple[np.ndarray, np.ndarray]) -> Trajectory:
+    """A straight line between given ends, else the nearest point of the bounds to zero or their middle."""
+
+    def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
+        index = form.bounds.places[kind][place]
+        low, high = bounds[0][index], bounds[1][index]
+        finite = np.isfinite(low) & np.isfinite(high)
+        with np.errstate(invalid="ignore"):
+            value = np.where(finite, 0.5 * (low + high), np.clip(0.0, low, high))
+        return value, low == high
+
+    centre, _ = middle(role)
+    if role == "control":
+        return lambda s: np.tile(centre, (len(s), 1))
+    first, first_fixed = middle("initial")
+    last, last_fixed = middle("terminal")
+    start = np.where(first_fixed, first, np.where(last_fixed, last, centre))
+    end = np.where(last_fixed, last, start)
+    return lambda s: np.outer(1.0 - s, start) + np.outer(s, end)

@@ -1,0 +1,65 @@
+"""Piecewise polynomials kept as values at nodes: the form in which a solution stores its interpolants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["PiecewisePolynomial", "barycentric_weights", "differentiation_matrix", "lagrange"]
+
+
+@dataclass(frozen=True)
+class PiecewisePolynomial:
+    """One polynomial a piece, given by its values at nodes.
+
+    Attributes:
+        breaks: Where pieces begin and end, increasing. Shape (K + 1,).
+        nodes: Places of the values in a piece, in 0..1. Shape (d,); one node makes a piecewise constant.
+        values: Shape (K, d, n).
+    """
+
+    breaks: np.ndarray
+    nodes: np.ndarray
+    values: np.ndarray
+
+    def __call__(self, at: np.ndarray) -> np.ndarray:
+        """Values at ``at`` (M,), continuous from the right at breaks, clipped to the ends. Shape (M, n)."""
+        piece = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
+        start, end = self.breaks[piece], self.breaks[piece + 1]
+        return self.within(piece, np.clip((at - start) / (end - start), 0.0, 1.0))
+
+    def within(self, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Values at ``place`` (M,) in 0..1 of pieces ``piece`` (M,), so that both sides of a break can be asked."""
+        return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[piece]))
+
+
+def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
+    """Weights of the barycentric formula (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
+    difference = nodes[:, None] - nodes[None, :]
+    np.fill_diagonal(difference, 1.0)
+    return np.asarray(1.0 / difference.prod(axis=1))
+
+
+def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
+    at = np.asarray(at, dtype=float)
+    if len(nodes) == 1:
+        return np.ones((len(at), 1))
+    distance = at[:, None] - nodes[None, :]
+    hit = distance == 0.0
+    terms = barycentric_weights(nodes) / np.where(hit, 1.0, distance)
+    on_node = hit.any(axis=1, keepdims=True)
+    total = np.where(on_node, 1.0, terms.sum(axis=1, keepdims=True))
+    return np.where(on_node, hit.astype(float), terms / total)
+
+
+def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
+    """Derivatives of the Lagrange basis at its own nodes: row j, column i is l_i'(node_j). Shape (d, d)."""
+    weights = barycentric_weights(nodes)
+    difference = nodes[:, None] - nodes[None, :]
+    np.fill_diagonal(difference, 1.0)
+    matrix = weights[None, :] / weights[:, None] / difference
+    np.fill_diagonal(matrix, 0.0)
+    np.fill_diagonal(matrix, -matrix.sum(axis=1))
+    return np.asarray(matrix)

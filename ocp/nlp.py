@@ -1,0 +1,230 @@
+"""The solver call: options, progress, interruption, and words for what went wrong."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.assembly import Program
+from ocp.errors import ProblemError
+from ocp.fragment import Stages
+
+__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
+
+IPOPT = {
+    "tol": 1e-10,
+    "constr_viol_tol": 1e-9,
+    "dual_inf_tol": 1e-6,
+    "acceptable_tol": 1e-8,
+    "acceptable_constr_viol_tol": 1e-8,
+    "acceptable_dual_inf_tol": 1e-5,
+    "acceptable_iter": 10,
+    "max_iter": 1000,
+    "bound_relax_factor": 0.0,
+    "honor_original_bounds": "yes",
+    "print_level": 0,
+    "sb": "yes",
+}
+FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
+SOLVERS = ("ipopt", "fatrop")
+
+ADVICE = {
+    "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
+    "lengthen the horizon or start from another guess",
+    "Maximum_Iterations_Exceeded": "raise options={'max_iter': ...}, or start from a better guess",
+    "Restoration_Failed": "start from a better guess, or scale states and constraints nearer to 1",
+    "Diverging_Iterates": "the cost may be unbounded below; bound the controls or add a term to the cost",
+    "Invalid_Number_Detected": "a function is not finite at an iterate; bound the states away from where it is singular",
+    "Search_Direction_Becomes_Too_Small": "the problem may be badly scaled or its constraints redundant",
+    "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns; drop redundant constraints",
+    "User_Requested_Stop": "interrupted; the last iterate is returned",
+    "Error_In_Step_Computation": "constraints may be redundant or a function not smooth",
+}
+SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word."""
+
+    variables: np.ndarray
+    cost: float
+    rows: np.ndarray
+    multipliers: np.ndarray
+    success: bool
+    status: str
+    iterations: int
+    seconds: float
+
+
+class Progress(ca.Callback):  # type: ignore[misc]
+    """One line on the terminal for each iteration, and a way to stop between two."""
+
+    def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
+        ca.Callback.__init__(self)
+        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
+        self.title, self.show = title, show
+        self.stop = False
+        self.reset(np.zeros(m), np.zeros(m))
+        self.construct("progress", {})
+
+    def reset(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        self.lower, self.upper = lower, upper
+        self.count, self.began, self.drawn, self.stop = 0, time.monotonic(), 0.0, False
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[Any]) -> list[int]:
+        now = time.monotonic()
+        if self.show and now - self.began > 1.0 and now - self.drawn > 0.1:
+            g = np.asarray(arguments[2].full()).reshape(-1)
+            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+            line = f"{self.title}: iteration {self.count}, cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
+            sys.stderr.write(f"\r{line[:110]:<110}")
+            sys.stderr.flush()
+            self.drawn = now
+        self.count += 1
+        return [int(self.stop)]
+
+    def close(self) -> None:
+        if self.drawn:
+            sys.stderr.write("\r" + " " * 110 + "\r")
+            sys.stderr.flush()
+
+
+def build_solver(
+    program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
+) -> tuple[Any, Progress | None]:
+    """The casadi solver of a program.
+
+    Raises:
+        ProblemError: An unknown solver, or an option that it does not take.
+    """
+    if solver not in SOLVERS:
+        raise ProblemError(f"unknown solver {solver!r}; known: {', '.join(SOLVERS)}")
+    n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+    defaults = IPOPT if solver == "ipopt" else FATROP
+    own = {**defaults, **options}
+    if not own["print_level"] and "max_iter" in own:
+        settings["show_eval_warnings"] = False
+    progress = None
+    if solver == "ipopt":
+        settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
+        progress = Progress(n, m, n_p, title, bool(sys.stderr.isatty()) and not own["print_level"])
+        settings["iteration_callback"] = progress
+    else:
+        assert stages is not None
+        # this interface has no options for ready-made derivatives; it looks for them in its cache under these names
+        settings |= {
+            "cache": fatrop_functions(program),
+            "structure_detection": "manual",
+            "nx": list(stages.states),
+            "nu": list(stages.controls),
+            "ng": list(stages.rows),
+            "N": len(stages.states) - 1,
+        }
+    try:
+        return ca.nlpsol("solver", solver, program.nlp, {**settings, solver: own}), progress
+    except RuntimeError as error:
+        raise ProblemError(f"{solver} does not take these options {options!r}: {last_line(error)}") from error
+
+
+def fatrop_functions(program: Program) -> dict[str, Any]:
+    """The derivatives of a program with the signatures that casadi's fatrop interface uses."""
+    n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
+    x, p = ca.MX.sym("x", n), ca.MX.sym("p", n_p)
+    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
+    gradient, jacobian = program.gradient(x, p)[1], program.jacobian(x, p)[1]
+    lagrangian = sigma * gradient + ca.mtimes(jacobian.T, lam)
+    hessian = ca.triu2symm(program.hessian(x, p, sigma, lam))
+    functions = (
+        ca.Function("nlp_grad_f", [x, p], [gradient], ["x", "p"], ["grad_f_x"]),
+        program.jacobian,
+        ca.Function(
+            "nlp_hess_l",
+            [x, p, sigma, lam],
+            [lagrangian, hessian],
+            ["x", "p", "lam_f", "lam_g"],
+            ["grad_gamma_x", "hess_gamma_x_x"],
+        ),
+    )
+    return {function.name(): function for function in functions}
+
+
+def call_solver(
+    solver: Any,
+    progress: Progress | None,
+    arguments: dict[str, np.ndarray],
+    options: dict[str, Any] | None = None,
+) -> Outcome:
+    """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned."""
+    began = time.monotonic()
+    if progress is not None:
+        progress.reset(arguments["lbg"], arguments["ubg"])
+    with interruptible(progress):
+        result = solver(**arguments)
+    if progress is not None:
+        progress.close()
+    stats = solver.stats()
+    word = str(stats.get("return_status", ""))
+    if not word or word.lstrip("-").isdigit():  # fatrop gives numbers
+        word = "Solve_Succeeded" if stats["success"] else "Maximum_Iterations_Exceeded"
+    if progress is not None and progress.stop:
+        word = "User_Requested_Stop"
+    success = bool(stats["success"]) or word in SUCCESSES
+    values = {key: np.asarray(result[key].full()).reshape(-1) for key in ("x", "f", "g", "lam_g")}
+    if success and not all(np.all(np.isfinite(v)) for v in values.values()):
+        success, word = False, "Invalid_Number_Detected"
+    advice = "" if success else ADVICE.get(word, "")
+    return Outcome(
+        values["x"],
+        float(values["f"][0]),
+        values["g"],
+        values["lam_g"],
+        success,
+        f"{word}: {advice}" if advice else word,
+        int(stats.get("iter_count", 0)),
+        time.monotonic() - began,
+    )
+
+
+@contextmanager
+def interruptible(progress: Progress | None) -> Iterator[None]:
+    """Turn Ctrl-C into a request to stop while a solver with a progress callback runs in the main thread."""
+    if progress is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def request(number: int, frame: Any) -> None:
+        progress.stop = True
+
+    before: Callable[..., Any] | int | None = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def last_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[-1]

@@ -1,0 +1,132 @@
+"""The minimum principle along a plan: is the Hamiltonian stationary in the control, is it constant in time?
+
+Nothing here trusts the multipliers of path constraints: at each sample those that make the Hamiltonian most nearly
+stationary are found anew by least squares, with the signs that the minimum principle demands (Bryson, Ho 1975, ch 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ocp.formulation import Formulation
+from ocp.solution import Solution
+
+__all__ = ["Optimality", "minimum_principle"]
+
+ACTIVE = 1e-5  # a bound nearer than this, relative to its scale, is active
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """How well a plan meets the minimum principle.
+
+    Attributes:
+        t: Times of the control samples, s. Shape (K,).
+        stationarity: Largest entry of the Hamiltonian's reduced gradient at each sample. Shape (K,).
+        gradient_scale: What it is judged against: the largest entry of its parts, L_u and f_u' lambda.
+        hamiltonian: At the reported times of the plan. Shape (M,).
+        hamiltonian_scale: Largest of |L| + sum |lambda_i f_i|.
+    """
+
+    t: np.ndarray
+    stationarity: np.ndarray
+    gradient_scale: float
+    hamiltonian: np.ndarray
+    hamiltonian_scale: float
+
+    @property
+    def drift(self) -> float:
+        """Largest minus smallest Hamiltonian."""
+        return float(np.ptp(self.hamiltonian))
+
+
+def minimum_principle(
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+) -> Optimality:
+    """Evaluate the minimum principle along a plan at its own control samples and reported points."""
+    horizon = solution.horizon
+    x, u, costate = (np.hstack(list(pool.values())) if pool else np.zeros((len(solution.t), 0))
+                     for pool in (solution.states, solution.controls, solution.costates))  # fmt: skip
+    lam = form.problem.symbols.sym("lam", form.nx)
+    symbols = [form.x, form.u, form.t, form.T, form.p, lam]
+    values = ca.Function("hamiltonian", symbols, [form.running, lam * form.f])
+    running, products = numbers(values, x, u, solution.t, horizon, p, costate)
+    hamiltonian = running[:, 0] + products.sum(axis=1)
+    scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
+    if form.nu == 0:
+        return Optimality(np.zeros(0), np.zeros(0), 1.0, hamiltonian, scale or 1.0)
+
+    interpolant = solution.control_interpolant
+    widths = np.diff(interpolant.breaks)
+    s = (interpolant.breaks[:-1, None] + widths[:, None] * interpolant.nodes).ravel()
+    t = s * horizon
+    controls = interpolant.values.reshape(len(s), form.nu)
+    states = solution.state_interpolant(s)
+    costates = np.column_stack([np.interp(t, solution.t, costate[:, i]) for i in range(form.nx)])
+    rows = form.path.select(form.path.uses_control)
+    outputs = [
+        ca.jacobian(form.running, form.u).T,
+        ca.mtimes(ca.jacobian(form.f, form.u).T, lam),
+        rows.expression,
+        ca.jacobian(rows.expression, form.u),
+    ]
+    function = ca.Function("gradient", symbols, [ca.densify(ca.vec(out)) for out in outputs])
+    direct, through, g, g_u = numbers(function, states, controls, t, horizon, p, costates)
+    gradient = direct + through
+
+    low, high = bounds
+    control, path = form.bounds.places["control"], rows.bounds
+    level = np.hstack([controls, g])
+    lower, upper = np.concatenate([low[control], low[path]]), np.concatenate([high[control], high[path]])
+    size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
+    equal = lower == upper  # active everywhere, even where the plan misses it
+    at_lower = (level <= lower + ACTIVE * size) | equal
+    at_upper = (level >= upper - ACTIVE * size) | equal
+    reduced = np.abs(gradient).max(axis=1)
+    for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
+        directions = np.vstack([np.eye(form.nu), g_u[k].reshape(form.nu, -1).T])
+        reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
+    parts = max(float(np.abs(direct).max(initial=0.0)), float(np.abs(through).max(initial=0.0)))
+    return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)
+
+
+def reduce_gradient(
+    gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray
+) -> np.ndarray:
+    """What no multiplier of an active constraint can balance. Shape (nu,).
+
+    A multiplier is at least zero at an upper bound, at most zero at a lower one, and free at an equality. Wrongly
+    signed ones are dropped one by one, so the result is never smaller than the best one.
+    """
+    active = list(np.flatnonzero(at_lower | at_upper))
+    while active:
+        columns = directions[active].T
+        multiplier = np.linalg.lstsq(columns, -gradient, rcond=None)[0]
+        both = (at_lower & at_upper)[active]
+        wrong = np.where(both, 0.0, np.where(at_upper[active], -multiplier, multiplier))
+        worst = int(np.argmax(wrong))
+        if wrong[worst] <= 1e-12 * (1.0 + np.abs(multiplier).max()):
+            return np.asarray(gradient + columns @ multiplier)
+        del active[worst]
+    return gradient
+
+
+def numbers(
+    function: ca.Function,
+    x: np.ndarray,
+    u: np.ndarray,
+    t: np.ndarray,
+    horizon: float,
+    p: np.ndarray,
+    lam: np.ndarray,
+) -> list[np.ndarray]:
+    """A function of (x, u, t, T, p, lambda) at M samples; each output (M, size)."""
+    m = len(t)
+    if m == 0:
+        return [np.zeros((0, function.numel_out(i))) for i in range(function.n_out())]
+    inputs = (x.T, u.T, t[None, :], np.full((1, m), horizon), np.tile(p[:, None], (1, m)), lam.T)
+    outputs = function.map(m, "serial").call([ca.DM(value) for value in inputs])
+    return [np.asarray(out.full()).T for out in outputs]

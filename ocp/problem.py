@@ -1,0 +1,453 @@
+"""What is asked: states, controls, parameters, dynamics, constraints, cost. Inert: declaring solves nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.describe import describe
+from ocp.errors import ProblemError, unknown_name
+
+__all__ = ["Constraint", "Problem", "Variable"]
+
+Value = Any  # a number, an array, or a casadi expression of parameters
+Guess = Any  # a value, or a function of time that returns one
+RESERVED = ("t", "time", "horizon")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A named state, control or parameter.
+
+    Attributes:
+        name: Its name, unique in the problem.
+        symbol: Its symbol. Shape (n, 1).
+        lower, upper: Bounds, casadi expressions of parameters. Shape (n, 1).
+        initial, terminal: Values at both ends, nan where an entry is free. Shape (n, 1). States only.
+        guess: A value, a function of time, or None. States and controls only.
+    """
+
+    name: str
+    symbol: Any
+    lower: Any = None
+    upper: Any = None
+    initial: Any = None
+    terminal: Any = None
+    guess: Guess = None
+
+    @property
+    def size(self) -> int:
+        return int(self.symbol.numel())
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A named vector constraint ``lower <= expression <= upper``; equal bounds make an equality.
+
+    Attributes:
+        name: Its name, unique among the constraints of the problem.
+        expression: Shape (m, 1).
+        lower, upper: casadi expressions of parameters. Shape (m, 1).
+    """
+
+    name: str
+    expression: Any
+    lower: Any
+    upper: Any
+
+    @property
+    def size(self) -> int:
+        return int(self.expression.numel())
+
+
+@dataclass
+class Horizon:
+    """The final time: fixed when lower and upper are one expression."""
+
+    symbol: Any
+    lower: Any
+    upper: Any
+    guess: float | None
+    fixed: bool
+
+
+@dataclass
+class Declarations:
+    """Everything declared so far, by kind and name, in order of declaration."""
+
+    states: dict[str, Variable] = field(default_factory=dict)
+    controls: dict[str, Variable] = field(default_factory=dict)
+    parameters: dict[str, Variable] = field(default_factory=dict)
+    dynamics: dict[str, Any] = field(default_factory=dict)
+    path: dict[str, Constraint] = field(default_factory=dict)
+    start: dict[str, Constraint] = field(default_factory=dict)
+    end: dict[str, Constraint] = field(default_factory=dict)
+    at_start: dict[str, Any] = field(default_factory=dict)
+    horizon: Horizon | None = None
+    running: Any = None
+    terminal: Any = None
+
+
+class Problem:
+    """An optimal control problem, declared piece by piece and solved by a method of choice.
+
+    Args:
+        name: A name for tables, errors and files.
+        symbols: ``casadi.SX`` (default; fast derivatives) or ``casadi.MX`` for problems that call interpolants
+            or external functions.
+
+    Raises:
+        ProblemError: From every method, naming what is wrong, at the moment it is declared.
+    """
+
+    def __init__(self, name: str, symbols: Any = ca.SX) -> None:
+        if symbols not in (ca.SX, ca.MX):
+            raise ProblemError(f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}")
+        self.name = str(name)
+        self.symbols = symbols
+        self.time = symbols.sym("time")
+        self.declared = Declarations()
+
+    # ---- variables -------------------------------------------------------------------------------------------
+
+    def state(
+        self,
+        name: str,
+        size: int | None = None,
+        *,
+        initial: Value = None,
+        terminal: Value = None,
+        lower: Value = None,
+        upper: Value = None,
+        guess: Guess = None,
+    ) -> Any:
+        """Declare a state and return its symbol, shape (n, 1).
+
+        Args:
+            name: Unique name.
+            size: Number of entries; taken from the arrays given where left out (1 if they are all scalars).
+            initial, terminal: Values at both ends; nan leaves an entry free, None leaves all free. A scalar is
+                for every entry. May be expressions of parameters.
+            lower, upper: Bounds at every time; may be expressions of parameters.
+            guess: A value, or a function ``time -> value``.
+        """
+        given = {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
+        size = self._size(f"state {name!r}", size, {**given, "guess": guess})
+        symbol = self._symbol("state", name, size)
+        what = f"state {name!r}"
+        low, high = self._bounds(what, size, lower, upper)
+        first = self._column(f"{what}: initial", initial, size, np.nan)
+        last = self._column(f"{what}: terminal", terminal, size, np.nan)
+        for label, value in (("initial", first), ("terminal", last)):
+            check_inside(f"{what}: {label}", constant(value), constant(low), constant(high))
+        self._check_guess(what, guess, size)
+        self.declared.states[name] = Variable(name, symbol, low, high, first, last, guess)
+        return symbol
+
+    def control(
+        self,
+        name: str,
+        size: int | None = None,
+        *,
+        lower: Value = None,
+        upper: Value = None,
+        guess: Guess = None,
+    ) -> Any:
+        """Declare a control and return its symbol, shape (n, 1). Arguments as for :meth:`state`."""
+        size = self._size(f"control {name!r}", size, {"lower": lower, "upper": upper, "guess": guess})
+        symbol = self._symbol("control", name, size)
+        low, high = self._bounds(f"control {name!r}", size, lower, upper)
+        self._check_guess(f"control {name!r}", guess, size)
+        self.declared.controls[name] = Variable(name, symbol, low, high, guess=guess)
+        return symbol
+
+    def parameter(self, name: str, size: int = 1) -> Any:
+        """Declare a parameter, whose value is given at solve time, and return its symbol, shape (n, 1)."""
+        size = self._size(f"parameter {name!r}", size, {})
+        symbol = self._symbol("parameter", name, size)
+        self.declared.parameters[name] = Variable(name, symbol)
+        return symbol
+
+    def horizon(
+        self, value: Value = None, *, lower: Value = None, upper: Value = None, guess: float | None = None
+    ) -> Any:
+        """Fix the final time (``value``, s) or free it (``lower``, ``upper``, ``guess``); return its symbol.
+
+        A free horizon starts at 0 excluded: ``lower`` must be positive (default 1e-6 s).
+        """
+        what = f"problem {self.name!r}: horizon"
+        if self.declared.horizon is not None:
+            raise ProblemError(f"{what} is declared twice")
+        symbol = self.symbols.sym("horizon")
+        for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
+            if bound is not None and not is_symbolic(bound) and np.any(np.isnan(numeric(what, bound))):
+                raise ProblemError(f"{what}: {label} is not a number: {bound!r}")
+        if value is not None:
+            if not (lower is None and upper is None and guess is None):
+                raise ProblemError(f"{what}: give a fixed value or lower, upper and guess, not both")
+            low = high = self._column(what, value, 1, np.nan)
+            check_horizon(what, constant(low))
+        else:
+            low = self._column(f"{what}: lower", lower, 1, 1e-6)
+            high = self._column(f"{what}: upper", upper, 1, np.inf)
+            check_horizon(f"{what}: lower", constant(low))
+            check_order(what, constant(low), constant(high))
+            if guess is not None:
+                check_horizon(f"{what}: guess", np.array([float(guess)]))
+                check_inside(f"{what}: guess", np.array([float(guess)]), constant(low), constant(high))
+        self.declared.horizon = Horizon(symbol, low, high, guess, value is not None)
+        return symbol
+
+    def at_start(self, variable: Any) -> Any:
+        """Symbol of a state or control at the start, for conditions that tie both ends. Shape (n, 1)."""
+        found = self._find({**self.declared.states, **self.declared.controls}, variable, "at_start")
+        if found.name not in self.declared.at_start:
+            self.declared.at_start[found.name] = self.symbols.sym(f"{found.name}_at_start", found.size)
+        return self.declared.at_start[found.name]
+
+    # ---- equations -------------------------------------------------------------------------------------------
+
+    def dynamics(self, state: Any, derivative: Value) -> None:
+        """Declare ``d state / dt = derivative``, shape (n, 1), of states, controls, parameters, time, horizon."""
+        found = self._find(self.declared.states, state, "dynamics")
+        if found.name in self.declared.dynamics:
+            raise ProblemError(f"state {found.name!r}: dynamics declared twice")
+        what = f"dynamics of {found.name!r}"
+        expression = self._expression(what, derivative, self._inner())
+        if expression.numel() != found.size:
+            raise ProblemError(f"{what} has {expression.numel()} entries, the state has {found.size}")
+        self.declared.dynamics[found.name] = expression
+
+    def path(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+        """Declare ``lower <= expression <= upper`` at every time; equal bounds make an equality."""
+        self._constrain(self.declared.path, "path", name, expression, lower, upper, self._inner())
+
+    def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+        """Declare ``lower <= expression <= upper`` at the start."""
+        self._constrain(self.declared.start, "start", name, expression, lower, upper, self._inner())
+
+    def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+        """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
+        known = self._inner() + list(self.declared.at_start.values())
+        self._constrain(self.declared.end, "end", name, expression, lower, upper, known)
+
+    def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
+        """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
+        if self.declared.running is not None:
+            raise ProblemError(f"problem {self.name!r}: the cost is declared twice")
+        ends = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
+        ends += [*self.declared.at_start.values(), self.time, *self._horizon_symbol()]
+        costs = {
+            "running": self._expression("running cost", running, self._inner()),
+            "terminal": self._expression("terminal cost", terminal, ends),
+        }
+        for label, cost in costs.items():
+            if cost.numel() != 1:
+                raise ProblemError(f"{label} cost must be a scalar, it has {cost.numel()} entries")
+        self.declared.running, self.declared.terminal = costs["running"], costs["terminal"]
+
+    def check(self) -> None:
+        """Raise ProblemError where the declaration is not complete: no state, a state without dynamics, no horizon."""
+        if not self.declared.states:
+            raise ProblemError(f"problem {self.name!r} has no state; declare one with problem.state(...)")
+        for name in self.declared.states:
+            if name not in self.declared.dynamics:
+                raise ProblemError(f"state {name!r} has no dynamics; declare problem.dynamics({name}, ...)")
+        if self.declared.horizon is None:
+            raise ProblemError(f"problem {self.name!r} has no horizon; declare problem.horizon(...)")
+
+    def __str__(self) -> str:
+        return describe(self.name, self.declared)
+
+    def __repr__(self) -> str:
+        d = self.declared
+        return f"<Problem {self.name!r}: {len(d.states)} states, {len(d.controls)} controls>"
+
+    # ---- checks ----------------------------------------------------------------------------------------------
+
+    def _horizon_symbol(self) -> list[Any]:
+        return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
+
+    def _inner(self) -> list[Any]:
+        """Symbols that may stand inside the horizon."""
+        d = self.declared
+        variables = (*d.states.values(), *d.controls.values(), *d.parameters.values())
+        return [v.symbol for v in variables] + [self.time, *self._horizon_symbol()]
+
+    def _symbol(self, kind: str, name: str, size: int) -> Any:
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
+        if name in RESERVED:
+            raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
+        for other in ("states", "controls", "parameters"):
+            if name in getattr(self.declared, other):
+                raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
+        return self.symbols.sym(name, size)
+
+    def _size(self, what: str, size: int | None, given: dict[str, Value]) -> int:
+        if size is not None:
+            if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+                raise ProblemError(f"{what}: size must be a positive integer, not {size!r}")
+            return int(size)
+        lengths = {k: stacked(v).numel() if is_symbolic(v) else np.size(v) for k, v in given.items() if not callable(v)}
+        sizes = {k: n for k, n in lengths.items() if given[k] is not None and n != 1}
+        if len(set(sizes.values())) > 1:
+            detail = ", ".join(f"{k} has {n}" for k, n in sizes.items())
+            raise ProblemError(f"{what}: sizes do not match: {detail} entries")
+        return int(next(iter(sizes.values()), 1))
+
+    def _column(self, what: str, value: Value, size: int, default: float) -> Any:
+        """A value as a column of the problem's symbols, free of anything but parameters. Shape (size, 1)."""
+        if value is None:
+            return self.symbols(ca.DM.ones(size, 1) * default)
+        if is_symbolic(value):
+            expression = self._expression(what, value, [v.symbol for v in self.declared.parameters.values()])
+        else:
+            array = numeric(what, value)
+            expression = self.symbols(ca.DM(array))
+        if expression.numel() == 1:
+            expression = ca.repmat(expression, size, 1)
+        if expression.numel() != size:
+            raise ProblemError(f"{what} has {expression.numel()} entries, {size} expected")
+        return ca.densify(ca.vec(expression))
+
+    def _bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:
+        low = self._column(f"{what}: lower", lower, size, -np.inf)
+        high = self._column(f"{what}: upper", upper, size, np.inf)
+        for label, value in (("lower", lower), ("upper", upper)):
+            if value is not None and not is_symbolic(value) and np.any(np.isnan(numeric(what, value))):
+                raise ProblemError(f"{what}: {label} is not a number: {value!r}")
+        check_order(what, constant(low), constant(high))
+        return low, high
+
+    def _check_guess(self, what: str, guess: Guess, size: int) -> None:
+        if guess is None or callable(guess):
+            return
+        array = numeric(f"{what}: guess", guess)
+        if not np.all(np.isfinite(array)):
+            raise ProblemError(f"{what}: guess is not finite: {array.tolist()}")
+        if array.size not in (1, size):
+            raise ProblemError(f"{what}: guess has {array.size} entries, {size} expected")
+
+    def _expression(self, what: str, value: Value, known: Sequence[Any]) -> Any:
+        if value is None or isinstance(value, str):
+            raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
+        if is_symbolic(value):
+            expression = stacked(value)
+            if not isinstance(expression, self.symbols):
+                have, want = type(expression).__name__, self.symbols.__name__
+                raise ProblemError(f"{what} is made of {have} symbols, the problem of {want} symbols")
+        else:
+            array = numeric(what, value)
+            if not np.all(np.isfinite(array)):
+                raise ProblemError(f"{what} is not finite: {array.tolist()}")
+            expression = self.symbols(ca.DM(array))
+        identities = {identity(s) for symbol in known for s in ca.symvar(symbol)}
+        for symbol in ca.symvar(expression):
+            if identity(symbol) not in identities:
+                raise ProblemError(
+                    f"{what} uses the symbol {symbol.name()!r}, which may not stand there: it is not part of this "
+                    f"problem, was declared later, or has no meaning at this place"
+                )
+        return expression
+
+    def _find(self, pool: dict[str, Variable], symbol: Any, what: str) -> Variable:
+        if isinstance(symbol, str):
+            if symbol in pool:
+                return pool[symbol]
+            raise unknown_name(f"variable in {what}", symbol, pool)
+        if isinstance(symbol, self.symbols) and symbol.is_valid_input():
+            wanted = [identity(s) for s in ca.symvar(symbol)]
+            for variable in pool.values():
+                if [identity(s) for s in ca.symvar(variable.symbol)] == wanted:
+                    return variable
+        raise ProblemError(
+            f"{what}: {symbol!r} is not a declared {'state' if what == 'dynamics' else 'state or control'} of "
+            f"problem {self.name!r}; known: {', '.join(pool) or 'none'}"
+        )
+
+    def _constrain(
+        self,
+        pool: dict[str, Constraint],
+        kind: str,
+        name: str,
+        expression: Value,
+        lower: Value,
+        upper: Value,
+        known: Sequence[Any],
+    ) -> None:
+        what = f"{kind} constraint {name!r}"
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind} constraint: its name must be a non-empty string, not {name!r}")
+        for other in (self.declared.path, self.declared.start, self.declared.end):
+            if name in other:
+                raise ProblemError(f"{what}: a constraint of this name exists already")
+        vector = self._expression(what, expression, known)
+        if lower is None and upper is None:
+            raise ProblemError(f"{what} has neither lower nor upper bound")
+        low, high = self._bounds(what, vector.numel(), lower, upper)
+        pool[name] = Constraint(name, vector, low, high)
+
+
+def is_symbolic(value: Any) -> bool:
+    """Whether a value is an expression, or a list or tuple that holds one."""
+    if isinstance(value, list | tuple):
+        return any(is_symbolic(entry) for entry in value)
+    return isinstance(value, ca.SX | ca.MX)
+
+
+def stacked(value: Any) -> Any:
+    """An expression as one column; a list or tuple of expressions and numbers is stacked."""
+    return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
+
+
+def identity(symbol: Any) -> int:
+    """A number that is the same for the same scalar SX or the same MX symbol."""
+    return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
+
+
+def numeric(what: str, value: Any) -> np.ndarray:
+    """A value as a flat float array, or ProblemError where it is none."""
+    try:
+        array = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{what}: numbers or expressions are expected, not {value!r}") from error
+    return array.reshape(-1)
+
+
+def constant(expression: Any) -> np.ndarray:
+    """Numbers of a column of constants, nan where an entry is an expression of parameters. Shape (n,)."""
+    entries = ca.vertsplit(expression)
+    if isinstance(expression, ca.MX):
+        if not ca.symvar(expression):
+            return np.asarray(ca.evalf(expression).full()).reshape(-1)
+        return np.full(len(entries), np.nan)
+    return np.array([float(entry) if entry.is_constant() else np.nan for entry in entries])
+
+
+def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raise where a lower bound lies above its upper bound, or bounds cannot be met at all."""
+    for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        if low > high:
+            raise ProblemError(f"{what}: lower bound {low:g} is above upper bound {high:g} (entry {i})")
+        if low == np.inf or high == -np.inf:
+            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})")
+
+
+def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raise where a value (nan: free) is infinite or lies outside its bounds (nan: not known yet)."""
+    for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
+        if np.isinf(number):
+            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free")
+        if number < low or number > high:
+            raise ProblemError(f"{what} value {number:g} is outside the bounds [{low:g}, {high:g}] (entry {i})")
+
+
+def check_horizon(what: str, value: np.ndarray) -> None:
+    """Raise unless a horizon is a positive finite number (nan: an expression of parameters)."""
+    if np.isinf(value[0]) or value[0] <= 0:
+        raise ProblemError(f"{what} must be positive and finite, not {value[0]:g} s")

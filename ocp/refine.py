@@ -1,0 +1,103 @@
+"""Mesh refinement by the audit's own integration error."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ocp.collocation import Collocation
+from ocp.errors import ProblemError, RefinementWarning
+from ocp.problem import Problem
+from ocp.shooting import MultipleShooting
+from ocp.solution import Refinement, Solution
+from ocp.solve import solve
+from ocp.transcription import fractions
+
+__all__ = ["refine", "split"]
+
+SAFETY = 0.5
+MOST = 4  # pieces that an interval is split into at once
+ROUNDS = 20
+
+
+def refine(
+    problem: Problem,
+    method: Collocation | MultipleShooting,
+    *,
+    tolerance: float = 1e-6,
+    max_intervals: int = 400,
+    parameters: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    options: Mapping[str, Any] | None = None,
+    guess: Solution | Mapping[str, Any] | None = None,
+) -> Solution:
+    """Solve, and split intervals by their error until the audit's integration error is under ``tolerance``.
+
+    The error of an interval is the distance of the plan from its re-integration over that interval alone. It falls with
+    the power of the width that is the method's order, which says into how many pieces the interval is split. Every
+    round starts from the plan before.
+
+    Args:
+        problem, parameters, solver, options, guess: As for :func:`ocp.solve`.
+        method: The mesh to start from.
+        tolerance: Largest integration error, relative to the size of each state.
+        max_intervals: Cap on the number of intervals.
+
+    Returns:
+        The last solution; its ``refinement`` says how the mesh came about and whether the tolerance was reached.
+
+    Raises:
+        ProblemError: tolerance not positive, or cap below the first mesh.
+        SolveError: A round failed.
+
+    Warns:
+        RefinementWarning: The cap (or the least width) stopped it before the tolerance was reached.
+    """
+    if not (np.isfinite(tolerance) and tolerance > 0):
+        raise ProblemError(f"refine: tolerance must be positive and finite, not {tolerance!r}")
+    if max_intervals < method.intervals:
+        raise ProblemError(f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given")
+    order = method.degree + 1 if isinstance(method, Collocation) else 4
+    intervals: list[int] = []
+    errors: list[float] = []
+    while True:
+        solution = solve(problem, method, parameters=parameters, solver=solver, options=options, guess=guess)
+        audit = solution.audit()
+        intervals.append(method.intervals)
+        errors.append(audit.integration_error)
+        reached = audit.integration_error <= tolerance
+        mesh = fractions(method.intervals, method.mesh)
+        finer = split(mesh, audit.local_errors, SAFETY * tolerance, order, max_intervals)
+        if reached or len(finer) == len(mesh) or len(errors) == ROUNDS:
+            break
+        method = dataclasses.replace(method, intervals=len(finer) - 1, mesh=tuple(finer.tolist()))
+        guess = solution
+    if not reached:
+        warnings.warn(
+            f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals with an "
+            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals or degree",
+            RefinementWarning,
+            stacklevel=2,
+        )
+    return dataclasses.replace(solution, refinement=Refinement(tuple(intervals), tuple(errors), tolerance, reached))
+
+
+def split(mesh: np.ndarray, errors: np.ndarray, target: float, order: int, most: int) -> np.ndarray:
+    """A finer mesh of at most ``most`` intervals, the worst intervals split first. Shape (N' + 1,)."""
+    with np.errstate(over="ignore"):
+        wanted = np.ceil((np.where(np.isfinite(errors), errors, np.inf) / target) ** (1.0 / order))
+    pieces = np.clip(wanted, 1, MOST).astype(int)
+    if np.all(pieces == 1):  # every interval is good, their sum is not: halve the worse half
+        pieces[errors >= np.median(errors)] = 2
+    room = most - len(errors)
+    for k in np.argsort(errors):  # the least bad give way first
+        excess = int(np.sum(pieces - 1)) - room
+        if excess <= 0:
+            break
+        pieces[k] = max(1, pieces[k] - excess)
+    cuts = [np.linspace(mesh[k], mesh[k + 1], n + 1)[:-1] for k, n in enumerate(pieces)]
+    return np.concatenate([*cuts, mesh[-1:]])

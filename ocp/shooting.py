@@ -1,0 +1,226 @@
+"""Direct multiple shooting: every interval is integrated from its own start, and its end must meet the next one.
+
+Bock, Plitt 1984. The multipliers of these continuity conditions are the costates at the nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.formulation import Formulation
+from ocp.fragment import Block, Fragment
+from ocp.interpolation import PiecewisePolynomial
+from ocp.transcription import FragmentBuilder, check_intervals, fractions
+
+__all__ = ["MultipleShooting"]
+
+THIRDS = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
+INLINE = 3000  # instructions of a stage up to which it is one flat SX function
+CVODES = {"reltol": 1e-12, "abstol": 1e-12, "max_num_steps": 100_000, "quad_err_con": True}
+
+
+@dataclass(frozen=True)
+class MultipleShooting:
+    """Multiple shooting on a mesh of intervals.
+
+    Attributes:
+        intervals: Number of intervals.
+        integrator: ``rk4`` (classical Runge-Kutta, ``steps`` equal steps) or ``cvodes`` (variable step and order,
+            tolerance 1e-10; for stiff dynamics; slow second derivatives).
+        steps: Integration steps an interval; for cvodes the number of pieces of the reported interpolant.
+        control: ``held`` (constant on an interval) or ``linear`` (linear between nodes, continuous).
+        mesh: Fractions 0..1 where intervals begin and end, N + 1 of them; None for equal intervals.
+
+    Raises:
+        ProblemError: For a value outside these.
+    """
+
+    intervals: int
+    integrator: str = "rk4"
+    steps: int = 1
+    control: str = "held"
+    mesh: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        check_intervals("MultipleShooting", self.intervals, self.mesh)
+        if self.integrator not in ("rk4", "cvodes"):
+            raise ProblemError(f"MultipleShooting: integrator must be 'rk4' or 'cvodes', not {self.integrator!r}")
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int | np.integer) or self.steps < 1:
+            raise ProblemError(f"MultipleShooting: steps must be a positive integer, not {self.steps!r}")
+        if self.control not in ("held", "linear"):
+            raise ProblemError(f"MultipleShooting: control must be 'held' or 'linear', not {self.control!r}")
+
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
+        return transcribe(self, form, staged)
+
+
+def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fragment:
+    nx, nu = form.nx, form.nu
+    mesh = fractions(method.intervals, method.mesh)
+    n, width = len(mesh) - 1, np.diff(mesh)
+    stages = np.arange(n)
+    linear = method.control == "linear"
+    build = FragmentBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
+    lay = build.layout
+    first, last = lay.node[:nx, :-1], lay.node_end[:nx]
+    if linear:
+        controls = np.stack([lay.node[nx:, :-1], lay.node_end[nx:]])  # at both ends of the interval, (2, nu, n)
+    else:
+        build.variables("control", lay.interval, mesh[:-1] + 0.5 * width, "control")
+        controls = lay.interval[None]
+
+    # the end of every interval: x_end - F(x, u) = 0
+    rows = build.rows(tuple(f"continuity of {name}" for name in form.state_labels), None, stages, mesh[1:])
+    build.linear(rows, last, 1.0)
+    variables = build.point(first, controls.reshape(-1, n), stages)
+    data = np.vstack([mesh[:-1], width])
+    build.blocks.append(Block(interval_function(form, method), variables, data, rows))
+
+    # path constraints: at both ends of an interval where they contain a control, else at the nodes
+    free = ~form.path.uses_control
+    if linear:
+        build.node_rows(form.path, lay.node[nx:])
+        ends = (np.ones(1), np.ones(1))
+        build.ends(ends, lay.node[nx:, 0][None], lay.node[nx:, -1][None], at_nodes=True)
+    else:
+        held = lay.interval
+        build.path_rows(form.path.select(~free), first, held, stages, mesh[:-1])
+        build.path_rows(form.path.select(~free & ~form.path.equality), last, held, stages, mesh[1:])
+        build.node_rows(form.path.select(free), np.column_stack([held, held[:, -1]]))
+        build.ends((np.ones(1), np.ones(1)), held[:, 0][None], held[:, -1][None], at_nodes=False)
+
+    report = (np.concatenate([stages, [n - 1]]), np.concatenate([np.zeros(n), [1.0]]))
+    costate_rows = np.vstack([np.full((1, nx), -1), rows.T])
+    costate_scale = np.concatenate([[1.0], np.full(n, -1.0)])
+    dense = dense_function(form, method).map(n, "serial")
+
+    def interpolants(
+        values: np.ndarray, parameters: np.ndarray, horizon: float
+    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        everything = np.tile(parameters[:, None], (1, n))
+        inputs = (values[first], values[controls.reshape(-1, n)], data, np.full((1, n), horizon), everything)
+        states, slopes = (np.asarray(out.full()).reshape(nx, n, method.steps + 1) for out in dense(*inputs))
+        return hermite(mesh, states, slopes, horizon), held_or_linear(mesh, values[controls])
+
+    nodes = np.arange(n + 1)
+    return build.finish(report, lay.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
+
+
+def held_or_linear(mesh: np.ndarray, controls: np.ndarray) -> PiecewisePolynomial:
+    """Controls (1 or 2, nu, n) as a piecewise constant or linear function."""
+    nodes = np.array([0.5]) if len(controls) == 1 else np.array([0.0, 1.0])
+    return PiecewisePolynomial(mesh, nodes, controls.transpose(2, 0, 1))
+
+
+def hermite(mesh: np.ndarray, states: np.ndarray, slopes: np.ndarray, horizon: float) -> PiecewisePolynomial:
+    """Cubic Hermite curves through states and slopes (nx, n, steps + 1), kept as values at thirds."""
+    nx, _, knots = states.shape
+    steps = knots - 1
+    breaks = (mesh[:-1, None] + np.diff(mesh)[:, None] * np.arange(steps) / steps).ravel()
+    breaks = np.concatenate([breaks, [1.0]])
+    h = np.diff(breaks)[:, None, None] * horizon
+    a, b = (states[:, :, i : i + steps].reshape(nx, -1).T[:, None, :] for i in (0, 1))
+    da, db = (slopes[:, :, i : i + steps].reshape(nx, -1).T[:, None, :] * h for i in (0, 1))
+    s = THIRDS[None, :, None]
+    curve = (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * da + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * db
+    return PiecewisePolynomial(breaks, THIRDS, curve)
+
+
+# ---- integration of one interval -----------------------------------------------------------------------------
+
+
+def controls_of(form: Formulation, method: MultipleShooting) -> int:
+    return form.nu * (2 if method.control == "linear" else 1)
+
+
+def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) -> Any:
+    """The control at ``place`` 0..1 of an interval, from its control variables ``w``."""
+    if method.control == "held":
+        return w
+    return (1 - place) * w[: form.nu] + place * w[form.nu :]
+
+
+def interval_function(form: Formulation, method: MultipleShooting) -> Any:
+    """Block (v = [x; controls; T where free], d = [s, h], p) -> (integral of the running cost, -F(x, controls))."""
+    nw = controls_of(form, method)
+    step, flat = step_function(form, method)
+    sym = (ca.SX if flat else ca.MX).sym
+    v, d = sym("v", form.nx + nw + form.horizon_is_free), sym("d", 2)
+    p = sym("p", form.np)
+    horizon = v[form.nx + nw] if form.horizon_is_free else form.horizon_at(p)
+    x, w = v[: form.nx], v[form.nx : form.nx + nw]
+    cost: Any = 0
+    pieces = method.steps if method.integrator == "rk4" else 1
+    for i in range(pieces):
+        x, part = step(x, w, d, i, horizon, p)
+        cost = cost + part
+    return ca.Function("interval", [v, d, p], [cost, -x])
+
+
+def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
+    """One integration step (x, w, d, number of the step, T, p) -> (x, cost), and whether to inline all into SX."""
+    if method.integrator == "cvodes":
+        return cvodes(form, method, [1.0])[0], False
+    function = form.function("f", [form.f, form.running], ["f", "running"])
+    sym = form.problem.symbols.sym
+    x, w, d, i = sym("x", form.nx), sym("w", controls_of(form, method)), sym("d", 2), sym("i")
+    horizon, p = sym("T"), sym("p", form.np)
+    h = d[1] * horizon / method.steps
+
+    def slope(place: float, state: Any) -> Any:
+        within = (i + place) / method.steps
+        time = (d[0] + d[1] * within) * horizon
+        return ca.vertcat(*function(state, control_at(form, method, w, within), time, horizon, p))
+
+    k1 = slope(0.0, x)
+    k2 = slope(0.5, x + h / 2 * k1[: form.nx])
+    k3 = slope(0.5, x + h / 2 * k2[: form.nx])
+    k4 = slope(1.0, x + h * k3[: form.nx])
+    change = h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    outputs = [x + change[: form.nx], change[form.nx]]
+    step = ca.Function("step", [x, w, d, i, horizon, p], outputs)
+    flat = step.is_a("SXFunction") and step.n_instructions() * method.steps < INLINE
+    return step, flat
+
+
+def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> tuple[Any, Any]:
+    """(x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost), and the integrator itself."""
+    sym = form.problem.symbols.sym
+    nw = controls_of(form, method)
+    x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
+    w, s, h, horizon, p = (q[:nw], q[nw], q[nw + 1], q[nw + 2], q[nw + 3 :])
+    function = form.function("f", [form.f, form.running], ["f", "running"])
+    rate, cost = function(x, control_at(form, method, w, place), (s + h * place) * horizon, horizon, p)
+    dae = {"x": x, "t": place, "p": q, "ode": h * horizon * rate, "quad": h * horizon * cost}
+    integrator = ca.integrator("cvodes", "cvodes", dae, 0.0, places, CVODES)
+    x, w, d, i = ca.MX.sym("x", form.nx), ca.MX.sym("w", nw), ca.MX.sym("d", 2), ca.MX.sym("i")
+    horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
+    result = integrator(x0=x, p=ca.vertcat(w, d, horizon, p))
+    outputs = [result["xf"], result["qf"]]
+    return ca.Function("step", [x, w, d, i, horizon, p], outputs), integrator
+
+
+def dense_function(form: Formulation, method: MultipleShooting) -> Any:
+    """(x, w, d, T, p) -> states and their derivatives at the ``steps + 1`` knots of an interval, side by side."""
+    x, w, d = ca.MX.sym("x", form.nx), ca.MX.sym("w", controls_of(form, method)), ca.MX.sym("d", 2)
+    horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
+    if method.integrator == "cvodes":
+        places = (np.arange(1, method.steps + 1) / method.steps).tolist()
+        knots = [x, *ca.horzsplit(cvodes(form, method, places)[0](x, w, d, 0, horizon, p)[0])]
+    else:
+        step, knots = step_function(form, method)[0], [x]
+        for i in range(method.steps):
+            knots.append(step(knots[-1], w, d, i, horizon, p)[0])
+    rate = form.function("rate", [form.f], ["f"])
+    slopes = []
+    for i, state in enumerate(knots):
+        place = i / method.steps
+        time = (d[0] + d[1] * place) * horizon
+        slopes.append(rate(state, control_at(form, method, w, place), time, horizon, p))
+    return ca.Function("dense", [x, w, d, horizon, p], [ca.horzcat(*knots), ca.horzcat(*slopes)])

@@ -1,0 +1,230 @@
+"""A solved problem as plain arrays: read, interpolate, save, load, audit."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ocp.errors import AuditError, ProblemError, unknown_name
+from ocp.interpolation import PiecewisePolynomial
+
+if TYPE_CHECKING:
+    from ocp.audit import Audit
+    from ocp.problem import Problem
+
+__all__ = ["Refinement", "Sample", "Solution"]
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Sample(Mapping[str, np.ndarray]):
+    """States and controls at one time (each (n,)) or at several (each (M, n)), by name."""
+
+    arrays: dict[str, np.ndarray]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.arrays:
+            raise unknown_name("state or control", name, self.arrays)
+        return self.arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.arrays)
+
+    def __len__(self) -> int:
+        return len(self.arrays)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How a mesh was refined.
+
+    Attributes:
+        intervals, errors: Number of intervals and relative integration error of every round.
+        tolerance: What was asked. reached: Whether it was reached before the cap.
+    """
+
+    intervals: tuple[int, ...]
+    errors: tuple[float, ...]
+    tolerance: float
+    reached: bool
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The result of a solve.
+
+    Attributes:
+        name: Name of the problem.
+        method: What solved it, as a dictionary of its settings.
+        solver: ``ipopt``, ``fatrop``, ...
+        success: Whether the solver reports an optimum within its tolerance.
+        status: The solver's word, with what to try where it failed.
+        cost: Value of the cost. iterations: of the solver. horizon: Final time, s.
+        t: Reported times, s; first 0, last the horizon. Shape (M,).
+        states, controls, costates: Values at the reported times by name, each (M, n). Costates are
+            d(optimal cost)/d(state), so that H = running cost + costate . derivative.
+        parameters: Their values by name.
+        state_interpolant, control_interpolant: Over fractions 0..1 of the horizon, of all states (controls) stacked.
+        variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
+        seconds: Wall time of ``build`` and ``solve``.
+        problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
+    """
+
+    name: str
+    method: dict[str, Any]
+    solver: str
+    success: bool
+    status: str
+    cost: float
+    iterations: int
+    horizon: float
+    t: np.ndarray
+    states: dict[str, np.ndarray]
+    controls: dict[str, np.ndarray]
+    costates: dict[str, np.ndarray]
+    parameters: dict[str, np.ndarray]
+    state_interpolant: PiecewisePolynomial
+    control_interpolant: PiecewisePolynomial
+    variables: np.ndarray
+    multipliers: np.ndarray
+    seconds: dict[str, float]
+    problem: Problem | None = field(default=None, compare=False, repr=False)
+    refinement: Refinement | None = None
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Values of a state or control at the reported times. Shape (M, n)."""
+        for pool in (self.states, self.controls):
+            if name in pool:
+                return pool[name]
+        raise unknown_name("state or control", name, [*self.states, *self.controls])
+
+    def costate(self, name: str) -> np.ndarray:
+        """Costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""
+        if name not in self.costates:
+            raise unknown_name("state", name, self.costates)
+        return self.costates[name]
+
+    def at(self, time: Any) -> Sample:
+        """States and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own interpolant.
+
+        Raises:
+            ProblemError: A time outside 0 to the horizon, or not finite.
+        """
+        times = np.asarray(time, dtype=float)
+        slack = 1e-12 * self.horizon
+        if not np.all((times >= -slack) & (times <= self.horizon + slack)):
+            raise ProblemError(f"time {time!r} is outside the plan, 0 to {self.horizon:g} s")
+        return self.at_fraction(times / self.horizon)
+
+    def at_fraction(self, fraction: Any) -> Sample:
+        """As :meth:`at`, at fractions 0..1 of the horizon."""
+        at = np.asarray(fraction, dtype=float)
+        flat = np.clip(at.reshape(-1), 0.0, 1.0)
+        values: dict[str, np.ndarray] = {}
+        for pool, interpolant in (
+            (self.states, self.state_interpolant),
+            (self.controls, self.control_interpolant),
+        ):
+            values |= unstack(pool, interpolant(flat))
+        return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
+
+    def audit(self, problem: Problem | None = None, **settings: Any) -> Audit:
+        """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit`.
+
+        Raises:
+            AuditError: The solution was loaded from a file and no problem is given.
+        """
+        from ocp.audit import audit
+
+        known = problem if problem is not None else self.problem
+        if known is None:
+            raise AuditError(f"plan {self.name!r} was loaded without its problem; call audit(problem)")
+        return audit(known, self, **settings)
+
+    def with_problem(self, problem: Problem) -> Solution:
+        """The same solution tied to a problem, after :meth:`load`."""
+        return replace(self, problem=problem)
+
+    # ---- files -----------------------------------------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write arrays and JSON (no pickle) to one ``.npz`` file, whole or not at all."""
+        target = Path(path)
+        arrays: dict[str, np.ndarray] = {
+            "t": self.t,
+            "variables": self.variables,
+            "multipliers": self.multipliers,
+        }
+        for kind in ("states", "controls", "costates", "parameters"):
+            arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
+        for kind in ("state_interpolant", "control_interpolant"):
+            part = getattr(self, kind)
+            arrays |= {f"{kind}/{what}": getattr(part, what) for what in ("breaks", "nodes", "values")}
+        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
+        head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
+        head["order"] = {k: list(getattr(self, k)) for k in ("states", "controls", "costates", "parameters")}
+        if self.refinement is not None:
+            head["refinement"] = self.refinement.__dict__
+        arrays["head"] = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
+        handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+            os.replace(temporary, target)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Solution:
+        """Read a file written by :meth:`save`.
+
+        Raises:
+            ProblemError: The file is not such a file, or of an unknown version.
+        """
+        try:
+            with np.load(Path(path), allow_pickle=False) as archive:
+                arrays = {key: archive[key] for key in archive.files}
+            head = json.loads(arrays.pop("head").tobytes().decode())
+            version = head.pop("version")
+            if version != VERSION:
+                raise ProblemError(f"{path}: written by another version of the format ({version}, not {VERSION})")
+            order = head.pop("order")
+            fields: dict[str, Any] = {
+                kind: {name: arrays[f"{kind}/{name}"] for name in names} for kind, names in order.items()
+            }
+            fields |= {
+                kind: PiecewisePolynomial(*(arrays[f"{kind}/{what}"] for what in ("breaks", "nodes", "values")))
+                for kind in ("state_interpolant", "control_interpolant")
+            }
+            past = head.pop("refinement", None)
+            refinement = None
+            if past is not None:
+                refinement = Refinement(
+                    tuple(past["intervals"]), tuple(past["errors"]), past["tolerance"], past["reached"]
+                )
+            fields |= {key: arrays[key] for key in ("t", "variables", "multipliers")}
+            return cls(**head, **fields, refinement=refinement)
+        except FileNotFoundError:
+            raise
+        except (KeyError, ValueError, TypeError, OSError) as error:
+            if isinstance(error, ProblemError):
+                raise
+            raise ProblemError(f"{path} is not a saved solution: {error}") from error
+
+
+def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of stacked values (M, n) by name, in the order and sizes of ``pool``."""
+    values, offset = {}, 0
+    for name, like in pool.items():
+        values[name] = stacked[:, offset : offset + like.shape[1]]
+        offset += like.shape[1]
+    return values

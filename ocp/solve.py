@@ -1,0 +1,223 @@
+"""One way in: ``solve(problem, method)``, and ``prepare`` for problems that are solved many times."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from ocp.assembly import assemble
+from ocp.errors import ProblemError, SolveError
+from ocp.formulation import Formulation
+from ocp.fragment import Fragment
+from ocp.guess import initial_point
+from ocp.nlp import Outcome, build_solver, call_solver
+from ocp.problem import Problem
+from ocp.solution import Solution
+
+__all__ = ["Method", "Prepared", "prepare", "solve"]
+
+WORST = 6
+
+
+class Method(Protocol):
+    """A transcription: turns a formulation into a nonlinear program."""
+
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment: ...
+
+
+class Prepared:
+    """A problem built once for a method and a solver, to be solved many times.
+
+    Attributes:
+        formulation, fragment, program: What was built. seconds: Wall time of the build.
+    """
+
+    def __init__(
+        self, problem: Problem, method: Method, solver: str, options: Mapping[str, Any], compiled: bool
+    ) -> None:
+        began = time.monotonic()
+        if not isinstance(problem, Problem):
+            raise ProblemError(f"a Problem is expected, not {type(problem).__name__}")
+        if not callable(getattr(method, "transcribe", None)):
+            raise ProblemError(f"a method such as Collocation(...) is expected, not {method!r}")
+        self.problem, self.method, self.solver_name = problem, method, solver
+        self.formulation = Formulation(problem)
+        self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
+        jit = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O1"], "verbose": False}}
+        self.program = assemble(self.fragment, self.formulation.np, jit if compiled else None)
+        self._solver, self._progress = build_solver(
+            self.program, solver, dict(options), self.fragment.stages, problem.name
+        )
+        self.seconds = time.monotonic() - began
+
+    def solve(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        guess: Solution | Mapping[str, Any] | None = None,
+        check: bool = True,
+    ) -> Solution:
+        """Solve with these parameters from this guess; see :func:`solve`."""
+        form, fragment = self.formulation, self.fragment
+        p = form.parameter_vector(dict(parameters or {}))
+        bounds = form.bound_values(p)
+        lower, upper = bounds
+        lbx, ubx = lower[fragment.variable_bounds], upper[fragment.variable_bounds]
+        point = np.clip(initial_point(form, fragment, guess, bounds), lbx, ubx)
+        arguments = {
+            "x0": point,
+            "p": p,
+            "lbx": lbx,
+            "ubx": ubx,
+            "lbg": lower[fragment.row_bounds],
+            "ubg": upper[fragment.row_bounds],
+        }
+        outcome = call_solver(self._solver, self._progress, arguments)
+        solution = self._solution(outcome, p)
+        if check and not outcome.success:
+            raise SolveError(self._diagnosis(outcome, arguments, solution.horizon), solution)
+        return solution
+
+    def _solution(self, outcome: Outcome, p: np.ndarray) -> Solution:
+        form, fragment = self.formulation, self.fragment
+        v = outcome.variables
+        horizon = float(form.horizon_at(p)) if fragment.horizon is None else float(v[fragment.horizon])
+        states, controls = fragment.interpolants(v, p, horizon)
+        piece, place = fragment.report
+        mesh = fragment.mesh
+        at = mesh[piece] + np.diff(mesh)[piece] * place
+        at[-1] = 1.0
+        costates = self._costates(outcome, p)
+        stacked = {
+            "states": v[fragment.report_states],
+            "controls": controls_at(controls, fragment, piece, place),
+        }
+        settings = {k: v for k, v in dataclasses.asdict(self.method).items() if v is not None}  # type: ignore[call-overload]
+        return Solution(
+            name=form.name,
+            method={"type": type(self.method).__name__, **settings},
+            solver=self.solver_name,
+            success=outcome.success,
+            status=outcome.status,
+            cost=outcome.cost,
+            iterations=outcome.iterations,
+            horizon=horizon,
+            t=at * horizon,
+            states={name: stacked["states"][:, s] for name, s in form.states.items()},
+            controls={name: stacked["controls"][:, s] for name, s in form.controls.items()},
+            costates={name: costates[:, s] for name, s in form.states.items()},
+            parameters={name: p[s] for name, s in form.parameters.items()},
+            state_interpolant=states,
+            control_interpolant=controls,
+            variables=v,
+            multipliers=outcome.multipliers,
+            seconds={"build": self.seconds, "solve": outcome.seconds},
+            problem=self.problem,
+        )
+
+    def _costates(self, outcome: Outcome, p: np.ndarray) -> np.ndarray:
+        """Costates at the reported points, from the multipliers.
+
+        At a node: the derivative, with respect to its state, of what the intervals behind it add to the Lagrangian;
+        at the end: minus what the intervals before it say.
+        """
+        fragment = self.fragment
+        costates = outcome.multipliers[fragment.costate_rows] * fragment.costate_scale[:, None]
+        inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
+        jacobian = self.program.jacobian(outcome.variables, p)[1]
+        rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
+        terms = np.array(jacobian.nonzeros()) * inner[rows]
+        running = np.asarray(self.program.inside(outcome.variables, p).full()).reshape(-1)
+
+        node_of = np.full(fragment.size, -2)
+        node_of[fragment.nodes] = np.arange(len(fragment.mesh))
+        own = fragment.row_stages[rows] == node_of[columns]
+        behind = np.bincount(columns[own], weights=terms[own], minlength=fragment.size)
+        behind[fragment.start] += running[fragment.start]
+        before = np.bincount(columns, weights=terms, minlength=fragment.size) + running
+        behind[fragment.end] = -before[fragment.end]
+        at_node = fragment.costate_rows < 0
+        costates[at_node] = behind[fragment.nodes.T[fragment.costate_nodes]][at_node]
+        return np.asarray(costates)
+
+    def _diagnosis(self, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> str:
+        """What went wrong: the worst residuals by constraint, state and time."""
+        fragment = self.fragment
+        g = outcome.rows
+        miss = np.maximum(arguments["lbg"] - g, g - arguments["ubg"])
+        lines = [f"problem {self.problem.name!r}: {self.solver_name} ended with {outcome.status}"]
+        lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
+        broken = np.flatnonzero(~np.isfinite(g))
+        for i in broken[:WORST]:
+            lines.append(f"  {fragment.row_labels[i]} is not finite at {fragment.row_fractions[i] * horizon:.4g} s")
+        seen: set[str] = set()
+        for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
+            if len(seen) == WORST or not miss[i] > 1e-8:
+                break
+            label = fragment.row_labels[i]
+            if label not in seen:
+                seen.add(label)
+                lines.append(f"  {label} is missed by {miss[i]:.3g} at {fragment.row_fractions[i] * horizon:.4g} s")
+        if not seen and not broken.size:
+            lines.append("  all constraints are met; the plan is feasible but not optimal")
+        return "\n".join(lines)
+
+
+def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Controls at reported points, from the side of the interval that reports them."""
+    if len(controls.breaks) == len(fragment.mesh):
+        return np.asarray(controls.within(piece, place))
+    mesh = fragment.mesh
+    return np.asarray(controls(mesh[piece] + np.diff(mesh)[piece] * place))
+
+
+def prepare(
+    problem: Problem,
+    method: Method,
+    *,
+    solver: str = "ipopt",
+    options: Mapping[str, Any] | None = None,
+    compiled: bool = False,
+) -> Prepared:
+    """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
+
+    Args:
+        problem: What is asked. method: How it is transcribed.
+        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end).
+        options: Passed to the solver, for example ``{"max_iter": 500}``.
+        compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
+
+    Raises:
+        ProblemError: The problem is not complete, or the method or solver cannot take it.
+    """
+    return Prepared(problem, method, solver, options or {}, compiled)
+
+
+def solve(
+    problem: Problem,
+    method: Method,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    options: Mapping[str, Any] | None = None,
+    guess: Solution | Mapping[str, Any] | None = None,
+    check: bool = True,
+) -> Solution:
+    """Solve a problem by a method.
+
+    Args:
+        problem: What is asked. method: For example ``Collocation(intervals=20, degree=3)``.
+        parameters: Value of every parameter by name.
+        solver, options: See :func:`prepare`.
+        guess: An earlier solution (of any grid or method), or a dictionary by name of values, functions of time, or
+            samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
+        check: Raise where the solver fails; False returns the unsuccessful solution with its status.
+
+    Raises:
+        ProblemError: The problem, method or arguments cannot be right.
+        SolveError: The solver failed; names the worst residuals by constraint, state and time.
+    """
+    return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

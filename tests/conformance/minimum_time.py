@@ -1,0 +1,66 @@
+"""Double integrator, least time, |u| <= 1.
+
+From (0, 0) to (1, 0): full push, full brake, switch halfway at 1 s, cost T = 2. H = lq v + lv u + 1 vanishes, so
+lv(0) = -1, lv(2) = 1 and lq = -1 (the terminal cost T adds the 1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ocp import Problem
+
+from .case import Array, Case, Extremal, Switch, legendre, radau, shooting, within
+
+
+def build() -> Problem:
+    problem = Problem("minimum time")
+    q = problem.state("q", initial=0.0, terminal=1.0)
+    v = problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    horizon = problem.horizon(lower=0.1, upper=10.0, guess=3.0)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.minimize(terminal=horizon)
+    return problem
+
+
+def optimum(t: Array) -> Extremal:
+    return Extremal(
+        state={"q": np.where(t < 1, t**2 / 2, 1 - (2 - t) ** 2 / 2), "v": np.minimum(t, 2 - t)},
+        control={"u": np.where(t < 1, 1.0, -1.0)},
+        costate={"q": np.full_like(t, -1.0), "v": t - 1},
+    )
+
+
+CASE = Case(
+    name="minimum time",
+    build=build,
+    cost=2.0,
+    horizon=2.0,
+    optimum=optimum,
+    switches=(Switch(1.0, lambda x, lam: lam["v"]),),
+    runs=(
+        # held controls and an even number of intervals: the switch lies on a node, the optimum is held exactly
+        *within(
+            radau(20, control="held"),
+            legendre(20, control="held"),
+            shooting(20, "held"),
+            cost=(1e-8, 1e-8),
+            state=1e-8,
+            control=1e-7,
+            costate=1e-7,
+            time=1e-7,
+        ),
+        # an odd number: the switch lies inside an interval; still every plan is admissible
+        *within(
+            radau(21, control="held"),
+            shooting(21, "held"),
+            cost=(1e-8, 3e-3),
+            state=5e-2,
+            control=1e-6,
+            costate=5e-3,
+            time=1e-2,
+        ),
+    ),
+)

@@ -1,0 +1,109 @@
+"""Every reference problem by every method that suits it: cost from both sides, horizon, trajectory, costates, switches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ocp import Solution, solve
+
+from .case import Array, Case, Extremal, Run
+from .cases import CASES
+
+RUNS = [(case, run) for case in CASES for run in case.runs]
+
+
+def of(pairs: list[tuple[Case, Run]]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize(
+        ("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c, r in pairs]
+    )
+
+
+every_run = of(RUNS)
+runs_with_comparable_controls = of([(c, r) for c, r in RUNS if r.control is not None])
+runs_with_switching_functions = of([(c, r) for c, r in RUNS if any(s.function for s in c.switches)])
+
+
+@cache
+def solved(case: Case, run: Run) -> Solution:
+    return solve(case.build(), run.method)
+
+
+def known(case: Case, solution: Solution) -> Extremal:
+    """The optimum at the reported times, which are stretched to the known horizon where it is free."""
+    return case.optimum(solution.t * (case.horizon / solution.horizon))
+
+
+def apart(case: Case, run: Run, solution: Solution, times: Iterable[float]) -> Array:
+    """Which reported times are farther from `times` than one interval, or than nothing where these are nodes. (M,), bool.
+
+    Inside the interval that holds it a jump cannot be located, and at a node either of its sides may be reported.
+    """
+    method = run.method
+    mesh = np.linspace(0, 1, method.intervals + 1) if method.mesh is None else np.array(method.mesh)
+    fraction = solution.t / solution.horizon
+    far = np.ones(fraction.shape, dtype=bool)
+    for place in (time / case.horizon for time in times):
+        is_node = np.abs(mesh - place).min() < 1e-9
+        far &= np.abs(fraction - place) > (1e-9 if is_node else 1.001 * np.diff(mesh).max())
+    return far
+
+
+def largest_error(found: Array, expected: Array, where: Array) -> float:
+    assert where.any()
+    return float(np.abs(found - np.reshape(expected, found.shape))[where].max())
+
+
+@every_run
+def test_cost_is_the_optimum_from_both_sides(case: Case, run: Run) -> None:
+    below, above = run.cost
+    assert -below <= solved(case, run).cost - case.cost <= above
+
+
+@every_run
+def test_horizon_is_the_optimal_one(case: Case, run: Run) -> None:
+    horizon = solved(case, run).horizon
+    assert abs(horizon - case.horizon) <= (1e-12 if run.time is None else run.time)
+
+
+@every_run
+def test_states_follow_the_optimum(case: Case, run: Run) -> None:
+    solution = solved(case, run)
+    everywhere = np.ones(solution.t.shape, dtype=bool)
+    for name, expected in known(case, solution).state.items():
+        assert largest_error(solution[name], expected, everywhere) < run.state, name
+
+
+@every_run
+def test_costates_follow_the_optimum(case: Case, run: Run) -> None:
+    solution = solved(case, run)
+    where = apart(case, run, solution, case.jumps)
+    for name, expected in known(case, solution).costate.items():
+        assert largest_error(solution.costate(name), expected, where) < run.costate, name
+
+
+@runs_with_comparable_controls
+def test_controls_follow_the_optimum(case: Case, run: Run) -> None:
+    solution = solved(case, run)
+    where = apart(case, run, solution, [switch.time for switch in case.switches])
+    assert run.control is not None
+    for name, expected in known(case, solution).control.items():
+        assert largest_error(solution[name], expected, where) < run.control, name
+
+
+@runs_with_switching_functions
+def test_switching_functions_change_sign_at_the_switches(case: Case, run: Run) -> None:
+    solution = solved(case, run)
+    states = {name: solution[name][:, 0] for name in solution.states}
+    costates = {name: solution.costate(name)[:, 0] for name in solution.states}
+    assert run.time is not None
+    for switch in case.switches:
+        if switch.function is not None:
+            value = switch.function(states, costates)
+            before = np.flatnonzero(value[:-1] * value[1:] <= 0)
+            rise, step = np.diff(value)[before], np.diff(solution.t)[before]
+            zeros = solution.t[before] - value[before] * step / np.where(rise == 0, 1.0, rise)
+            assert np.abs(zeros - switch.time).min() <= run.time

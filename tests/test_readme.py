@@ -1,0 +1,43 @@
+"""The README's Python blocks run, in their order and in one namespace, as a reader would type them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+FENCE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
+MAKE = re.compile(r"\bmake ([a-z]+)")
+
+
+def python_blocks(text: str) -> list[tuple[int, str]]:
+    """The fenced Python blocks of a Markdown text, each with the line number of its first line."""
+    return [(text.count("\n", 0, match.start(1)) + 1, match.group(1)) for match in FENCE.finditer(text)]
+
+
+def test_every_python_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # what a block writes must not land in the repository
+    blocks = python_blocks(README.read_text(encoding="utf-8"))
+    assert blocks, "README.md has no Python block: the pattern or the fences are wrong"
+    namespace: dict[str, object] = {"__name__": "__main__"}
+    for line, source in blocks:
+        # The padding makes a traceback point at the line in README.md.
+        exec(compile("\n" * (line - 1) + source, str(README), "exec"), namespace)
+
+
+def test_every_make_target_named_in_the_readme_exists() -> None:
+    named = set(MAKE.findall(" ".join(re.findall(r"`[^`]+`", README.read_text(encoding="utf-8")))))
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {"reproduce", "test"} <= named
+    assert named <= targets
+
+
+def test_every_local_link_of_the_readme_leads_to_a_file() -> None:
+    links = [link for link in LINK.findall(README.read_text(encoding="utf-8")) if "://" not in link]
+    assert links, "README.md shows no local file: not even a picture"
+    missing = [link for link in links if not (ROOT / link).exists()]
+    assert not missing, f"README.md points at files that do not exist: {missing}"
