@@ -27,7 +27,7 @@ def initial_point(
     """Values of all variables to start from. Shape (size,).
 
     What ``guess`` says comes first, then the guess declared with the variable, then a straight line between the given
-    ends or the middle of the bounds. A solution of another grid or method is interpolated over fractions of its horizon.
+    ends or the middle of the bounds. A solution of another grid or method is read over fractions of its horizon.
 
     Raises:
         ProblemError: An unknown name, a wrong size, a number that is not finite.

@@ -43,7 +43,7 @@ ADVICE = {
     "Maximum_Iterations_Exceeded": "raise options={'max_iter': ...}, or start from a better guess",
     "Restoration_Failed": "start from a better guess, or scale states and constraints nearer to 1",
     "Diverging_Iterates": "the cost may be unbounded below; bound the controls or add a term to the cost",
-    "Invalid_Number_Detected": "a function is not finite at an iterate; bound the states away from where it is singular",
+    "Invalid_Number_Detected": "a function is not finite at an iterate; keep the states away from where it is singular",
     "Search_Direction_Becomes_Too_Small": "the problem may be badly scaled or its constraints redundant",
     "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns; drop redundant constraints",
     "User_Requested_Stop": "interrupted; the last iterate is returned",

@@ -79,7 +79,7 @@ def refine(
     if not reached:
         warnings.warn(
             f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals with an "
-            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals or degree",
+            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals",
             RefinementWarning,
             stacklevel=2,
         )

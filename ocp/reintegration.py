@@ -1,4 +1,4 @@
-"""The controls of a plan, integrated anew with tight tolerances by an integrator that knows nothing of the transcription."""
+"""The controls of a plan, integrated anew with tight tolerances, knowing nothing of the transcription."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ CASE = Case(
             radau(12),
             legendre(12),
             shooting(12, "linear"),
-            cost=(1e-8, 1e-8),
+            cost=(2e-9, 2e-9),
             state=1e-5,
             control=2e-4,
             costate=2e-3,

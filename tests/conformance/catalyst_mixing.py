@@ -58,9 +58,7 @@ def optimum(t: Array) -> Extremal:
         control={"u": np.select(arcs, [np.ones_like(t), np.zeros_like(t)], SINGULAR)},
         costate={
             "x1": np.select(arcs, [(kept + difference) / 11, np.ones_like(t)], singular_l1),
-            "x2": np.select(
-                arcs, [(kept - 10 * difference) / 11, np.exp(t - HORIZON)], L_RATIO * singular_l1
-            ),
+            "x2": np.select(arcs, [(kept - 10 * difference) / 11, np.exp(t - HORIZON)], L_RATIO * singular_l1),
         },
     )
 
@@ -86,11 +84,11 @@ CASE = Case(
             radau(MESH, control="held"),
             legendre(MESH, control="held"),
             cost=(1e-8, 1e-8),
-            state=1e-6,
+            state=3e-7,
             control=1e-4,
-            costate=5e-5,
+            costate=4e-6,
         ),
         # smooth enough but for the switches: shooting with both of them on nodes
-        *within(shooting(MESH, "held"), cost=(1e-8, 5e-8), state=1e-6, control=1e-4, costate=5e-5),
+        *within(shooting(MESH, "held"), cost=(1e-8, 1e-8), state=3e-7, control=1e-4, costate=4e-6),
     ),
 )

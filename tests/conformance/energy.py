@@ -53,8 +53,6 @@ CASE = Case(
             costate=1e-10,
         ),
         # N held controls: the best of them costs 6 N^2 / (N^2 - 1), exactly
-        *within(
-            shooting(50, "held"), cost=(1e-9 - HELD, 1e-9 + HELD), state=1e-3, control=0.13, costate=1e-2
-        ),
+        *within(shooting(50, "held"), cost=(1e-9 - HELD, 1e-9 + HELD), state=1e-3, control=0.13, costate=1e-2),
     ),
 )

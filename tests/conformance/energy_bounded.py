@@ -55,9 +55,7 @@ CASE = Case(
         Switch(0.5 + A, lambda x, lam: lam["v"] - LIMIT),
     ),
     runs=(
-        *within(
-            radau(40), legendre(40), cost=(2e-6, 2e-6), state=5e-4, control=3e-3, costate=8e-3, time=5e-4
-        ),
+        *within(radau(40), legendre(40), cost=(2e-6, 2e-6), state=5e-4, control=3e-3, costate=8e-3, time=5e-4),
         # corners on nodes: a cubic an arc
         *within(radau(MESH), cost=(1e-8, 1e-8), state=3e-6, control=2e-5, costate=5e-5, time=1e-5),
         *within(

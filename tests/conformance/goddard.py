@@ -89,9 +89,7 @@ def optimum(t: Array) -> Extremal:
     h, v, m, lh, lv, lm = y
     thrust = np.where(where[0], THRUST, 0.0)
     thrust[where[1]] = [singular_thrust(*x) for x in zip(h[where[1]], v[where[1]], m[where[1]], strict=True)]
-    return Extremal(
-        state={"h": h, "v": v, "m": m}, control={"F": thrust}, costate={"h": lh, "v": lv, "m": lm}
-    )
+    return Extremal(state={"h": h, "v": v, "m": m}, control={"F": thrust}, costate={"h": lh, "v": lv, "m": lm})
 
 
 CASE = Case(
@@ -110,17 +108,24 @@ CASE = Case(
             state=5e-3,
             control=None,
             costate=1e-2,
-            time=1e-5,
+            time=3e-6,
         ),
         *within(
             radau(MESH, control="held"),
+            cost=(1e-8, 1e-8),
+            state=2e-4,
+            control=0.2,
+            costate=2e-3,
+            time=2e-6,
+        ),
+        *within(
             legendre(MESH, control="held"),
             cost=(1e-8, 1e-8),
             state=2e-4,
             control=0.2,
-            costate=0.005,
+            costate=2e-4,
             time=2e-6,
         ),
-        *within(shooting(MESH, "held"), cost=(1e-8, 1e-6), state=2e-4, control=0.2, costate=0.005, time=1e-5),
+        *within(shooting(MESH, "held"), cost=(1e-8, 3e-7), state=2e-4, control=0.2, costate=1e-3, time=5e-6),
     ),
 )

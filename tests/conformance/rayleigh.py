@@ -77,7 +77,7 @@ CASE = Case(
     runs=(
         *within(radau(40, degree=7), cost=(1e-10, 1e-10), state=3e-7, control=5e-6, costate=2e-6),
         *within(legendre(60, degree=4), cost=(2e-9, 2e-9), state=3e-5, control=1e-3, costate=2e-5),
-        *within(shooting(100, "linear", steps=4), cost=(1e-6, 1e-4), state=5e-4, control=0.1, costate=2e-4),
+        *within(shooting(100, "linear", steps=4), cost=(1e-6, 5e-5), state=2e-4, control=0.1, costate=3e-5),
         *within(shooting(100, "held", steps=4), cost=(1e-6, 2e-2), state=5e-3, control=0.5, costate=5e-3),
     ),
 )

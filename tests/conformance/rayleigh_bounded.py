@@ -52,23 +52,23 @@ CASE = Case(
     ),
     runs=(
         # corners of the control on nodes
-        *within(radau(MESH), cost=(1e-4, 1e-4), state=1e-3, control=1e-3, costate=5e-3, time=1e-3),
-        *within(legendre(MESH), cost=(1e-5, 1e-5), state=5e-4, control=2e-4, costate=2e-4, time=1e-3),
+        *within(radau(MESH), cost=(1e-4, 1e-4), state=1e-3, control=1e-3, costate=5e-3, time=5e-6),
+        *within(legendre(MESH), cost=(1e-5, 1e-5), state=5e-4, control=2e-4, costate=2e-4, time=5e-6),
         *within(
             shooting(MESH, "linear", steps=4),
-            cost=(1e-4, 1e-4),
+            cost=(1e-5, 1e-5),
             state=1e-3,
             control=1e-2,
             costate=1e-3,
-            time=1e-3,
+            time=3e-4,
         ),
         *within(
             shooting(100, "held", steps=4),
             cost=(1e-6, 5e-3),
             state=1e-2,
             control=0.2,
-            costate=1e-2,
-            time=1e-2,
+            costate=5e-3,
+            time=2e-3,
         ),
     ),
 )

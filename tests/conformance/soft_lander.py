@@ -63,7 +63,7 @@ CASE = Case(
             shooting(50, "held"),
             cost=(1e-8, 1e-4),
             state=5e-3,
-            control=1e-6,
+            control=5e-8,
             costate=0.05,
             time=0.05,
         ),
@@ -74,11 +74,11 @@ CASE = Case(
             shooting(MESH, "held"),
             cost=(1e-8, 1e-8),
             state=1e-8,
-            control=1e-6,
+            control=5e-8,
             costate=0.05,
             time=0.15,
         ),
         # a polynomial across the switch overshoots between its points and beats the optimum, here by 3.0e-5
-        *within(radau(51), cost=(1e-4, 0.0), state=2e-2, control=1e-6, costate=0.02, time=0.05),
+        *within(radau(51), cost=(1e-4, 0.0), state=2e-2, control=1e-7, costate=0.02, time=0.05),
     ),
 )

@@ -17,9 +17,7 @@ RUNS = [(case, run) for case in CASES for run in case.runs]
 
 
 def of(pairs: list[tuple[Case, Run]]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize(
-        ("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c, r in pairs]
-    )
+    return pytest.mark.parametrize(("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c, r in pairs])
 
 
 every_run = of(RUNS)

@@ -152,13 +152,8 @@ def test_switching_functions_vanish_at_the_switches(case: Case) -> None:
             bounds = p.control_bounds()
             middle = Extremal(
                 point.state,
-                {
-                    n: np.full(3, np.mean(b))
-                    for n, b in zip(p.controls, zip(*bounds, strict=True), strict=True)
-                },
+                {n: np.full(3, np.mean(b)) for n, b in zip(p.controls, zip(*bounds, strict=True), strict=True)},
                 point.costate,
             )
-            slope = p.along(p.hamiltonian, t, case.horizon, middle) - p.along(
-                p.hamiltonian, t, case.horizon, point
-            )
+            slope = p.along(p.hamiltonian, t, case.horizon, middle) - p.along(p.hamiltonian, t, case.horizon, point)
             assert abs(slope[1]) < TOLERANCE

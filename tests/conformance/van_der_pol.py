@@ -61,11 +61,17 @@ CASE = Case(
         *within(legendre(30, degree=4), cost=(1e-11, 1e-11), state=1e-8, control=1e-7, costate=1e-8),
         *within(
             shooting(50, "linear"),
-            shooting(50, "linear", integrator="cvodes"),
             cost=(1e-9, 2e-7),
             state=1e-6,
             control=1e-3,
             costate=1e-6,
+        ),
+        *within(
+            shooting(50, "linear", integrator="cvodes"),
+            cost=(1e-9, 3e-8),
+            state=1e-7,
+            control=1e-3,
+            costate=4e-8,
         ),
         *within(shooting(50, "held"), cost=(1e-8, 3e-4), state=3e-4, control=0.05, costate=3e-4),
     ),
