@@ -166,9 +166,7 @@ class FreeFloating:
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
         """Twist of a base whose configuration changes with `base_rate`. Shape (6, 1), or (3, 1) if planar."""
-        rate = checked_vector(
-            base_rate, self.base_size, "base_rate", "the derivative of the base configuration"
-        )
+        rate = checked_vector(base_rate, self.base_size, "base_rate", "the derivative of the base configuration")
         base = checked_vector(base, self.base_size, "base", "the base configuration")
         if self.base == "planar":
             return ca.vertcat(rate[2], rate[0:2])
@@ -191,20 +189,14 @@ class FreeFloating:
         return ca.densify(locked)[rows, rows], ca.densify(joints)[rows, :]
 
     @on_scalars
-    def momentum(
-        self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression
-    ) -> Expression:
+    def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
         """Total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
 
         Shape (6, 1) or (3, 1).
         """
         locked, joints = self.momentum_matrices(base, q)
-        twist = checked_vector(
-            base_twist, len(self.twist_rows), "base_twist", "angular velocity, then linear"
-        )
-        return ca.mtimes(locked, twist) + ca.mtimes(
-            joints, joint_vector(self.robot, joint_rates, "joint_rates")
-        )
+        twist = checked_vector(base_twist, len(self.twist_rows), "base_twist", "angular velocity, then linear")
+        return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
 
     @on_scalars
     def momentum_residual(
@@ -234,9 +226,7 @@ class FreeFloating:
         both = motion_transform((turn, ca.DM(3, 1)))
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
 
-    def manipulability(
-        self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)
-    ) -> Expression:
+    def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """Of the generalized Jacobian, as jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 

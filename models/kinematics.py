@@ -54,9 +54,7 @@ class MassMoments(NamedTuple):
     def spatial_inertia(self) -> Expression:
         """Spatial inertia about the origin. Shape (6, 6)."""
         arm = skew(self.first)
-        return ca.vertcat(
-            ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3))
-        )
+        return ca.vertcat(ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3)))
 
 
 def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
@@ -88,9 +86,7 @@ def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
     return Frame(ca.mtimes(link.rotation, _constant(robot.tip_rotation)), link.point(robot.tip_translation))
 
 
-def centers_of_mass(
-    robot: Robot, q: Expression, world_from_base: Placement | None = None
-) -> dict[str, Expression]:
+def centers_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
     """Centre of mass of each link in the world, by link name. Shape (3, 1) each, m."""
     frames = link_frames(robot, q, world_from_base)
     return {link.name: frames[link.name].point(link.center_of_mass) for link in robot.links}
@@ -105,9 +101,7 @@ def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | Non
     if robot.total_mass == 0:
         raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
     frames = link_frames(robot, q, world_from_base)
-    moment = sum(
-        link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass
-    )
+    moment = sum(link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass)
     return ca.densify(moment / robot.total_mass)
 
 
@@ -145,9 +139,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
     return frame_jacobian(robot, q, str(robot.tip), robot.tip_translation, world_from_base)
 
 
-def center_of_mass_jacobian(
-    robot: Robot, q: Expression, world_from_base: Placement | None = None
-) -> Expression:
+def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
     if robot.total_mass == 0:
         raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
@@ -192,9 +184,7 @@ def point_jacobian(
     """As frame_jacobian, from the axes of frames_and_axes and a point in the world. Shape (6, dof)."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = [
-        ca.vertcat(axes[name][0], axes[name][1] + cross(axes[name][0], point))
-        if name in carriers
-        else ca.DM(6, 1)
+        ca.vertcat(axes[name][0], axes[name][1] + cross(axes[name][0], point)) if name in carriers else ca.DM(6, 1)
         for name in robot.joint_names
     ]
     return ca.horzcat(ca.DM(6, 0), *columns)
@@ -208,11 +198,7 @@ def frames_and_axes(
     A motion vector is (angular velocity, velocity at the world's origin) per unit rate, world axes.
     """
     q = joint_vector(robot, q)
-    base = (
-        Frame(ca.DM.eye(3), ca.DM(3, 1))
-        if world_from_base is None
-        else Frame(*map(expression, world_from_base))
-    )
+    base = Frame(ca.DM.eye(3), ca.DM(3, 1)) if world_from_base is None else Frame(*map(expression, world_from_base))
     frames: dict[str, Frame] = {robot.root: base}
     axes: dict[str, tuple[Expression, Expression]] = {}
     column = 0

@@ -61,9 +61,7 @@ class Machine(Protocol):
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Time derivative of the base configuration that the joint rates cause. Shape (base_size, 1)."""
 
-    def manipulability(
-        self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)
-    ) -> Expression:
+    def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """Manipulability of the task that fixes these rows of the tip's twist, as jacobian_manipulability.
 
         Shape (1, 1).
@@ -161,9 +159,7 @@ class FixedBase:
         """Nothing, of the type of the joint rates. Shape (0, 1)."""
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
-    def manipulability(
-        self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)
-    ) -> Expression:
+    def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """As jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 

@@ -50,9 +50,7 @@ class Link:
         inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
         _check_inertia(inertia, owner)
         object.__setattr__(self, "mass", mass)
-        object.__setattr__(
-            self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass")
-        )
+        object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
         object.__setattr__(self, "inertia", frozenchecked_array((inertia + inertia.T) / 2))
 
 
@@ -131,9 +129,7 @@ def frozenchecked_array(array: Array) -> Array:
     return array
 
 
-def checked_array(
-    value: ArrayInput, shape: tuple[int, ...], owner: str, what: str, finite: bool = True
-) -> Array:
+def checked_array(value: ArrayInput, shape: tuple[int, ...], owner: str, what: str, finite: bool = True) -> Array:
     """Read-only copy of `value` as floats.
 
     ModelError naming `owner` and `what` for a wrong shape, nan, or inf.
@@ -154,9 +150,7 @@ def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     matrix = checked_array(value, (3, 3), owner, what)
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if error > 1e-6 or np.linalg.det(matrix) < 0:
-        raise ModelError(
-            f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
-        )
+        raise ModelError(f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)")
     if error > 1e-12:  # printed to few digits: take the nearest rotation
         left, _, right = np.linalg.svd(matrix)
         matrix = frozenchecked_array(left @ right)

@@ -46,9 +46,7 @@ class Robot:
         object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
         object.__setattr__(self, "tip", self._find_tip())
         owner = "robot"
-        object.__setattr__(
-            self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation")
-        )
+        object.__setattr__(self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation"))
         object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
 
     def _find_tip(self) -> str:
@@ -60,9 +58,7 @@ class Robot:
         parents = {joint.parent for joint in self.joints}
         leaves = [name for name in names if name not in parents]
         if len(leaves) > 1:
-            raise ModelError(
-                f"the tree has the leaves {leaves}; say which carries the tip: Robot(..., tip=name)"
-            )
+            raise ModelError(f"the tree has the leaves {leaves}; say which carries the tip: Robot(..., tip=name)")
         return leaves[0]
 
     @cached_property
@@ -175,9 +171,7 @@ def planar_chain(
     lengths = np.atleast_1d(np.asarray(lengths, dtype=float))
     count = lengths.shape[0]
     if lengths.ndim != 1 or count == 0:
-        raise ModelError(
-            f"planar chain: lengths must be a vector of at least one length, not of shape {lengths.shape}"
-        )
+        raise ModelError(f"planar chain: lengths must be a vector of at least one length, not of shape {lengths.shape}")
     lengths = checked_array(lengths, (count,), "planar chain", "lengths")
     masses = checked_array(masses, (count,), "planar chain", "masses")
     moments = checked_array(

@@ -74,9 +74,7 @@ def skew(vector: Expression) -> Expression:
     """Matrix [a x] with [a x] b = a x b. Shape (3, 3)."""
     a = expression(vector)
     zero = type(a)(1, 1)
-    return ca.vertcat(
-        ca.horzcat(zero, -a[2], a[1]), ca.horzcat(a[2], zero, -a[0]), ca.horzcat(-a[1], a[0], zero)
-    )
+    return ca.vertcat(ca.horzcat(zero, -a[2], a[1]), ca.horzcat(a[2], zero, -a[0]), ca.horzcat(-a[1], a[0], zero))
 
 
 def cross(a: Expression, b: Expression) -> Expression:

@@ -12,9 +12,7 @@ def require_unique(names: Iterable[str], what: str) -> None:
     """Raise ModelError when a name occurs twice."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
-        raise ModelError(
-            f"{what} name {repeated[0]!r} is used more than once; give every {what} its own name"
-        )
+        raise ModelError(f"{what} name {repeated[0]!r} is used more than once; give every {what} its own name")
 
 
 def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> str:
@@ -34,9 +32,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
     for joint, parent, child in edges:
         for role, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise ModelError(
-                    f"joint {joint!r}: {role} link {link!r} does not exist; the links are {sorted(known)}"
-                )
+                raise ModelError(f"joint {joint!r}: {role} link {link!r} does not exist; the links are {sorted(known)}")
         if parent == child:
             raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop")
         if child in parent_joint:

@@ -3,6 +3,7 @@
 from ocp.audit import Audit, Finding
 from ocp.collocation import Collocation
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
+from ocp.indirect import Indirect
 from ocp.problem import Problem
 from ocp.refine import refine
 from ocp.shooting import MultipleShooting
@@ -14,6 +15,7 @@ __all__ = [
     "AuditError",
     "Collocation",
     "Finding",
+    "Indirect",
     "MultipleShooting",
     "Problem",
     "ProblemError",

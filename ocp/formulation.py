@@ -96,7 +96,8 @@ class Formulation:
         f: State derivative. Shape (nx, 1).
         running, terminal: Cost densities, scalars.
         path, start, end: Constraint rows.
-        states, controls, parameters: Slices of the vectors by name. state_labels: A name for every entry.
+        states, controls, parameters: Slices of the vectors by name. state_labels,
+            control_labels: A name for every entry.
         bounds: The bound table.
         horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
@@ -115,7 +116,7 @@ class Formulation:
         self.states = slices(declared.states)
         self.controls = slices(declared.controls)
         self.parameters = slices(declared.parameters)
-        self.state_labels = labels(declared.states)
+        self.state_labels, self.control_labels = labels(declared.states), labels(declared.controls)
         self.nx, self.nu, self.np = (total(s) for s in (self.states, self.controls, self.parameters))
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
         self.x0, self.u0 = sym("x0", self.nx), sym("u0", self.nu)

@@ -7,21 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from models import Machine, ModelError
+from models import Machine
 from models.linear import solve_spd
-from models.machine import checked_rows, jacobian_manipulability
+from models.machine import jacobian_manipulability
+from ocp.builders.task import Array, Start, Velocity, checked_start, is_singular, velocity_expression
 from ocp.errors import ProblemError
 
-__all__ = ["LocalSolution", "Start", "checked_start", "least_rates", "resolve", "velocity_expression"]
+__all__ = ["LocalSolution", "least_rates", "resolve"]
 
-Array: TypeAlias = NDArray[np.float64]
-Velocity: TypeAlias = Any  # a constant of one entry for each row, or a function: casadi time -> casadi vector
 MAX_STEPS = 20000  # of the integrator between two samples; a smooth motion takes some tens
 
 
@@ -72,23 +71,6 @@ class LocalSolution:
         return {"base": base, "joints": joints, "joint_rates": rates}
 
 
-@dataclass(frozen=True)
-class Start:
-    """A task and where it starts, checked and in plain arrays.
-
-    Attributes:
-        rows: Twist rows that the task fixes.
-        joints: Shape (joint_size,).
-        base: Shape (base_size,).
-        horizon: s.
-    """
-
-    rows: list[int]
-    joints: Array
-    base: Array
-    horizon: float
-
-
 def resolve(
     machine: Machine,
     tip_velocity: Velocity,
@@ -105,8 +87,8 @@ def resolve(
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
-        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a function that
-            takes a casadi time (s) and returns a casadi vector or a list of expressions.
+        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a
+            function that takes a casadi time (s) and returns a casadi vector or a list of expressions.
         rows: Which rows of the tip's twist v prescribes: angular 0..2, linear 3..5, world axes.
         start_joints: Shape (joint_size,).
         horizon: Final time, s.
@@ -114,10 +96,12 @@ def resolve(
         damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays
             bounded where the Jacobian loses rank, at the price of a task error.
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
-        samples: How many equally spaced times to report, or the increasing times themselves from 0 to the horizon.
+        samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
+            horizon.
 
     Returns:
-        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in `stopped`.
+        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in
+        `stopped`.
 
     Raises:
         ProblemError: Something does not fit the machine, or the task is singular already at the start.
@@ -134,7 +118,7 @@ def resolve(
     except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
         model = _Model(machine, tip_velocity, start, damping, ca.MX)
     first = np.concatenate([start.base, start.joints])
-    if not np.isfinite(np.array(model.rate(0.0, first))).all():
+    if damping == 0 and is_singular(machine, start):
         raise ProblemError(
             f"the task of rows {start.rows} is singular at the start joints {start.joints.tolist()}; "
             "start elsewhere, fix fewer rows, or give a damping"
@@ -144,80 +128,17 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0) -> Any:
-    """G' (G G' + damping^2 1)^-1 v: the least joint rates that give the velocity, G# v when undamped. Shape (n, 1).
+    """G' (G G' + damping^2 1)^-1 v: the least joint rates that give the velocity, G# v when undamped.
+
+    Shape (n, k).
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
-        velocity: v. Shape (m, 1).
+        velocity: v, or several as columns. Shape (m, k).
         damping: In units of the Jacobian.
     """
     square = ca.mtimes(jacobian, jacobian.T) + damping**2 * ca.DM.eye(jacobian.shape[0])
     return ca.mtimes(jacobian.T, solve_spd(square, velocity))
-
-
-def velocity_expression(tip_velocity: Velocity, time: Any, size: int) -> Any:
-    """The tip velocity as a column of expressions of the symbol `time`. Shape (size, 1).
-
-    Raises:
-        ProblemError: Wrong size, not finite, or an expression of anything but the time.
-    """
-    value = tip_velocity(time) if callable(tip_velocity) else tip_velocity
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = list(value.ravel())
-    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
-        value = ca.vertcat(*value)
-    if not isinstance(value, ca.SX | ca.MX | ca.DM):
-        try:
-            value = ca.DM(np.asarray(value, dtype=float))
-        except (TypeError, ValueError) as error:
-            raise ProblemError(f"tip_velocity gives {value!r}, not {size} numbers or expressions") from error
-    if value.shape != (size, 1):
-        raise ProblemError(
-            f"tip_velocity has shape {tuple(value.shape)}, expected ({size}, 1): one entry for each row of the task"
-        )
-    if isinstance(value, ca.DM):
-        if not np.isfinite(np.array(value)).all():
-            raise ProblemError(f"tip_velocity {np.array(value).ravel().tolist()} is not finite")
-    elif strange := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
-        raise ProblemError(f"tip_velocity depends on {strange}, but only the time it is called with may occur")
-    return ca.densify(value)
-
-
-def checked_start(machine: Machine, rows: Sequence[int], start_joints: Any, horizon: float, start_base: Any) -> Start:
-    """The task's rows, the start and the horizon, checked against the machine.
-
-    Raises:
-        ProblemError: Rows out of range, repeated, none, or more than joints; wrong sizes; a quaternion that is not
-            of unit length; a horizon that is not positive.
-    """
-    try:
-        chosen = checked_rows(rows)
-    except ModelError as error:
-        raise ProblemError(str(error)) from error
-    if len(chosen) > machine.joint_size:
-        raise ProblemError(
-            f"the task fixes {len(chosen)} rows {chosen} but the machine has only {machine.joint_size} joints"
-        )
-    joints = _numbers(start_joints, machine.joint_size, "start_joints", "one entry for each joint")
-    home = machine.base_home() if start_base is None else start_base
-    base = _numbers(home, machine.base_size, "start_base", "the machine's base configuration")
-    if machine.base_size == 7 and abs(np.linalg.norm(base[3:]) - 1) > 1e-9:
-        raise ProblemError(f"start_base has the quaternion {base[3:].tolist()}, which is not of unit length")
-    if not (np.isscalar(horizon) and np.isfinite(horizon) and horizon > 0):
-        raise ProblemError(f"horizon must be a positive number of seconds, not {horizon!r}")
-    return Start(chosen, joints, base, float(horizon))
-
-
-def _numbers(value: Any, size: int, what: str, meaning: str) -> Array:
-    try:
-        array = np.asarray(value, dtype=float).ravel()
-    except (TypeError, ValueError) as error:
-        raise ProblemError(f"{what} {value!r} is not numeric") from error
-    if array.shape != (size,):
-        raise ProblemError(f"{what} has {array.size} entries, expected {size}: {meaning}")
-    if not np.isfinite(array).all():
-        raise ProblemError(f"{what} {array.tolist()} is not finite")
-    return array
 
 
 def _times(samples: Any, horizon: float) -> Array:
@@ -296,7 +217,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
         pass  # go again from sample to sample, to learn how far it goes
     step = model.one_interval(tolerance)
     reached, spent = [first], [0.0]
-    for begin, end in zip(times[:-1], times[1:], strict=True):
+    for begin, end in pairwise(times):
         try:
             found = step(x0=reached[-1], p=[begin, end - begin])
             state, cost = np.array(found["xf"]).ravel(), float(found["qf"])

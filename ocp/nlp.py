@@ -18,7 +18,7 @@ from ocp.assembly import Program
 from ocp.errors import ProblemError
 from ocp.fragment import Stages
 
-__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
+__all__ = ["SOLVERS", "Interrupt", "Outcome", "build_solver", "call_solver", "interruptible"]
 
 IPOPT = {
     "tol": 1e-10,
@@ -208,9 +208,16 @@ def call_solver(
     )
 
 
+@dataclass
+class Interrupt:
+    """A request to stop between two iterations."""
+
+    stop: bool = False
+
+
 @contextmanager
-def interruptible(progress: Progress | None) -> Iterator[None]:
-    """Turn Ctrl-C into a request to stop while a solver with a progress callback runs in the main thread."""
+def interruptible(progress: Progress | Interrupt | None) -> Iterator[None]:
+    """Turn Ctrl-C into a request to stop, in the main thread; without anything to ask, leave it alone."""
     if progress is None or threading.current_thread() is not threading.main_thread():
         yield
         return

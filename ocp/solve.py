@@ -14,6 +14,7 @@ from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.fragment import Fragment
 from ocp.guess import initial_point
+from ocp.indirect import Indirect, PreparedIndirect
 from ocp.nlp import Outcome, build_solver, call_solver
 from ocp.problem import Problem
 from ocp.solution import Solution
@@ -176,12 +177,12 @@ def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.
 
 def prepare(
     problem: Problem,
-    method: Method,
+    method: Method | Indirect,
     *,
     solver: str = "ipopt",
     options: Mapping[str, Any] | None = None,
     compiled: bool = False,
-) -> Prepared:
+) -> Prepared | PreparedIndirect:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
     Args:
@@ -193,12 +194,18 @@ def prepare(
     Raises:
         ProblemError: The problem is not complete, or the method or solver cannot take it.
     """
+    if isinstance(method, Indirect):
+        return PreparedIndirect(problem, method, _seed)
     return Prepared(problem, method, solver, options or {}, compiled)
+
+
+def _seed(problem: Problem, method: Method, parameters: Any, guess: Any) -> Solution:
+    return solve(problem, method, parameters=parameters, guess=guess)
 
 
 def solve(
     problem: Problem,
-    method: Method,
+    method: Method | Indirect,
     *,
     parameters: Mapping[str, Any] | None = None,
     solver: str = "ipopt",

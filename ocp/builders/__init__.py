@@ -1,1 +1,1 @@
-"""Ready problems, one module for each family of machines and tasks."""
+"""Ready problems, one module for each family of machines and tasks; `task` holds what they share."""

@@ -1,6 +1,7 @@
 """Redundancy resolved over the whole motion: the least joint velocity that does a task of the tip.
 
-Problem (27) of the free-floating paper (Kim, Kim 2011), for any machine of `models`, on a fixed or a floating base.
+Problem (27) of the free-floating paper (Kim, Kim 2011), for any machine of `models`, on a fixed or a floating
+base.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
+from ocp.builders.task import Array, Velocity, checked_start, is_singular, velocity_expression
 from ocp.errors import ProblemError
-from ocp.local import Array, LocalSolution, Velocity, checked_start, least_rates, resolve, velocity_expression
+from ocp.local import LocalSolution, least_rates, resolve
 from ocp.problem import Problem
 
 __all__ = ["minimum_velocity"]
@@ -38,41 +40,54 @@ def minimum_velocity(
 
     States "joints" and, on a floating base, "base". Two formulations of the same problem:
 
-    "rates": control "rates" are the joint rates x2', the task G x2' = v is the path equality "task". Regular where
+    "rates": control "rates" are the joint rates x2', the task G x2' = v is the path equality "task". Regular
+    where
         the Jacobian loses rank as long as v stays in its range; the one to use.
-    "null_space": control "null" is u of x2' = (1 - G# G) u + G# v, equation (26), which does the task by itself.
-        Fragile: G# is unbounded where the Jacobian loses rank, and the part of u in the row space of G has no
-        effect, so that the optimal u is not unique (the motion is).
+    "null_space": control "null" is u of x2' = (1 - G# G) u + G# v, equation (26), which does the task by
+    itself.
+        Fragile: G# is unbounded where the Jacobian loses rank. The part G# G u of the control has no effect
+            on the
+        motion; 1/2 |G# G u|^2 is added to the cost, so that the running cost is 1/2 |u|^2 + 1/2 |G# v|^2. It
+        vanishes at the optimum and makes the optimal u unique: u lies in the null space and x2' = u + G# v
+        there. Without it shooting with linear controls takes hundreds of iterations instead of ten.
 
     Args:
         machine: A FixedBase, a FreeFloating, or anything else that is a Machine.
-        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a function that
-            takes `problem.time` (s) and returns a casadi vector or a list of expressions.
+        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a
+            function that takes `problem.time` (s) and returns a casadi vector or a list of expressions.
         rows: Which rows of the tip's twist the task fixes: angular 0..2, linear 3..5, world axes.
         start_joints: Shape (joint_size,), rad or m.
         horizon: Final time, s.
         start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
         formulation: "rates" or "null_space".
-        limits: Whether the robot's position limits bound the state "joints" and its velocity limits the joint rates
-            (a bound of the control "rates", or the path constraint "velocity limits" of the null-space form).
-        guess_damping: Damping of the local solution (see ocp.local.resolve) that is attached as the initial guess,
-            relative to the root mean square of the singular values of the task's Jacobian at the start. Small values
-            start near the pseudo-inverse; large ones avoid its singular passages and may lead to another extremal:
-            on the paper's example up to 0.01 leads to J = 1.7351 and 0.03 to 1.7467.
+        limits: Whether the robot's position limits bound the state "joints" and its velocity limits the joint
+            rates (a bound of the control "rates", or the path constraint "velocity limits" of the null-space
+            form).
+        guess_damping: Damping of the local solution (see ocp.local.resolve) that is attached as the initial
+            guess, relative to the root mean square of the singular values of the task's Jacobian at the
+            start. Small values start near the pseudo-inverse; large ones avoid its singular passages and may
+            lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03 to
+            J = 1.7467.
         symbols: casadi.SX, or casadi.MX when tip_velocity calls an interpolant.
 
     Returns:
         The problem, its guesses attached; nothing is solved but the local motion.
 
     Raises:
-        ProblemError: Rows out of range, repeated, none, or more than joints; wrong sizes; a start outside the
-            limits; a horizon or a damping that is not positive; an unknown formulation.
+        ProblemError: Rows out of range, repeated, none, more than joints, or moved by no joint; wrong sizes;
+            a start outside the limits, or singular for the null-space form; a horizon or a damping that is
+            not positive; an unknown formulation.
     """
     if formulation not in ("rates", "null_space"):
         raise ProblemError(f"unknown formulation {formulation!r}; use 'rates' or 'null_space'")
     if not (np.isfinite(guess_damping) and guess_damping > 0):
         raise ProblemError(f"guess_damping must be positive, not {guess_damping!r}")
     start = checked_start(machine, rows, start_joints, horizon, start_base)
+    if formulation == "null_space" and is_singular(machine, start):
+        raise ProblemError(
+            f"the task of rows {start.rows} is singular at the start joints {start.joints.tolist()}, where the "
+            "null-space form does not exist; use formulation='rates' or start elsewhere"
+        )
     lower, upper, speed = _limits(machine, limits)
     _check_inside(machine, start.joints, lower, upper)
     jacobian = np.array(ca.DM(machine.tip_jacobian(start.base, start.joints)))[start.rows]
@@ -95,23 +110,26 @@ def minimum_velocity(
     problem.horizon(start.horizon)
     velocity = velocity_expression(tip_velocity, problem.time, len(start.rows))
 
+    running: Any = 0
     if formulation == "rates":
         rates = problem.control("rates", lower=-speed, upper=speed, guess=_guess(local, "joint_rates"))
         base_rate, twist = machine.base_rate(base, joints, rates), machine.tip_twist(base, joints, rates)
         base_rate, twist = ca.cse([base_rate, twist])  # both contain the kinematics
         problem.path("task", twist[start.rows] - velocity, lower=0, upper=0)
     else:
-        null = problem.control("null", machine.joint_size, guess=_guess(local, "joint_rates"))
+        null = problem.control("null", machine.joint_size, guess=0.0)  # local motion has no part there
         task = machine.tip_jacobian(base, joints)[start.rows, :]
-        # (1 - G# G) u + G# v with a single right-hand side.
-        rates = null + least_rates(task, velocity - ca.mtimes(task, null))
-        base_rate, rates = ca.cse([machine.base_rate(base, joints, rates), rates])
+        both = least_rates(task, ca.horzcat(velocity, ca.mtimes(task, null)))
+        idle = both[:, 1]  # G# G u, without effect
+        rates = null + both[:, 0] - idle
+        base_rate, rates, idle = ca.cse([machine.base_rate(base, joints, rates), rates, idle])
+        running += ca.dot(idle, idle) / 2
         if np.isfinite(speed).any():
             problem.path("velocity limits", rates, lower=-speed, upper=speed)
     if machine.base_size:
         problem.dynamics(base, base_rate)
     problem.dynamics(joints, rates)
-    problem.minimize(running=ca.dot(rates, rates) / 2)
+    problem.minimize(running=running + ca.dot(rates, rates) / 2)
     return problem
 
 

@@ -1,8 +1,8 @@
 """Brachistochrone: the fastest slide from rest, 10 m across and 5 m down.
 
-x' = v sin a, y' = v cos a (y down), v' = g cos a. The curve is a cycloid of radius R, x = R (p - sin p),
-y = R (1 - cos p), with p = sqrt(g/R) t and a = p/2. The costates follow from H = 0 and dH/da = 0:
-lx = -sin a / v, ly + lv g / v = -cos a / v.
+x' = v sin a, y' = v cos a (y down), v' = g cos a. The curve is a cycloid of radius R, x = R (p - sin p), y = R (1 -
+cos p), with p = sqrt(g/R) t and a = p/2. The costates follow from H = 0 and dH/da = 0: lx = -sin a / v, ly + lv g / v
+= -cos a / v.
 """
 
 from __future__ import annotations

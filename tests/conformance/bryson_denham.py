@@ -8,6 +8,9 @@ jumps at both ends of the contact. Bryson & Ho, Applied Optimal Control, 1975, s
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 
 from ocp import Problem
@@ -18,9 +21,11 @@ CEILING = 1 / 9
 T1 = 3 * CEILING  # contact begins; it ends at 1 - T1
 
 
-def build() -> Problem:
+def build(*, as_path: bool = False) -> Problem:
     problem = Problem("Bryson-Denham")
-    q = problem.state("q", initial=0.0, terminal=0.0, upper=CEILING)
+    q = problem.state("q", initial=0.0, terminal=0.0, upper=None if as_path else CEILING)
+    if as_path:
+        problem.path("ceiling", q, upper=CEILING)
     v = problem.state("v", initial=1.0, terminal=-1.0)
     u = problem.control("u")
     problem.horizon(1.0)
@@ -41,6 +46,11 @@ def optimum(t: Array) -> Extremal:
     )
 
 
+# contact begins and ends on a node, and each arc is a cubic: these hold the optimum exactly
+EXACT = within(
+    radau(12), legendre(12), shooting(12, "linear"), cost=(2e-9, 2e-9), state=1e-5, control=2e-4, costate=2e-3
+)
+
 CASE = Case(
     name="Bryson-Denham",
     build=build,
@@ -49,19 +59,11 @@ CASE = Case(
     optimum=optimum,
     jumps=(T1, 1 - T1),
     runs=(
-        # contact begins and ends on a node, and each arc is a cubic: these hold the optimum exactly
-        *within(
-            radau(12),
-            legendre(12),
-            shooting(12, "linear"),
-            cost=(2e-9, 2e-9),
-            state=1e-5,
-            control=2e-4,
-            costate=2e-3,
-        ),
-        # inside an interval: between the points the ceiling is overstepped a little
+        *EXACT,
+        # contact begins inside an interval: between the points the ceiling is overstepped a little
         *within(radau(20), legendre(20), cost=(2e-4, 1e-8), state=2e-3, control=0.1, costate=0.1),
-        # held controls on the nodes of the arcs
         *within(shooting(48, "held"), cost=(1e-8, 1e-2), state=2e-3, control=0.2, costate=0.1),
     ),
 )
+
+CASE_AS_PATH = replace(CASE, name="Bryson-Denham, ceiling as a path", build=partial(build, as_path=True), runs=EXACT)

@@ -50,9 +50,9 @@ class Run:
 
     Attributes:
         method: The transcription.
-        cost: How far under and how far over the optimum the cost may come. Under it by the solver's tolerance only where
-            every plan of the discretised problem is admissible in the original one; elsewhere by what the quadrature and
-            the polynomials between the points can cheat. Over it by the discretisation error.
+        cost: How far under and how far over the optimum the cost may come. Under it by the solver's tolerance where
+            every plan of the discretised problem is admissible in the original one; elsewhere by what the quadrature
+            and the polynomials between the points can cheat. Over it by the discretisation error.
         state, control, costate: Largest allowed error at the reported times; None where controls are not compared, for
             a reason that stands beside the run.
         time: Largest allowed error of the horizon and of the switching times, s.

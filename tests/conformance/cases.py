@@ -28,6 +28,7 @@ CASES: tuple[Case, ...] = (
     consumption.CASE,
     minimum_time.CASE,
     bryson_denham.CASE,
+    bryson_denham.CASE_AS_PATH,
     brachistochrone.CASE,
     rayleigh.CASE,
     rayleigh_bounded.CASE,

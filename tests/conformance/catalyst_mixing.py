@@ -1,9 +1,9 @@
 """Catalyst mixing (COPS 3.0, problem 14): bang, singular, bang.
 
-x1' = u (10 x2 - x1), x2' = u (x1 - 10 x2) - (1 - u) x2 from (1, 0), 1 s, 0 <= u <= 1, least x1 + x2 - 1. With
-x' = (N + u M) x the switching function is l.Mx, its rate l.Cx with C = MN - NM. On the singular arc Mx and Cx are
-parallel, which fixes the ratio r = x2/x1: 90 r^2 - 20 r + 1 = 0; u keeps it. Pure first catalyst until the ratio is
-reached, pure second from where l.Mx leaves zero.
+x1' = u (10 x2 - x1), x2' = u (x1 - 10 x2) - (1 - u) x2 from (1, 0), 1 s, 0 <= u <= 1, least x1 + x2 - 1. With x' = (N
++ u M) x the switching function is l.Mx, its rate l.Cx with C = MN - NM. On the singular arc Mx and Cx are parallel,
+which fixes the ratio r = x2/x1: 90 r^2 - 20 r + 1 = 0; u keeps it. Pure first catalyst until the ratio is reached,
+pure second from where l.Mx leaves zero.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Double integrator, least consumption int |u| dt, |u| <= 5.
 
-From (0, 0) to (1, 0) in 1 s. |u| is written as u = up - um, both in [0, 5]. The control is 5, 0, -5: it burns while the
-costate of v is below -1, brakes while it is above 1. Distance 1 = 5 t1 (1 - t1) gives the switch t1; the cost is
+From (0, 0) to (1, 0) in 1 s. |u| is written as u = up - um, both in [0, 5]. The control is 5, 0, -5: it burns while
+the costate of v is below -1, brakes while it is above 1. Distance 1 = 5 t1 (1 - t1) gives the switch t1; the cost is
 10 t1 = 5 - sqrt 5.
 """
 

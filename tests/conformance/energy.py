@@ -1,7 +1,7 @@
 """Double integrator, least control energy.
 
 q' = v, v' = u, from (0, 0) to (1, 0) in 1 s, least int u^2 / 2 dt. H = u^2/2 + lq v + lv u gives u = -lv, lv' = -lq,
-lq' = 0: a control linear in time, fixed by the ends. Bryson & Ho, Applied Optimal Control, 1975, section 3.
+lq' = 0: a control linear in time, fixed by the ends.
 """
 
 from __future__ import annotations

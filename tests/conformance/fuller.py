@@ -1,14 +1,16 @@
 """Fuller's problem: the optimal control switches infinitely often in finite time.
 
-q' = v, v' = u, |u| <= 1, from (0, 1) to rest at 0 in 3.5 s, least int q^2 dt. The control is u = -sign(q + Z v |v|); its
-switching times accumulate at 2.92 s, after which the plan rests. Each arc is the one before it scaled by W in time and
-velocity, W^2 in position, so the cost is a geometric series with ratio W^5. At a switch lv = 0, and H = 0 gives lq.
-Fuller, J. Electronics and Control 15, 1963; Zelikin & Borisov, Theory of Chattering Control, 1994, chapter 2.
+q' = v, v' = u, |u| <= 1, from (0, 1) to rest at 0 in 3.5 s, least int q^2 dt. The control is u = -sign(q + Z v |v|);
+its switching times accumulate at 2.92 s, after which the plan rests. Each arc is the one before it scaled by W in
+time and velocity, W^2 in position, so the cost is a geometric series with ratio W^5. At a switch lv = 0, and H = 0
+gives lq. Fuller, J. Electronics and Control 15, 1963; Zelikin & Borisov, Theory of Chattering Control, 1994, chapter
+2.
 """
 
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from math import sqrt
 
 import numpy as np
@@ -71,7 +73,7 @@ def optimum(t: Array) -> Extremal:
     states = switch_states()
     q, v, lq, lv, u = np.zeros((5, t.size))
     begins = [-np.inf, *(state[0] for state in states)]
-    for k, (begin, end) in enumerate(zip(begins[:-1], begins[1:], strict=True)):
+    for k, (begin, end) in enumerate(pairwise(begins)):
         on = (t >= begin) & (t < end)
         time, position, velocity = states[max(k - 1, 0)]  # the first arc is followed back from its end
         direction = -1.0 if k % 2 == 0 else 1.0

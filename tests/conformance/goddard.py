@@ -1,9 +1,10 @@
 """Goddard's rocket (COPS 3.0, problem 10): full thrust, singular arc, coast.
 
-h' = v, v' = (F - D)/m - 1/h^2, m' = -2 F with D = 310 v^2 exp(-500 (h - 1)), from (1, 0, 1) to m = 0.6, 0 <= F <= 3.5,
-greatest h at a free final time. Where the switching function vanishes so do its rate and H: three linear equations in
-three costates, solvable only on the surface D (1 + 2 v) = m / h^2. Full thrust reaches it at T1; the thrust that keeps to
-it burns until m = 0.6 at T2; the coast ends at rest. The times come from integrating these arcs with events.
+h' = v, v' = (F - D)/m - 1/h^2, m' = -2 F with D = 310 v^2 exp(-500 (h - 1)), from (1, 0, 1) to m = 0.6, 0 <= F <=
+3.5, greatest h at a free final time. Where the switching function vanishes so do its rate and H: three linear
+equations in three costates, solvable only on the surface D (1 + 2 v) = m / h^2. Full thrust reaches it at T1; the
+thrust that keeps to it burns until m = 0.6 at T2; the coast ends at rest. The times come from integrating these arcs
+with events.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def canonical(
     """Rates of states and costates under a law of thrust."""
 
     def rates(t: float, y: Array) -> Sequence[float]:
-        h, v, m, lh, lv, lm = (float(entry) for entry in y)
+        h, v, m, lh, lv, _ = (float(entry) for entry in y)
         thrust = thrust_law(h, v, m)
         density = 310 * exp(-500 * (h - 1))
         drag = density * v**2

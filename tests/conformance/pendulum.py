@@ -1,8 +1,8 @@
 """Pendulum as a differential-algebraic system (Betts, example 10.103), and the same in its angle.
 
-Unit mass on a unit rod, driven sideways to the rod by u, from horizontal rest to x = 0, x' = 0 in 3 s, least int u^2 dt:
-x'' = -2 z x + u y, y'' = -g - 2 z y - u x. The rod's force 2 z is that of x^2 + y^2 = 1 differentiated twice,
-2 z = x'^2 + y'^2 - g y: z is a control tied by a path equality. Its bounds matter: a swing up to the top costs 6.467 but
+Unit mass on a unit rod, driven sideways to the rod by u, from horizontal rest to x = 0, x' = 0 in 3 s, least int u^2
+dt: x'' = -2 z x + u y, y'' = -g - 2 z y - u x. The rod's force 2 z is that of x^2 + y^2 = 1 differentiated twice, 2 z
+= x'^2 + y'^2 - g y: z is a control tied by a path equality. Its bounds matter: a swing up to the top costs 6.467 but
 needs z = 20.5 and a speed of 5.6. In the angle, x = cos a: a'' = -g cos a - u, and the end is a = -pi/2. The initial
 costates were found by shooting. Betts, Practical Methods for Optimal Control, 3rd ed. 2020: 12.8738850.
 """

@@ -1,8 +1,8 @@
 """Linear quadratic regulators with random matrices, constant or varying in time.
 
-x' = A(t) x + B(t) u from x0, 2 s, end free, least 1/2 x(T)' F x(T) + int 1/2 (x' Q x + 2 x' S u + u' R u) dt. The optimal
-cost from (t, x) is x' P(t) x / 2, with P from the Riccati equation integrated backwards from F; the costate is P x and
-u = -R^-1 (B' P + S') x. Bryson & Ho, Applied Optimal Control, 1975, section 5.2.
+x' = A(t) x + B(t) u from x0, 2 s, end free, least 1/2 x(T)' F x(T) + int 1/2 (x' Q x + 2 x' S u + u' R u) dt. The
+optimal cost from (t, x) is x' P(t) x / 2, with P from the Riccati equation integrated backwards from F; the costate
+is P x and u = -R^-1 (B' P + S') x. Bryson & Ho, Applied Optimal Control, 1975, section 5.2.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Soft lander (Meditch): fall free, then brake at full thrust.
 
-h' = v, v' = u - 1.5, from h = 10, v = -2 to rest on the ground, 0 <= u <= 3, least int u dt, free final time.
-The engine fires at t1, the root of 1.5 t1^2 + 4 t1 = 26/3; it burns for t1 + 4/3, so the cost is 3 t1 + 4 = sqrt 68.
-The costate of v is -1 at the switch, and H = 0 there gives that of h. Meditch, IEEE Trans. Automatic Control 9, 1964.
+h' = v, v' = u - 1.5, from h = 10, v = -2 to rest on the ground, 0 <= u <= 3, least int u dt, free final time. The
+engine fires at t1, the root of 1.5 t1^2 + 4 t1 = 26/3; it burns for t1 + 4/3, so the cost is 3 t1 + 4 = sqrt 68. The
+costate of v is -1 at the switch, and H = 0 there gives that of h. Meditch, IEEE Trans. Automatic Control 9, 1964.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Every reference problem by every method that suits it: cost from both sides, horizon, trajectory, costates, switches."""
+"""Every reference problem by every method that suits it: cost from both sides, trajectory, costates, switches."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def known(case: Case, solution: Solution) -> Extremal:
 
 
 def apart(case: Case, run: Run, solution: Solution, times: Iterable[float]) -> Array:
-    """Which reported times are farther from `times` than one interval, or than nothing where these are nodes. (M,), bool.
+    """Which reported times stand apart from jumps at `times`. Shape (M,), bool.
 
-    Inside the interval that holds it a jump cannot be located, and at a node either of its sides may be reported.
+    A jump cannot be located better than to the interval that holds it; at a node either of its sides may be reported.
     """
     method = run.method
     mesh = np.linspace(0, 1, method.intervals + 1) if method.mesh is None else np.array(method.mesh)

@@ -1,7 +1,7 @@
 """Van der Pol oscillator, regulated.
 
-x1' = x2, x2' = (1 - x1^2) x2 - x1 + u from (1, 0), 2 s, end free, least int (x1^2 + x2^2 + u^2) / 2 dt. The control is
-u = -l2. The initial costate was found by shooting on l(2) = 0; published costs near 1.0479 are coarse-grid values.
+x1' = x2, x2' = (1 - x1^2) x2 - x1 + u from (1, 0), 2 s, end free, least int (x1^2 + x2^2 + u^2) / 2 dt. The control
+is u = -l2. The initial costate was found by shooting on l(2) = 0; published costs near 1.0479 are coarse-grid values.
 """
 
 from __future__ import annotations

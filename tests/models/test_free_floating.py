@@ -83,9 +83,7 @@ class Motion:
 
 @few
 @given(seeds, sizes, bases)
-def test_momentum_is_the_sum_over_the_links_of_differentiated_frames(
-    seed: int, size: int, base: Base
-) -> None:
+def test_momentum_is_the_sum_over_the_links_of_differentiated_frames(seed: int, size: int, base: Base) -> None:
     """E1 and E2 against sum(c x m c' + R I R^T omega) and sum(m c'), by differentiated frames."""
     rng = np.random.default_rng(seed)
     machine = random_machine(rng, size, base)
@@ -136,9 +134,7 @@ def test_generalized_jacobian_is_the_papers_formula(seed: int, size: int, base: 
     np.testing.assert_allclose(
         numeric(machine.tip_twist(place, q, rates)).ravel(), (f2 + f1 @ reaction) @ rates, atol=1e-9
     )
-    np.testing.assert_allclose(
-        numeric(machine.base_twist(place, q, rates)).ravel(), reaction @ rates, atol=1e-9
-    )
+    np.testing.assert_allclose(numeric(machine.base_twist(place, q, rates)).ravel(), reaction @ rates, atol=1e-9)
 
 
 @few
@@ -182,9 +178,7 @@ def test_momentum_is_conserved_along_an_integrated_motion(seed: int, size: int, 
 
 @settings(max_examples=20)
 @given(seeds, sizes, bases)
-def test_generalized_jacobian_agrees_with_finite_differences_of_the_tip(
-    seed: int, size: int, base: Base
-) -> None:
+def test_generalized_jacobian_agrees_with_finite_differences_of_the_tip(seed: int, size: int, base: Base) -> None:
     """The tip is moved by integrating base and joints together; its own displacement gives its velocity."""
     rng = np.random.default_rng(seed)
     machine = random_machine(rng, size, base)

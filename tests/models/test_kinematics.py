@@ -89,9 +89,7 @@ def test_jacobian_of_any_link_point_is_the_derivative_of_its_frame(seed: int, si
     found.append(ca.mtimes(tip_jacobian(robot, q, world_from_base), rates))
     expected.append(twist_by_differentiation(tip.rotation, tip.position, q, rates))
     error = ca.Function("f", [q, rates], [ca.horzcat(*found) - ca.horzcat(*expected)])
-    np.testing.assert_allclose(
-        numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-12
-    )
+    np.testing.assert_allclose(numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-12)
 
 
 @few
@@ -120,9 +118,7 @@ def test_momentum_matrix_is_the_sum_over_the_links(seed: int, size: int, base: B
     expected = momentum_by_differentiation(robot, link_frames(robot, q, world_from_base), q, rates)
     found = ca.mtimes(momentum_matrix(robot, q, world_from_base), rates)
     error = ca.Function("f", [q, rates], [found - expected])
-    np.testing.assert_allclose(
-        numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-11
-    )
+    np.testing.assert_allclose(numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-11)
 
 
 @few
@@ -170,9 +166,7 @@ def test_a_moved_base_moves_everything_with_it(seed: int, size: int) -> None:
     here, there = numeric_poses(robot, q), numeric_poses(robot, q, base)
     for link in robot.links:
         np.testing.assert_allclose(there[link.name][0], base.rotation @ here[link.name][0], atol=1e-13)
-        np.testing.assert_allclose(
-            there[link.name][1], numeric(base.point(here[link.name][1])).ravel(), atol=1e-13
-        )
+        np.testing.assert_allclose(there[link.name][1], numeric(base.point(here[link.name][1])).ravel(), atol=1e-13)
 
 
 def test_planar_chain_has_the_textbook_position() -> None:
@@ -232,9 +226,7 @@ def test_a_rounded_right_angle_costs_no_more_than_an_exact_one() -> None:
     c, s = np.cos(np.pi / 2), np.sin(np.pi / 2)
     rounded = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
     q = ca.SX.sym("q", 2)
-    counts = [
-        ca.Function("f", [q], [tip_jacobian(robot(turn), q)]).n_instructions() for turn in (exact, rounded)
-    ]
+    counts = [ca.Function("f", [q], [tip_jacobian(robot(turn), q)]).n_instructions() for turn in (exact, rounded)]
     assert counts[0] == counts[1]
 
 
@@ -253,8 +245,6 @@ def test_requests_that_do_not_fit_are_refused() -> None:
 def test_a_robot_without_joints_stands_still() -> None:
     robot = Robot((Link("a", 2.0, (1, 0, 0)),), tip_translation=(1, 2, 3))
     turn = random_rotation(np.random.default_rng(0))
-    np.testing.assert_allclose(
-        numeric(tip_pose(robot, [], (turn, (0, 0, 0))).position).ravel(), turn @ [1, 2, 3]
-    )
+    np.testing.assert_allclose(numeric(tip_pose(robot, [], (turn, (0, 0, 0))).position).ravel(), turn @ [1, 2, 3])
     assert tip_jacobian(robot, []).shape == (6, 0)
     assert momentum_matrix(robot, []).shape == (6, 0)

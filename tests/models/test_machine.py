@@ -56,9 +56,7 @@ def test_fixed_base_moves_its_tip_as_its_jacobian_says_and_nothing_else(seed: in
 
 @few
 @given(seeds, st.integers(3, 7), st.sampled_from([None, "planar", "spatial"]))
-def test_manipulability_is_the_product_of_the_singular_values(
-    seed: int, size: int, base: Base | None
-) -> None:
+def test_manipulability_is_the_product_of_the_singular_values(seed: int, size: int, base: Base | None) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size, base or "spatial")
     machine: Machine = FixedBase(robot) if base is None else FreeFloating(robot, base)
@@ -91,9 +89,7 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any, kind: str) 
     rng = np.random.default_rng(5)
     robot = random_robot(rng, 6, "planar" if kind == "planar" else "spatial")
     machine: Any = (
-        FixedBase(robot)
-        if kind == "fixed"
-        else FreeFloating(robot, "planar" if kind == "planar" else "spatial")
+        FixedBase(robot) if kind == "fixed" else FreeFloating(robot, "planar" if kind == "planar" else "spatial")
     )
     place = np.zeros(0) if kind == "fixed" else random_base(rng, machine.base)
     numbers = (place, rng.normal(size=robot.dof), rng.normal(size=robot.dof))

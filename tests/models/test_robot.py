@@ -183,9 +183,7 @@ def test_an_impossible_joint_is_refused(fields: dict[str, Any], message: str) ->
         ("abc", [("j", "a", "b"), ("k", "a", "c")], r"leaves \['b', 'c'\]; say which carries the tip"),
     ],
 )
-def test_links_that_form_no_tree_are_refused(
-    links: str, edges: list[tuple[str, str, str]], message: str
-) -> None:
+def test_links_that_form_no_tree_are_refused(links: str, edges: list[tuple[str, str, str]], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         Robot(tuple(Link(name) for name in links), tuple(joint(*edge) for edge in edges))
 

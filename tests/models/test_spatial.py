@@ -120,9 +120,7 @@ def test_quaternion_rate_gives_the_angular_velocity_of_the_rotation_and_keeps_th
     found = numeric(ca.Function("f", [symbol], [twist])(quaternion)).ravel()
     np.testing.assert_allclose(found[0:3], omega, atol=1e-13)
     assert abs(float(ca.dot(rate, quaternion))) < 1e-15 * (1 + np.linalg.norm(omega))
-    np.testing.assert_allclose(
-        numeric(angular_velocity_from_quaternion(quaternion, rate)).ravel(), omega, atol=1e-14
-    )
+    np.testing.assert_allclose(numeric(angular_velocity_from_quaternion(quaternion, rate)).ravel(), omega, atol=1e-14)
 
 
 @given(seeds)
@@ -161,9 +159,7 @@ def test_motion_cross_is_the_rate_of_the_motion_transform(seed: int) -> None:
 @given(seeds)
 def test_force_cross_keeps_power_constant(seed: int) -> None:
     velocity, motion, force = np.random.default_rng(seed).normal(size=(3, 6))
-    power_rate = (numeric(motion_cross(velocity)) @ motion) @ force + motion @ (
-        numeric(force_cross(velocity)) @ force
-    )
+    power_rate = (numeric(motion_cross(velocity)) @ motion) @ force + motion @ (numeric(force_cross(velocity)) @ force)
     assert abs(power_rate) < 1e-12
     np.testing.assert_allclose(numeric(motion_cross(velocity)) @ velocity, 0, atol=1e-14)
 
@@ -173,9 +169,7 @@ def test_spatial_inertia_gives_the_momentum_of_point_masses(seed: int) -> None:
     rng = np.random.default_rng(seed)
     masses, points, velocity = rng.uniform(0.1, 2, size=9), rng.normal(size=(9, 3)), rng.normal(size=6)
     center = masses @ points / masses.sum()
-    inertia = sum(
-        m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, points - center, strict=True)
-    )
+    inertia = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, points - center, strict=True))
     speeds = velocity[3:] + np.cross(velocity[:3], points)
     expected = np.concatenate([(masses[:, None] * np.cross(points, speeds)).sum(axis=0), masses @ speeds])
     found = numeric(spatial_inertia(masses.sum(), center, inertia)) @ velocity

@@ -57,9 +57,7 @@ def random_robot(rng: np.random.Generator, size: int, base: Base = "spatial") ->
             if rng.random() < 0.3:
                 turn = turn @ flips
             axis = (
-                np.array([*rng.normal(size=2), 0.0])
-                if kind == "prismatic"
-                else np.array([0, 0, rng.choice([-1, 1])])
+                np.array([*rng.normal(size=2), 0.0]) if kind == "prismatic" else np.array([0, 0, rng.choice([-1, 1])])
             )
         # Mostly chains, sometimes a branch.
         parent = links[i if rng.random() < 0.7 else int(rng.integers(i + 1))].name
@@ -67,6 +65,15 @@ def random_robot(rng: np.random.Generator, size: int, base: Base = "spatial") ->
     tip = links[int(rng.integers(1, size + 1))].name
     turn = Rotation.from_euler("z", 0.4).as_matrix() if base == "planar" else random_rotation(rng)
     return Robot(tuple(links), tuple(joints), tip, rng.normal(scale=0.3, size=3), turn)
+
+
+def seven_joint_arm() -> Robot:
+    """Arm of seven joints about z and y in turn, some 2 m long, on a base of 100 kg."""
+    links, joints = [Link("base", 100.0, inertia=np.diag([30.0, 40.0, 50.0]))], []
+    for i, axis in enumerate([(0, 0, 1), (0, 1, 0)] * 3 + [(0, 0, 1)]):
+        links.append(Link(f"link{i}", 3.0, (0.0, 0.02, 0.15), np.diag([0.1, 0.1, 0.05])))
+        joints.append(Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, (0, 0, 0.3), axis=axis))
+    return Robot(tuple(links), tuple(joints), tip_translation=(0, 0, 0.2))
 
 
 def random_base(rng: np.random.Generator, base: Base) -> Array:
@@ -87,9 +94,7 @@ def numeric(value: Any) -> Array:
 
 def vee(matrix: Any) -> Any:
     """Axial vector of the antisymmetric part of a matrix."""
-    return (
-        ca.vertcat(matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]) / 2
-    )
+    return ca.vertcat(matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]) / 2
 
 
 def directional(value: Any, variables: Any, rates: Any) -> Any:
@@ -134,6 +139,4 @@ def momentum_by_differences(robot: Robot, poses: list[dict[str, tuple[Array, Arr
 
 def numeric_poses(robot: Robot, q: Any, world_from_base: Any = None) -> dict[str, tuple[Array, Array]]:
     frames = link_frames(robot, q, world_from_base)
-    return {
-        name: (numeric(frame.rotation), numeric(frame.position).ravel()) for name, frame in frames.items()
-    }
+    return {name: (numeric(frame.rotation), numeric(frame.position).ravel()) for name, frame in frames.items()}

@@ -1,0 +1,248 @@
+"""Pontryagin's minimum principle of a problem, by automatic differentiation.
+
+H = L + lambda . f + mu . h with running cost L, dynamics f and path equalities h that contain the control. Costates obey
+lambda' = -dH/dx, the control makes H least. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.formulation import Formulation
+
+__all__ = ["Hamiltonian"]
+
+SEED = 20110106
+REGULAR = 1e-9  # least eigenvalue, relative to the largest, of a matrix that may be divided by
+
+
+@dataclass(frozen=True)
+class Hamiltonian:
+    """The Hamiltonian system of a problem.
+
+    Attributes:
+        form: The problem.
+        lam, mu: Symbols of the costates (nx, 1) and of the multipliers of the path equalities (m, 1).
+        value: H. Scalar expression of x, u, lam, mu, t, T, p.
+        smooth, linear: Indices of the controls in which H is curved, and of those in which it is linear.
+        unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that make H least. ``bang`` are
+            the values of the linear controls, each at one of its bounds; ``guess`` a guess of w for iterations.
+        how: ``quadratic`` (solved symbolically), ``projected`` (then put inside its bounds) or ``iterated``.
+    """
+
+    form: Formulation
+    lam: Any
+    mu: Any
+    value: Any
+    smooth: tuple[int, ...]
+    linear: tuple[int, ...]
+    unknowns: Any
+    how: str
+
+    @classmethod
+    def of(cls, form: Formulation) -> Hamiltonian:
+        """Derive the Hamiltonian system.
+
+        Raises:
+            ProblemError: The problem has a constraint that the minimum principle as built here cannot take, or H is
+                linear in a control that has no bounds, or does not determine a control; says which.
+        """
+        check_constraints(form)
+        sym = form.problem.symbols.sym
+        rows = form.path.expression
+        lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
+        value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
+        curved = np.asarray(ca.DM(ca.sparsify(ca.hessian(value, form.u)[0]).sparsity(), 1).full()).any(axis=1)
+        in_path = np.asarray(ca.DM(ca.jacobian_sparsity(rows, form.u), 1).full()).any(axis=0)
+        in_path = in_path if len(form.path) else np.zeros(form.nu, dtype=bool)
+        smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
+        linear = [i for i in range(form.nu) if i not in smooth]
+        system = Stationarity(form, lam, mu, value, smooth, linear)
+        unknowns, how = system.solve()
+        return cls(form, lam, mu, value, tuple(smooth), tuple(linear), unknowns, how)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Sizes of x, lam, t, T, p, bang, guess."""
+        form = self.form
+        return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
+
+    def flow(self) -> Any:
+        """Function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT), the control making H least."""
+        form = self.form
+        # H is stationary in u and mu, so it is differentiated with both held
+        outputs = [form.f, -ca.gradient(self.value, form.x), form.running, ca.gradient(self.value, form.T)]
+        return self._eliminated("flow", outputs)
+
+    def outputs(self) -> Any:
+        """Function (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls)."""
+        switching = ca.gradient(self.value, self.form.u)[list(self.linear)]
+        return self._eliminated("outputs", [self.form.u, self.mu, self.value, switching])
+
+    def _eliminated(self, name: str, outputs: list[Any]) -> Any:
+        form = self.form
+        sym = form.problem.symbols.sym
+        w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
+        control = assemble_control(form, self.smooth, self.linear, w, bang)
+        outputs = [ca.densify(out) for out in outputs]
+        outputs = ca.substitute(outputs, [form.u, self.mu], [control, w[len(self.smooth) :]])
+        inner = ca.Function(name, [form.x, self.lam, form.t, form.T, form.p, bang, w], outputs, {"cse": True})
+        flat = self.unknowns.is_a("SXFunction") and inner.is_a("SXFunction")
+        arguments = [(ca.SX if flat else ca.MX).sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
+        found = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
+        return ca.Function(name, arguments, found, {"cse": True})
+
+
+def assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
+    """All controls, from the smooth ones (first entries of ``w``) and those at their bounds."""
+    order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
+    return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
+
+
+def check_constraints(form: Formulation) -> None:
+    """Raise ProblemError for a constraint that the indirect method cannot take, naming it."""
+    for name, place in form.states.items():
+        index = form.bounds.places["state"][place]
+        low, high = (bound[index] for bound in numeric_bounds(form))
+        if np.any(np.isfinite(low) | np.isfinite(high)):
+            raise ProblemError(
+                f"the indirect method cannot take the bounds of state {name!r}: it knows path constraints only as "
+                "bounds of controls and equalities that contain a control; drop them or use a direct method"
+            )
+    for label, equality, uses in zip(form.path.labels, form.path.equality, form.path.uses_control, strict=True):
+        if not equality:
+            raise ProblemError(
+                f"the indirect method cannot take the path inequality {label!r}; drop it or use a direct method"
+            )
+        if not uses:
+            raise ProblemError(
+                f"the indirect method cannot take the path equality {label!r}, which contains no control; "
+                "differentiate it until one appears or use a direct method"
+            )
+    controls = ca.vertcat(form.u, form.u0)
+    for kind, rows in (("start", form.start), ("end", form.end)):
+        for i, (label, equality) in enumerate(zip(rows.labels, rows.equality, strict=True)):
+            if not equality:
+                raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
+            if form.nu and ca.depends_on(rows.expression[i], controls):
+                raise ProblemError(f"the indirect method cannot take {kind} constraint {label!r} on the control")
+
+
+@dataclass(frozen=True)
+class Stationarity:
+    """The equations that make H stationary in the smooth controls, and their solution."""
+
+    form: Formulation
+    lam: Any
+    mu: Any
+    value: Any
+    smooth: list[int]
+    linear: list[int]
+
+    def solve(self) -> tuple[Any, str]:
+        """Function (x, lam, t, T, p, bang, guess) -> w, and how it works."""
+        form, n, m = self.form, len(self.smooth), len(self.form.path)
+        sym = form.problem.symbols.sym
+        self._check_linear()
+        w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
+        known = [form.x, self.lam, form.t, form.T, form.p, bang]
+        residual = self._residual(w, bang)
+        matrix = ca.sparsify(ca.jacobian(residual, w))
+        self._check_regular(matrix, [*known, w])
+        bounded = self._has_bounds()
+        index = form.bounds.places["control"][self.smooth].tolist()
+        low, high = (bound[index] for bound in form.bounds.function(form.p))
+        separate = m == 0 and matrix.sparsity().is_diag()
+        if not ca.depends_on(matrix, w) and (not bounded or separate):
+            offset = ca.substitute([residual], [w], [ca.DM.zeros(n + m)])[0]
+            found = -symmetric_solve(matrix, offset, n) if n + m else w
+            if bounded:
+                found = ca.fmax(low, ca.fmin(high, found))
+            return ca.Function("unknowns", [*known, guess], [found]), "projected" if bounded else "quadratic"
+        if bounded:  # stationary or at a bound: u is the projection of u - H_u on the bounds
+            inside = ca.fmax(low, ca.fmin(high, w[:n] - residual[:n]))
+            residual = ca.vertcat(w[:n] - inside, residual[n:])
+        equations = ca.Function("stationary", [w, ca.vertcat(*known)], [residual])
+        options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False}
+        finder = ca.rootfinder("control", "newton", equations, options)
+        symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
+        return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
+
+    def _residual(self, w: Any, bang: Any) -> Any:
+        """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        n = len(self.smooth)
+        gradient = ca.gradient(self.value, self.form.u)[self.smooth]
+        lower = [self.form.bounds.function(self.form.p)[0][int(i)] for i in self.form.path.bounds]
+        level = ca.vertcat(self.form.problem.symbols(0, 1), *lower)
+        stacked = ca.densify(ca.vertcat(gradient, self.form.path.expression - level))
+        control = assemble_control(self.form, self.smooth, self.linear, w, bang)
+        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:]])[0]
+
+    def _has_bounds(self) -> bool:
+        low, high = numeric_bounds(self.form)
+        index = self.form.bounds.places["control"][self.smooth]
+        return bool(np.any(np.isfinite(low[index]) | np.isfinite(high[index])))
+
+    def _check_linear(self) -> None:
+        low, high = numeric_bounds(self.form)
+        for i in self.linear:
+            at = self.form.bounds.places["control"][i]
+            if not (np.isfinite(low[at]) and np.isfinite(high[at])):
+                raise ProblemError(
+                    f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
+                    "both sides: no control makes it least; bound it or add a quadratic term to the cost"
+                )
+
+    def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
+        """Raise where the equations of the control are singular at a random point."""
+        if matrix.shape[0] == 0:
+            return
+        rng = np.random.default_rng(SEED)
+        sample = numbers(matrix, symbols, rng)
+        singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
+        if singular[-1] < REGULAR * singular[0]:
+            raise ProblemError(
+                "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
+                "that the path equalities leave; add a quadratic term in the control to the cost"
+            )
+
+
+def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
+    """The bound table with all parameters one, to see which bounds are finite."""
+    lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
+    return lower, upper
+
+
+def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
+    """An expression at a random point in 0.1..1."""
+    function = ca.Function("matrix", symbols, [ca.densify(matrix)])
+    return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
+
+
+def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
+    """Solve [[W, A'], [A, 0]] w = rhs with W (n, n) by elimination, falling back on the whole where W is singular."""
+    if not isinstance(matrix, ca.SX):
+        return ca.solve(matrix, rhs)
+    curvature, constraint = matrix[:n, :n], matrix[n:, :n]
+    if not positive(curvature):
+        return ca.solve(ca.densify(matrix), rhs)
+    factor = ca.ldl(curvature)
+    first = ca.ldl_solve(rhs[:n], *factor)
+    if matrix.shape[0] == n:
+        return first
+    through = ca.ldl_solve(ca.densify(constraint.T), *factor)
+    schur = ca.mtimes(constraint, through)
+    multiplier = ca.ldl_solve(ca.mtimes(constraint, first) - rhs[n:], *ca.ldl(schur))
+    return ca.vertcat(first - ca.mtimes(through, multiplier), multiplier)
+
+
+def positive(matrix: Any) -> bool:
+    """Whether a symmetric matrix is positive definite at a random point."""
+    sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(SEED))
+    values = np.linalg.eigvalsh(sample)
+    return bool(np.all(np.isfinite(values)) and values[0] > REGULAR * values[-1])

@@ -1,0 +1,116 @@
+"""Bang-bang controls: which bound each is at, and where it switches, read from a direct solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ocp.errors import SolveError
+from ocp.hamiltonian import Hamiltonian
+from ocp.solution import Solution
+
+__all__ = ["Arcs", "read_arcs"]
+
+INSIDE = 0.1  # share of its range by which a control must be off both bounds to count as inside them
+SINGULAR = 0.1  # share of the horizon that a control may spend inside its bounds, for the sake of coarse seeds
+LONG = 3.5  # and the number of the seed's samples in a row
+
+
+@dataclass(frozen=True)
+class Arcs:
+    """Arcs between the switches of the controls in which the Hamiltonian is linear.
+
+    Attributes:
+        switches: Fractions of the horizon. Shape (A - 1,).
+        components: Which linear control switches at each. Length A - 1.
+        segments: Number of shooting segments of every arc. Length A.
+        bang: Values of the linear controls in every segment. Shape (S, n_linear).
+    """
+
+    switches: np.ndarray
+    components: tuple[int, ...]
+    segments: tuple[int, ...]
+    bang: np.ndarray
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Index of the node at every switch. Shape (A - 1,)."""
+        return np.cumsum(self.segments)[:-1]
+
+    def times(self, horizon: float) -> np.ndarray:
+        """Times of all nodes, s. Shape (S + 1,)."""
+        knots = np.concatenate([[0.0], self.switches, [1.0]]) * horizon
+        pieces = [np.linspace(knots[a], knots[a + 1], n + 1)[:-1] for a, n in enumerate(self.segments)]
+        return np.concatenate([*pieces, [horizon]])
+
+
+def read_arcs(
+    ham: Hamiltonian,
+    outputs: Any,
+    seed: Solution,
+    p: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    segments: int,
+) -> Arcs:
+    """Arcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
+
+    Raises:
+        SolveError: A control in which H is linear stays inside its bounds: a singular arc.
+    """
+    form = ham.form
+    if not ham.linear:
+        return Arcs(np.zeros(0), (), (segments,), np.zeros((segments, 0)))
+    index = form.bounds.places["control"][list(ham.linear)]
+    low, high = bounds[0][index], bounds[1][index]
+    m = len(seed.t)
+    x, lam, u = (np.hstack([pool[name] for name in places]) for pool, places in (
+        (seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls)))  # fmt: skip
+    linear = u[:, list(ham.linear)]
+    guess = np.hstack([u[:, list(ham.smooth)], np.zeros((m, len(form.path)))])
+    ones = np.ones((1, m))
+    arguments = (x.T, lam.T, seed.t[None, :], seed.horizon * ones, p[:, None] * ones, linear.T, guess.T)
+    slope = np.asarray(outputs.map(m)(*arguments)[3].full()).T
+    check_singular(form.control_labels, ham.linear, seed, low, high)
+
+    at_lower = slope > 0
+    events: list[tuple[float, int]] = []
+    for j in range(len(ham.linear)):
+        for k in np.flatnonzero(at_lower[1:, j] != at_lower[:-1, j]):
+            a, b = slope[k, j], slope[k + 1, j]
+            share = a / (a - b)
+            events.append((float(seed.t[k] + share * (seed.t[k + 1] - seed.t[k])) / seed.horizon, j))
+    events = sorted(event for event in events if 1e-6 < event[0] < 1 - 1e-6)
+    switches = np.array([at for at, _ in events])
+    widths = np.diff(np.concatenate([[0.0], switches, [1.0]]))
+    counts = tuple(int(max(2, round(segments * width))) for width in widths)
+    state = at_lower[0].copy()
+    values = []
+    for arc, count in enumerate(counts):
+        values += [np.where(state, low, high)] * count
+        if arc < len(events):
+            state[events[arc][1]] = ~state[events[arc][1]]
+    return Arcs(switches, tuple(j for _, j in events), counts, np.array(values))
+
+
+def check_singular(
+    labels: tuple[str, ...], linear: tuple[int, ...], seed: Solution, low: np.ndarray, high: np.ndarray
+) -> None:
+    """Raise SolveError where a linear control of the seed stays inside its bounds for long."""
+    samples = seed.control_interpolant
+    widths = np.diff(samples.breaks)
+    at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
+    values = samples.values.reshape(len(at), -1)[:, list(linear)]
+    for j, index in enumerate(linear):
+        margin = INSIDE * (high[j] - low[j])
+        inside = (values[:, j] > low[j] + margin) & (values[:, j] < high[j] - margin)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            width = at[end - 1] - at[begin]
+            if end - begin > LONG and width > SINGULAR:
+                raise SolveError(
+                    f"control {labels[index]!r} has a singular arc from {at[begin] * seed.horizon:.4g} to "
+                    f"{at[end - 1] * seed.horizon:.4g} s, where the Hamiltonian does not determine it; use a direct method, "
+                    "or add a small quadratic term in it to the cost"
+                )
