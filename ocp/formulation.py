@@ -63,7 +63,7 @@ class Rows:
         """The rows where ``mask`` (m,) holds."""
         keep = np.flatnonzero(mask)
         return Rows(
-            self.expression[keep.tolist()] if keep.size else self.expression[:0],
+            self.expression[keep.tolist()] if keep.size else self.expression[:0, :],
             tuple(self.labels[i] for i in keep),
             tuple(self.owners[i] for i in keep),
             self.bounds[keep],
@@ -156,7 +156,7 @@ class Formulation:
         v = self.problem.symbols.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
         horizon = v[self.nx + self.nu] if self.horizon_is_free else self.horizon_value
-        new = [v[: self.nx], v[inside], d[0] * horizon, horizon]
+        new = [v[: self.nx, :], v[inside, :], d[0] * horizon, horizon]
         symbols = self.problem.symbols
         outputs = ca.substitute([symbols(cost), symbols(g)], [self.x, self.u, self.t, self.T], new)
         return ca.Function(name, [v, d, self.p], outputs, {"cse": True})

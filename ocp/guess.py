@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ocp.fragment import Fragment
 from ocp.problem import numeric
 from ocp.solution import Solution
 
-__all__ = ["initial_point"]
+__all__ = ["Samples", "initial_point"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
@@ -74,10 +75,12 @@ def initial_point(
 
 def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
     """A guess as a function of the fraction: from a function of time, samples (M, n) over ``times``, or a value."""
-    if callable(value):
-        return lambda at: np.array([fitted(name, value(float(s) * horizon), size) for s in at])
     if isinstance(value, OverFraction):
         return value.curve
+    if isinstance(value, Samples) and value.values.shape[1] == size:
+        return lambda at: value.over(at * horizon)
+    if callable(value):
+        return lambda at: np.array([fitted(name, value(float(s) * horizon), size) for s in at])
     array = np.asarray(value, dtype=float)
     if array.ndim == 2 and array.shape[0] > 1:
         rows = len(array)
@@ -86,9 +89,31 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
             raise ProblemError(f"guess of {name!r} has shape {array.shape}, ({len(at)}, {size}) expected")
         if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):
             raise ProblemError(f"guess of {name!r}: its times 't' must be finite and increase")
-        return lambda s: np.column_stack([np.interp(s * horizon, at, array[:, i]) for i in range(size)])
+        sampled = Samples(at, array)
+        return lambda s: sampled.over(s * horizon)
     constant = fitted(name, value, size)
     return lambda s: np.tile(constant, (len(s), 1))
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A guess sampled over time: a function of time that can be asked for many times at once.
+
+    Attributes:
+        t: Times, s, increasing. Shape (M,).
+        values: Shape (M, n).
+    """
+
+    t: np.ndarray
+    values: np.ndarray
+
+    def over(self, times: np.ndarray) -> np.ndarray:
+        """Values at ``times`` (K,), linear between samples, constant beyond them. Shape (K, n)."""
+        return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
+
+    def __call__(self, time: float) -> np.ndarray:
+        """Value at one time. Shape (n,)."""
+        return np.asarray(self.over(np.array([time]))[0])
 
 
 class OverFraction:

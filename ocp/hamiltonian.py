@@ -1,7 +1,7 @@
 """Pontryagin's minimum principle of a problem, by automatic differentiation.
 
-H = L + lambda . f + mu . h with running cost L, dynamics f and path equalities h that contain the control. Costates obey
-lambda' = -dH/dx, the control makes H least. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
+H = L + lambda . f + mu . h with running cost L, dynamics f and path equalities h that contain the control. The costates
+obey lambda' = -dH/dx, the control makes H least. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
 """
 
 from __future__ import annotations
@@ -57,9 +57,8 @@ class Hamiltonian:
         rows = form.path.expression
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
-        curved = np.asarray(ca.DM(ca.sparsify(ca.hessian(value, form.u)[0]).sparsity(), 1).full()).any(axis=1)
-        in_path = np.asarray(ca.DM(ca.jacobian_sparsity(rows, form.u), 1).full()).any(axis=0)
-        in_path = in_path if len(form.path) else np.zeros(form.nu, dtype=bool)
+        curved = used_columns(ca.sparsify(ca.hessian(value, form.u)[0]).sparsity())
+        in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
         smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
         linear = [i for i in range(form.nu) if i not in smooth]
         system = Stationarity(form, lam, mu, value, smooth, linear)
@@ -90,7 +89,7 @@ class Hamiltonian:
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
         control = assemble_control(form, self.smooth, self.linear, w, bang)
         outputs = [ca.densify(out) for out in outputs]
-        outputs = ca.substitute(outputs, [form.u, self.mu], [control, w[len(self.smooth) :]])
+        outputs = ca.substitute(outputs, [form.u, self.mu], [control, w[len(self.smooth) :, :]])
         inner = ca.Function(name, [form.x, self.lam, form.t, form.T, form.p, bang, w], outputs, {"cse": True})
         flat = self.unknowns.is_a("SXFunction") and inner.is_a("SXFunction")
         arguments = [(ca.SX if flat else ca.MX).sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
@@ -152,7 +151,7 @@ class Stationarity:
         w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
         known = [form.x, self.lam, form.t, form.T, form.p, bang]
         residual = self._residual(w, bang)
-        matrix = ca.sparsify(ca.jacobian(residual, w))
+        matrix = ca.sparsify(ca.jacobian(residual, w)) if n + m else self.form.problem.symbols(0, 0)
         self._check_regular(matrix, [*known, w])
         bounded = self._has_bounds()
         index = form.bounds.places["control"][self.smooth].tolist()
@@ -165,8 +164,8 @@ class Stationarity:
                 found = ca.fmax(low, ca.fmin(high, found))
             return ca.Function("unknowns", [*known, guess], [found]), "projected" if bounded else "quadratic"
         if bounded:  # stationary or at a bound: u is the projection of u - H_u on the bounds
-            inside = ca.fmax(low, ca.fmin(high, w[:n] - residual[:n]))
-            residual = ca.vertcat(w[:n] - inside, residual[n:])
+            inside = ca.fmax(low, ca.fmin(high, w[:n, :] - residual[:n, :]))
+            residual = ca.vertcat(w[:n, :] - inside, residual[n:, :])
         equations = ca.Function("stationary", [w, ca.vertcat(*known)], [residual])
         options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False}
         finder = ca.rootfinder("control", "newton", equations, options)
@@ -181,7 +180,7 @@ class Stationarity:
         level = ca.vertcat(self.form.problem.symbols(0, 1), *lower)
         stacked = ca.densify(ca.vertcat(gradient, self.form.path.expression - level))
         control = assemble_control(self.form, self.smooth, self.linear, w, bang)
-        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:]])[0]
+        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
 
     def _has_bounds(self) -> bool:
         low, high = numeric_bounds(self.form)
@@ -200,7 +199,7 @@ class Stationarity:
 
     def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
         """Raise where the equations of the control are singular at a random point."""
-        if matrix.shape[0] == 0:
+        if 0 in matrix.shape:
             return
         rng = np.random.default_rng(SEED)
         sample = numbers(matrix, symbols, rng)
@@ -210,6 +209,12 @@ class Stationarity:
                 "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
                 "that the path equalities leave; add a quadratic term in the control to the cost"
             )
+
+
+def used_columns(pattern: Any) -> list[bool]:
+    """Which columns of a sparsity pattern have any entry."""
+    starts = pattern.colind()
+    return [starts[i + 1] > starts[i] for i in range(pattern.size2())]
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:

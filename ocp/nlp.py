@@ -49,6 +49,8 @@ ADVICE = {
     "User_Requested_Stop": "interrupted; the last iterate is returned",
     "Error_In_Step_Computation": "constraints may be redundant or a function not smooth",
 }
+FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
+FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
 SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -181,14 +183,19 @@ def call_solver(
     began = time.monotonic()
     if progress is not None:
         progress.reset(arguments["lbg"], arguments["ubg"])
-    with interruptible(progress):
-        result = solver(**arguments)
+    try:
+        with interruptible(progress):
+            result = solver(**(arguments if progress is not None else tightened(arguments)))
+    except RuntimeError as error:
+        if "option not supported" in str(error).lower():  # fatrop looks at its options only now
+            raise ProblemError(f"fatrop does not take this option: {last_line(error)}") from error
+        raise
     if progress is not None:
         progress.close()
     stats = solver.stats()
     word = str(stats.get("return_status", ""))
-    if not word or word.lstrip("-").isdigit():  # fatrop gives numbers
-        word = "Solve_Succeeded" if stats["success"] else "Maximum_Iterations_Exceeded"
+    if "fatrop" in stats:
+        word = FATROP_WORDS.get(int(stats["fatrop"]["return_flag"]), "Error_In_Step_Computation")
     if progress is not None and progress.stop:
         word = "User_Requested_Stop"
     success = bool(stats["success"]) or word in SUCCESSES
@@ -206,6 +213,19 @@ def call_solver(
         int(stats.get("iter_count", 0)),
         time.monotonic() - began,
     )
+
+
+def tightened(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Bounds drawn in by as much as fatrop widens them, so that plans keep the bounds that were asked."""
+    own = dict(arguments)
+    for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
+        lower, upper = arguments[low], arguments[high]
+        room = lower < upper
+        for key, bound, sign in ((low, lower, 1.0), (high, upper, -1.0)):
+            move = room & np.isfinite(bound)
+            size = np.maximum(1.0, np.abs(np.where(move, bound, 0.0)))
+            own[key] = np.where(move, bound + sign * FATROP_RELAXATION * size, bound)
+    return own
 
 
 @dataclass

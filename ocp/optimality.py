@@ -26,7 +26,8 @@ class Optimality:
     Attributes:
         t: Times of the control samples, s. Shape (K,).
         stationarity: Largest entry of the Hamiltonian's reduced gradient at each sample. Shape (K,).
-        gradient_scale: What it is judged against: the largest entry of its parts, L_u and f_u' lambda.
+        gradient_scale: What it is judged against: the largest sum of the sizes of its parts, L_u and each
+            f_u lambda.
         hamiltonian: At the reported times of the plan. Shape (M,).
         hamiltonian_scale: Largest of |L| + sum |lambda_i f_i|.
     """
@@ -69,13 +70,14 @@ def minimum_principle(
     rows = form.path.select(form.path.uses_control)
     outputs = [
         ca.jacobian(form.running, form.u).T,
-        ca.mtimes(ca.jacobian(form.f, form.u).T, lam),
+        ca.jacobian(form.f, form.u),
         rows.expression,
         ca.jacobian(rows.expression, form.u),
     ]
     function = ca.Function("gradient", symbols, [ca.densify(ca.vec(out)) for out in outputs])
-    direct, through, g, g_u = numbers(function, states, controls, t, horizon, p, costates)
-    gradient = direct + through
+    direct, f_u, g, g_u = numbers(function, states, controls, t, horizon, p, costates)
+    products = f_u.reshape(len(t), form.nu, form.nx) * costates[:, None, :]
+    gradient = direct + products.sum(axis=2)
 
     low, high = bounds
     control, path = form.bounds.places["control"], rows.bounds
@@ -89,7 +91,7 @@ def minimum_principle(
     for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
         directions = np.vstack([np.eye(form.nu), g_u[k].reshape(form.nu, -1).T])
         reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
-    parts = max(float(np.abs(direct).max(initial=0.0)), float(np.abs(through).max(initial=0.0)))
+    parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=0.0))
     return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)
 
 

@@ -154,7 +154,7 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
     v, d = sym("v", form.nx + nw + form.horizon_is_free), sym("d", 2)
     p = sym("p", form.np)
     horizon = v[form.nx + nw] if form.horizon_is_free else form.horizon_at(p)
-    x, w = v[: form.nx], v[form.nx : form.nx + nw]
+    x, w = v[: form.nx], v[form.nx : form.nx + nw, :]
     cost: Any = 0
     pieces = method.steps if method.integrator == "rk4" else 1
     for i in range(pieces):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Refinement", "Sample", "Solution"]
 
 VERSION = 1
+INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ class Solution:
         states, controls, costates: Values at the reported times by name, each (M, n). Costates are
             d(optimal cost)/d(state), so that H = running cost + costate . derivative.
         parameters: Their values by name.
-        state_interpolant, control_interpolant: Over fractions 0..1 of the horizon, of all states (controls) stacked.
+        state_interpolant, control_interpolant, costate_interpolant: Over fractions 0..1 of the horizon, of all states
+            (controls, costates) stacked.
         variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
@@ -93,6 +95,7 @@ class Solution:
     parameters: dict[str, np.ndarray]
     state_interpolant: PiecewisePolynomial
     control_interpolant: PiecewisePolynomial
+    costate_interpolant: PiecewisePolynomial
     variables: np.ndarray
     multipliers: np.ndarray
     seconds: dict[str, float]
@@ -165,7 +168,7 @@ class Solution:
         }
         for kind in ("states", "controls", "costates", "parameters"):
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
-        for kind in ("state_interpolant", "control_interpolant"):
+        for kind in INTERPOLANTS:
             part = getattr(self, kind)
             arrays |= {f"{kind}/{what}": getattr(part, what) for what in ("breaks", "nodes", "values")}
         simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
@@ -203,7 +206,7 @@ class Solution:
             }
             fields |= {
                 kind: PiecewisePolynomial(*(arrays[f"{kind}/{what}"] for what in ("breaks", "nodes", "values")))
-                for kind in ("state_interpolant", "control_interpolant")
+                for kind in INTERPOLANTS
             }
             past = head.pop("refinement", None)
             refinement = None

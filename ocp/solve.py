@@ -15,6 +15,7 @@ from ocp.formulation import Formulation
 from ocp.fragment import Fragment
 from ocp.guess import initial_point
 from ocp.indirect import Indirect, PreparedIndirect
+from ocp.interpolation import PiecewisePolynomial
 from ocp.nlp import Outcome, build_solver, call_solver
 from ocp.problem import Problem
 from ocp.solution import Solution
@@ -113,6 +114,7 @@ class Prepared:
             parameters={name: p[s] for name, s in form.parameters.items()},
             state_interpolant=states,
             control_interpolant=controls,
+            costate_interpolant=costate_interpolant(fragment, costates),
             variables=v,
             multipliers=outcome.multipliers,
             seconds={"build": self.seconds, "solve": outcome.seconds},
@@ -165,6 +167,17 @@ class Prepared:
         if not seen and not broken.size:
             lines.append("  all constraints are met; the plan is feasible but not optimal")
         return "\n".join(lines)
+
+
+def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:
+    """The polynomials through the reported costates of every interval, both its ends included."""
+    piece, place = fragment.report
+    n = len(fragment.mesh) - 1
+    starts = np.searchsorted(piece + (place == 1.0), np.arange(n))
+    width = starts[1] - starts[0] if n > 1 else len(piece) - 1
+    index = starts[:, None] + np.arange(width + 1)
+    nodes = np.append(place[(piece + (place == 1.0)) == 0], 1.0)
+    return PiecewisePolynomial(fragment.mesh, nodes, costates[index])
 
 
 def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.ndarray) -> np.ndarray:

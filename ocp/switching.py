@@ -15,7 +15,8 @@ __all__ = ["Arcs", "read_arcs"]
 
 INSIDE = 0.1  # share of its range by which a control must be off both bounds to count as inside them
 SINGULAR = 0.1  # share of the horizon that a control may spend inside its bounds, for the sake of coarse seeds
-LONG = 3.5  # and the number of the seed's samples in a row
+LONG = 3  # and the number of the seed's samples in a row
+CHATTER = 3  # arcs in a row that are shorter than an interval of the seed
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def read_arcs(
             events.append((float(seed.t[k] + share * (seed.t[k + 1] - seed.t[k])) / seed.horizon, j))
     events = sorted(event for event in events if 1e-6 < event[0] < 1 - 1e-6)
     switches = np.array([at for at, _ in events])
+    check_chattering(form.control_labels, ham.linear, events, seed)
     widths = np.diff(np.concatenate([[0.0], switches, [1.0]]))
     counts = tuple(int(max(2, round(segments * width))) for width in widths)
     state = at_lower[0].copy()
@@ -111,6 +113,23 @@ def check_singular(
             if end - begin > LONG and width > SINGULAR:
                 raise SolveError(
                     f"control {labels[index]!r} has a singular arc from {at[begin] * seed.horizon:.4g} to "
-                    f"{at[end - 1] * seed.horizon:.4g} s, where the Hamiltonian does not determine it; use a direct method, "
-                    "or add a small quadratic term in it to the cost"
+                    f"{at[end - 1] * seed.horizon:.4g} s, where the Hamiltonian does not determine it; use a direct "
+                    "method, or add a small quadratic term in it to the cost"
+                )
+
+
+def check_chattering(
+    labels: tuple[str, ...], linear: tuple[int, ...], events: list[tuple[float, int]], seed: Solution
+) -> None:
+    """Raise SolveError where a control switches again and again within the width of the seed's intervals."""
+    width = 1.5 * float(np.max(np.diff(seed.control_interpolant.breaks)))
+    for j, index in enumerate(linear):
+        at = np.array([time for time, component in events if component == j])
+        quick = np.diff(at) < width
+        for k in range(len(quick) - CHATTER + 1):
+            if quick[k : k + CHATTER].all():
+                raise SolveError(
+                    f"control {labels[index]!r} switches in every interval of the seed from {at[k] * seed.horizon:.4g} s on: "
+                    "a singular arc or chattering, where the Hamiltonian does not determine it; use a direct method "
+                    "with held controls, or add a small quadratic term in it to the cost"
                 )

@@ -15,6 +15,7 @@ import numpy as np
 from models import Machine
 from ocp.builders.task import Array, Velocity, checked_start, is_singular, velocity_expression
 from ocp.errors import ProblemError
+from ocp.guess import Samples
 from ocp.local import LocalSolution, least_rates, resolve
 from ocp.problem import Problem
 
@@ -150,5 +151,5 @@ def _check_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -
             )
 
 
-def _guess(local: LocalSolution, what: str) -> Any:
-    return lambda time: local.at(time)[what]
+def _guess(local: LocalSolution, what: str) -> Samples:
+    return Samples(local.t, getattr(local, what))

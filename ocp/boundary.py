@@ -1,0 +1,233 @@
+"""The boundary value problem of the minimum principle, written for shooting."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.formulation import Formulation
+from ocp.hamiltonian import Hamiltonian
+from ocp.switching import Arcs
+
+__all__ = ["NODES", "BoundaryProblem"]
+
+NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # of the reported interpolant of a piece, Chebyshev-Lobatto
+
+
+class BoundaryProblem:
+    """Segments of states and costates y = [x; lambda], and the conditions that make them one extremal.
+
+    Each segment is integrated from its own y with data q = [start time, duration, horizon, p, bang values, guess].
+
+    Attributes:
+        form, ham: The problem and its Hamiltonian system. backward: Whether to shoot backwards from the end state.
+        outputs: Function of the Hamiltonian system -> (u, mu, H, dH/du of the linear controls).
+        step, dense: Functions (y, q) -> (y at the end, or at NODES behind the first; integrals of L and dH/dT).
+    """
+
+    def __init__(self, ham: Hamiltonian, *, backward: bool, tolerance: float) -> None:
+        self.ham, self.form, self.backward, self.tolerance = ham, ham.form, backward, tolerance
+        self.outputs = ham.outputs()
+        self.step = self._integrator(np.array([1.0]))
+        self.dense = self._integrator(NODES[1:])
+        self._ends = end_conditions(ham.form)
+        self._systems: dict[tuple[int, ...], tuple[Any, Any]] = {}
+
+    def system(self, arcs: Arcs) -> tuple[Any, Any]:
+        """Residual and its Jacobian as functions of (unknowns, data), for a number of segments in every arc."""
+        key = tuple(arcs.segments)
+        if key not in self._systems:
+            build = self._backward if self.backward else self._multiple
+            z, data, residual = build(arcs)
+            jacobian = ca.jacobian(residual, z)
+            self._systems[key] = (
+                ca.Function("residual", [z, data], [residual]),
+                ca.Function("jacobian", [z, data], [jacobian]),
+            )
+        return self._systems[key]
+
+    def _multiple(self, arcs: Arcs) -> tuple[Any, Any, Any]:
+        """Forward multiple shooting: unknown y at every segment's start and at the end."""
+        form, _ham = self.form, self.ham
+        at, of = self.layout(arcs), self._data(arcs)
+        z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
+        total = sum(arcs.segments)
+        y = ca.reshape(z[at["y"]], 2 * form.nx, total + 1)
+        horizon = z[at["horizon"]] if form.horizon_is_free else data[of["horizon"]]
+        inputs = self._segment_data(z[at["switches"]], horizon, data, arcs)
+        ends, quads = self.step.map(total)(y[:, :-1], inputs)
+        residuals = [ca.vec(y[:, 1:] - ends)]
+        last = inputs[:, -1]
+        for i, (component, node) in enumerate(zip(arcs.components, arcs.nodes, strict=True)):
+            here = y[:, int(node)]
+            values = self.outputs(*self.arguments(here, z[at["switches"]][i], horizon, inputs[:, int(node) - 1]))
+            residuals.append(values[3][component])
+        values = self.outputs(*self.arguments(y[:, -1], horizon, horizon, last))
+        multipliers = z[at["start"]], z[at["end"]]
+        conditions, by_horizon = self._ends(y[:, 0], y[:, -1], horizon, data[of["p"]], *multipliers, data[of["ends"]])
+        residuals.append(conditions)
+        if form.horizon_is_free:
+            residuals.append(values[2] + by_horizon + ca.sum2(quads[1, :]))
+        return z, data, ca.vertcat(*residuals)
+
+    def _backward(self, arcs: Arcs) -> tuple[Any, Any, Any]:
+        """Backward shooting: unknown end state only; the start must be met."""
+        form = self.form
+        if len(form.end) or len(form.start) or form.horizon_is_free or arcs.components or form.ties_ends:
+            raise ProblemError(
+                "backward shooting takes problems with a given start, a free end state, a fixed horizon, no switches; "
+                "use Indirect(shooting='multiple')"
+            )
+        of = self._data(arcs)
+        total = sum(arcs.segments)
+        z, data = ca.MX.sym("z", form.nx), ca.MX.sym("data", of["guess"].stop)
+        _, y_start = self._chain(z, data, arcs, total)
+        return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
+
+    def _chain(self, state: Any, data: Any, arcs: Arcs, total: int) -> tuple[list[Any], Any]:
+        """y at all nodes from the end to the start, integrated backwards from an end state."""
+        form, of = self.form, self._data(arcs)
+        horizon = data[of["horizon"]]
+        gradient = ca.gradient(form.terminal, form.x)
+        terminal = ca.Function("terminal", [form.x, form.t, form.T, form.p], [gradient])
+        y = ca.vertcat(state, terminal(state, horizon, horizon, data[of["p"]]))
+        inputs = self._segment_data(ca.MX(0, 1), horizon, data, arcs)
+        nodes = [y]
+        for k in reversed(range(total)):
+            q = ca.vertcat(inputs[0, k] + inputs[1, k], -inputs[1, k], inputs[2:, k])
+            y = self.step(y, q)[0]
+            nodes.append(y)
+        return nodes, y
+
+    def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: Arcs) -> Any:
+        """The q of every segment side by side."""
+        of, total = self._data(arcs), sum(arcs.segments)
+        knots = ca.vertcat(0, switches, horizon)
+        begins, lengths = [], []
+        for a, count in enumerate(arcs.segments):
+            length = (knots[a + 1] - knots[a]) / count
+            begins += [knots[a] + j * length for j in range(count)]
+            lengths += [length] * count
+        sizes = self.ham.sizes
+        return ca.vertcat(
+            ca.horzcat(*begins),
+            ca.horzcat(*lengths),
+            ca.repmat(ca.vertcat(horizon, data[of["p"]]), 1, total),
+            ca.reshape(data[of["bang"]], sizes[5], total),
+            ca.reshape(data[of["guess"]], sizes[6], total),
+        )
+
+    def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
+        sizes = self.ham.sizes
+        cuts = np.cumsum([3, *sizes[4:]])
+        tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
+        return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
+
+    def layout(self, arcs: Arcs) -> dict[str, slice]:
+        """Where everything stands in the vector of unknowns."""
+        form = self.form
+        total = sum(arcs.segments)
+        sizes = {
+            "y": 2 * form.nx * (total + 1),
+            "switches": len(arcs.switches),
+            "horizon": int(form.horizon_is_free),
+            "start": len(form.start),
+            "end": len(form.end),
+        }
+        cuts = np.cumsum([0, *sizes.values()])
+        return {name: slice(int(a), int(b)) for name, a, b in zip(sizes, cuts, cuts[1:], strict=False)}
+
+    def _data(self, arcs: Arcs) -> dict[str, slice]:
+        """Where everything stands in the vector of data: horizon if fixed, p, end values, bang values, guesses."""
+        sizes = self.ham.sizes
+        total = sum(arcs.segments)
+        parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
+        cuts = np.cumsum([0, *parts.values()])
+        return {name: slice(int(a), int(b)) for name, a, b in zip(parts, cuts, cuts[1:], strict=False)}
+
+    def _integrator(self, places: np.ndarray) -> Any:
+        """Function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang, guess]."""
+        ham = self.ham
+        sizes = ham.sizes
+        flow = ham.flow()
+        sym = (ca.SX if flow.is_a("SXFunction") else ca.MX).sym
+        y, place = sym("y", 2 * sizes[0]), sym("place")
+        q = sym("q", 3 + sum(sizes[4:]))
+        cuts = np.cumsum([3, *sizes[4:]])
+        tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
+        x_rate, lam_rate, cost, by_horizon = flow(y[: sizes[0]], y[sizes[0] :], q[0] + place * q[1], q[2], *tail)
+        ode, quad = q[1] * ca.vertcat(x_rate, lam_rate), q[1] * ca.vertcat(cost, by_horizon)
+        tolerance = self.tolerance
+        options = {
+            "reltol": tolerance,
+            "abstol": tolerance,
+            "max_num_steps": 50_000,
+            "quad_err_con": True,
+            "linear_multistep_method": "adams",
+            "show_eval_warnings": False,
+        }
+        dae = {"x": y, "t": place, "p": q, "ode": ode, "quad": quad}
+        integrator = ca.integrator("flow", "cvodes", dae, 0.0, places.tolist(), options)
+        y, q = ca.MX.sym("y", 2 * sizes[0]), ca.MX.sym("q", q.numel())
+        result = integrator(x0=y, p=q)
+        return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
+
+    def integrate(self, integrator: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (2 nx, places) and integrals (2,); nan where the integration breaks down."""
+        try:
+            states, spent = integrator(y, q)
+            return np.asarray(states.full()), np.asarray(spent.full()).reshape(-1)
+        except RuntimeError:
+            return np.full(integrator.size_out(0), np.nan), np.full(2, np.nan)
+
+    def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
+        """y at a place 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
+        if place == 0.0:
+            return y
+        return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
+
+    def unpack(self, z: np.ndarray, arcs: Arcs, data: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
+        form, total = self.form, sum(arcs.segments)
+        horizon, switches = float(data[0]), np.zeros(0)
+        if self.backward:
+            symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
+            nodes, _ = self._chain(*symbols, arcs, total)
+            y = np.asarray(ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])(z, data).full())
+        else:
+            at = self.layout(arcs)
+            y = z[at["y"]].reshape(total + 1, 2 * form.nx).T
+            switches = z[at["switches"]]
+            horizon = float(z[at["horizon"]][0]) if form.horizon_is_free else horizon
+        w, at_end, given = ca.MX.sym("w", switches.size), ca.MX.sym("T"), ca.MX.sym("data", data.size)
+        inputs = ca.Function("q", [w, at_end, given], [self._segment_data(w, at_end, given, arcs)])
+        return y, np.asarray(inputs(switches, horizon, data).full()), switches, horizon
+
+
+def end_conditions(form: Formulation) -> Any:
+    """Function (y0, yN, T, p, nu0, nu1, ends) -> (2 nx + n_start + n_end conditions, dPhi/dT).
+
+    ``ends`` are, for initial and then for terminal states, 1 where an entry is given and its value; elsewhere the
+    costate there is the gradient of Phi = terminal cost + nu . constraints (with minus at the start).
+    """
+    sym = form.problem.symbols.sym
+    nx = form.nx
+    y0, y1, ends = sym("y0", 2 * nx), sym("y1", 2 * nx), sym("ends", 4 * nx)
+    nu0, nu1 = sym("nu0", len(form.start)), sym("nu1", len(form.end))
+    low = form.bounds.function(form.p)[0]
+    level0 = ca.vertcat(form.problem.symbols(0, 1), *[low[int(i)] for i in form.start.bounds])
+    level1 = ca.vertcat(form.problem.symbols(0, 1), *[low[int(i)] for i in form.end.bounds])
+    begin = ca.substitute([form.start.expression - level0], [form.x, form.t], [form.x0, 0])[0]
+    end, terminal = ca.substitute([form.end.expression - level1, form.terminal], [form.t], [form.T])
+    phi = terminal + ca.dot(nu0, begin) + ca.dot(nu1, end)
+    parts = [ca.gradient(phi, form.x0), ca.gradient(phi, form.x), ca.gradient(phi, form.T), begin, end]
+    parts = ca.substitute([ca.densify(part) for part in parts], [form.x0, form.x], [y0[:nx], y1[:nx]])
+    fixed0, given0, fixed1, given1 = (ends[i * nx : (i + 1) * nx] for i in range(4))
+    first = ca.if_else(fixed0, y0[:nx] - given0, y0[nx:] + parts[0])
+    last = ca.if_else(fixed1, y1[:nx] - given1, y1[nx:] - parts[1])
+    conditions = ca.vertcat(first, last, parts[3], parts[4])
+    return ca.Function("ends", [y0, y1, form.T, form.p, nu0, nu1, ends], [conditions, parts[2]])

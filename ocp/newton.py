@@ -1,0 +1,74 @@
+"""Newton's method for boundary value problems: sparse, damped, interruptible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.nlp import Interrupt, interruptible
+
+__all__ = ["Found", "newton"]
+
+HALVINGS = 12
+STEPS = 40
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where Newton's method ended."""
+
+    unknowns: np.ndarray
+    residual: float
+    steps: int
+    success: bool
+    status: str
+
+
+def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: float, tolerance: float) -> Found:
+    """Damped Newton's method on a sparse system; the step is halved until the residual falls."""
+    residual, jacobian = system
+
+    def evaluate(z: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(residual(z, data).full()).reshape(-1)
+        except RuntimeError:  # the integration broke down: as bad as can be
+            return np.full(z.size, np.inf)
+
+    z, value = start, evaluate(start)
+    if value.size != start.size:
+        raise ProblemError(f"the boundary value problem has {value.size} conditions for {start.size} unknowns")
+    interrupt = Interrupt()
+    polished = False
+    with interruptible(interrupt):
+        for steps in range(STEPS + 1):
+            size = float(np.max(np.abs(value), initial=0.0))
+            if not np.isfinite(size):
+                return Found(z, size, steps, False, "the integration broke down at the seed")
+            if size <= tolerance * scale and polished:
+                return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
+            polished = size <= tolerance * scale  # one more step: it costs little and gains digits
+            if interrupt.stop or steps == STEPS:
+                break
+            try:
+                step = np.asarray(ca.solve(jacobian(z, data), ca.DM(-value), "qr").full()).reshape(-1)
+            except RuntimeError:
+                return Found(z, size, steps, False, "the integration of the sensitivities broke down")
+            if not np.all(np.isfinite(step)):
+                return Found(z, size, steps, False, "Newton's matrix is singular: the plan is not determined")
+            length = 1.0
+            for _ in range(HALVINGS):
+                trial = z + length * step
+                new = evaluate(trial)
+                if np.linalg.norm(new) < (1.0 - 1e-4 * length) * np.linalg.norm(value) or polished:
+                    break
+                length *= 0.5
+            else:
+                return Found(z, size, steps, False, "no step along Newton's direction makes the residual smaller")
+            if polished and np.max(np.abs(new)) > size:
+                return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
+            z, value = trial, new
+    return Found(z, size, steps, False, "interrupted" if interrupt.stop else f"not converged in {STEPS} Newton steps")

@@ -1,0 +1,142 @@
+"""False optima of the free-floating example: plans that a solver calls optimal and that jump across a singularity.
+
+At a horizon of 4 s, from a constant guess and from random ones. Every plan is audited, solved again from itself on
+twice the intervals, and again while it may still be an extremal whose mesh is too coarse. An extremal keeps its cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp import Collocation, Problem, Solution, prepare
+
+__all__ = ["GUESSES", "HORIZON", "Trial", "trials"]
+
+Array: TypeAlias = NDArray[np.float64]
+
+HORIZON = 4.0  # s
+INTERVALS = 50
+MAX_INTERVALS = 200
+SAME_COST = 1e-2  # relative change of the cost under doubling up to which a plan may be one and the same extremal
+GUESSES = ("constant", *["smooth"] * 10, *["rough"] * 10)
+KNOTS = 9  # of a smooth random guess
+
+EXTREMAL, COARSE, FALSE = "extremal", "extremal, mesh too coarse", "false optimum"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One guess and what came of it.
+
+    Attributes:
+        guess: "constant" (the start, at rest), "smooth" (random values at nine times) or "rough" (at every point).
+        seed: Of the random guess; -1 for the constant one.
+        status: The solver's word.
+        cost: On 50 intervals, J of (27).
+        jump_deg_s: Largest jump of a joint velocity between two intervals, deg/s.
+        integration_error: Largest distance of the states from the re-integrated ones, relative.
+        task_error_m_s: Largest violation of the tip velocity between the nodes, m/s.
+        audit: Whether the plan passes its audit.
+        failed: The checks it does not pass.
+        intervals: On which the plan was solved last.
+        refined_cost: There.
+        refined_audit: Whether the plan passes there.
+        verdict: "extremal" passes and keeps its cost on twice the intervals; "extremal, mesh too coarse" passes on a
+            finer mesh at the same cost; "false optimum" does neither.
+        t: Reported times of the plan on 50 intervals. Shape (M,), s.
+        joint_rates: Shape (M, n), rad/s.
+    """
+
+    guess: str
+    seed: int
+    status: str
+    cost: float
+    jump_deg_s: float
+    integration_error: float
+    task_error_m_s: float
+    audit: bool
+    failed: tuple[str, ...]
+    intervals: int
+    refined_cost: float
+    refined_audit: bool
+    verdict: str
+    t: Array
+    joint_rates: Array
+
+    def row(self) -> dict[str, Any]:
+        """The trial without its curves, for a table."""
+        curves = ("t", "joint_rates")
+        return {
+            name: "; ".join(value) if name == "failed" else value
+            for name, value in self.__dict__.items()
+            if name not in curves
+        }
+
+
+def trials(problem: Problem, start_base: Array, start_joints: Array) -> Iterator[Trial]:
+    """One trial after the other.
+
+    Args:
+        problem: The "rates" formulation over HORIZON.
+        start_base: Shape (3,). start_joints: Shape (n,).
+    """
+    solvers = {}
+    intervals = INTERVALS
+    while intervals <= MAX_INTERVALS:
+        solvers[intervals] = prepare(problem, Collocation(intervals))
+        intervals *= 2
+    for number, kind in enumerate(GUESSES):
+        seed = number - 1
+        guess = _guess(kind, seed, start_base, start_joints)
+        first = solvers[INTERVALS].solve(guess=guess, check=False)
+        audit = first.audit()
+        plan, passed, intervals = first, audit.passed, INTERVALS
+        while intervals < MAX_INTERVALS:
+            intervals *= 2
+            plan = solvers[intervals].solve(guess=plan, check=False)
+            passed = plan.audit().passed
+            same = plan.success and abs(plan.cost - first.cost) < SAME_COST * abs(first.cost)
+            if passed or not same:
+                break
+        verdict = FALSE if not (passed and same) else EXTREMAL if audit.passed else COARSE
+        yield Trial(
+            guess=kind,
+            seed=seed,
+            status=first.status.split(":")[0],
+            cost=first.cost,
+            jump_deg_s=_jump(first),
+            integration_error=audit.integration_error,
+            task_error_m_s=audit.constraints["task"],
+            audit=audit.passed,
+            failed=tuple(finding.name for finding in audit.failures),
+            intervals=intervals,
+            refined_cost=plan.cost,
+            refined_audit=passed,
+            verdict=verdict,
+            t=first.t,
+            joint_rates=first["rates"],
+        )
+
+
+def _guess(kind: str, seed: int, base: Array, joints: Array) -> dict[str, Array]:
+    if kind == "constant":
+        return {"base": base, "joints": joints, "rates": np.zeros_like(joints)}
+    rng = np.random.default_rng(seed)
+    points = KNOTS if kind == "smooth" else 3 * INTERVALS + 1
+    spread = {"base": (base, 0.5), "joints": (joints, 1.0), "rates": (np.zeros_like(joints), 1.0)}
+    guess = {name: middle + rng.normal(0.0, size, (points, len(middle))) for name, (middle, size) in spread.items()}
+    return {"t": np.linspace(0.0, HORIZON, points), **guess}
+
+
+def _jump(plan: Solution) -> float:
+    """Largest jump of a joint velocity between two intervals, deg/s."""
+    curve = plan.control_interpolant
+    pieces = np.arange(len(curve.breaks) - 1)
+    left = curve.within(pieces[:-1], np.ones(len(pieces) - 1))
+    right = curve.within(pieces[1:], np.zeros(len(pieces) - 1))
+    return float(np.degrees(np.abs(right - left).max()))

@@ -1,0 +1,191 @@
+"""The free-floating example of Kim, Kim 2011, solved by every method: what its script draws and tabulates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from tqdm import tqdm
+
+from models import FreeFloating, Link, paper_example, planar_chain
+from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
+from ocp.builders.redundancy import minimum_velocity
+from ocp.local import resolve
+from scripts import false_optima
+from scripts.drawing import Row
+from scripts.false_optima import Trial
+from scripts.free_floating_motion import Array, Laws, Motion, laws, motion_of_local, motion_of_plan
+
+__all__ = ["Results", "compute", "problem", "progress", "pseudo_inverse"]
+
+Item = TypeVar("Item")
+
+ROWS = (3, 4)  # the task: linear velocity of the tip in the plane, its orientation free
+TIP_VELOCITY = np.array([-1.0, -1.0])  # m/s, printed
+START_JOINTS = np.radians([45.0, 60.0, -60.0])  # printed
+START_BASE = np.zeros(3)  # printed
+HORIZON = 5.0  # s, chosen
+STEP = 1e-3  # s, of the grids that peaks are read from
+PLAN = Collocation(100, degree=3, scheme="legendre")
+SECOND_OPINION = MultipleShooting(100, control="linear")
+
+ASSUMED = (
+    "Not printed in the paper: links 2 m long, arm mounted at (1, 0) m of the base, centres of mass at mid-link "
+    "(identified from the pattern of Table 1)"
+)
+CHOSEN = f"horizon {HORIZON:g} s (chosen, not printed)"
+NOTE = f"{ASSUMED}; {CHOSEN}."
+
+PAPER_PEAKS = {
+    "pseudo-inverse": (157.8240, 69.7189, -113.5345),
+    "optimum": (70.4688, -22.0748, -98.1823),
+}
+"""Table 1, deg/s."""
+PAPER_ACCELERATIONS = {
+    "pseudo-inverse": (-154757.4, -14153.14, 148085.1),
+    "optimum": (-811.6214, 136.2558, -296.0277),
+}
+"""Table 2, at the instant of the peak velocity, deg/s^2."""
+
+CAVEATS = {
+    "peaks": {
+        "pseudo-inverse": "converged; the rest is sensitivity to the geometry that is not printed, see sensitivity.csv",
+        "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s",
+    },
+    "accelerations": {
+        "pseudo-inverse": "not reproducible: the velocity is smooth, so its derivative is 0 at a peak inside the "
+        "motion, and no larger than the last column anywhere",
+        "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s",
+    },
+}
+LENGTH_OF_FIRST_PEAK = 2.00214
+"""Link length, m, at which the first peak alone would agree with Table 1: shown, never used."""
+
+METHODS: tuple[tuple[str, int, tuple[int, ...], Callable[[int], Any]], ...] = (
+    ("Radau 3", 5, (50, 100, 200), lambda n: Collocation(n)),
+    ("Legendre 3", 6, (25, 50, 100, 200), lambda n: Collocation(n, scheme="legendre")),
+    ("multiple shooting RK4, held control", 2, (50, 100, 200), lambda n: MultipleShooting(n)),
+    ("multiple shooting RK4, linear control", 4, (50, 100, 200), lambda n: MultipleShooting(n, control="linear")),
+)
+"""Name, order of the cost, numbers of intervals."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that is drawn, tabled and summarised.
+
+    Attributes:
+        machine: The paper's example.
+        local: Pseudo-inverse motion, every millisecond. near_peaks: the same, every microsecond near the peaks.
+        optimal: The plan, every millisecond.
+        plan: Legendre 3, 100 intervals. audit, laws: of it, re-integrated.
+        shooting: The same problem by multiple shooting of (26). principle: by backward shooting of (34).
+        convergence, sensitivity: Rows of the tables.
+        trials: False optima.
+    """
+
+    machine: FreeFloating
+    local: Motion
+    near_peaks: Motion
+    optimal: Motion
+    plan: Solution
+    audit: Audit
+    laws: Laws
+    shooting: Solution
+    principle: Solution
+    convergence: list[Row]
+    sensitivity: list[Row]
+    trials: list[Trial]
+
+
+def problem(horizon: float = HORIZON, formulation: Any = "rates") -> Problem:
+    """Problem (27) for the paper's example."""
+    machine = paper_example()
+    return minimum_velocity(machine, TIP_VELOCITY, ROWS, START_JOINTS, horizon, formulation=formulation)
+
+
+def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:
+    """Motion (26) with u = 0 at given times."""
+    local = resolve(machine, TIP_VELOCITY, ROWS, START_JOINTS, times[-1], tolerance=1e-12, samples=times)
+    if local.stopped:
+        raise RuntimeError(f"the pseudo-inverse motion ends early: {local.stopped}")
+    return motion_of_local(machine, local, TIP_VELOCITY, ROWS)
+
+
+def compute() -> Results:
+    """Solve everything."""
+    machine = paper_example()
+    times = grid()
+    local = pseudo_inverse(machine, times)
+    around = [np.arange(-STEP, STEP, 1e-6) + peak for peak in local.peak_joint_rates()[1]]
+    near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([times, *around]).round(9)))
+
+    rates, null_space = problem(), problem(formulation="null_space")
+    plan = solve(rates, PLAN)
+    audit = plan.audit()
+    principle = solve(rates, Indirect(shooting="backward", tolerance=1e-13), guess=plan)
+    forward = solve(rates, Indirect(shooting="multiple", tolerance=1e-13), guess=plan)
+    convergence = []
+    for method, order, counts, make in METHODS:
+        for intervals in progress(counts, f"convergence, {method}"):
+            found = solve(null_space if "shooting" in method else rates, make(intervals))
+            convergence.append(_convergence_row(method, intervals, order, found, principle.cost))
+            if make(intervals) == SECOND_OPINION:
+                shooting = found
+    convergence.append(_convergence_row("minimum principle, forward multiple shooting", 20, 0, forward, principle.cost))
+    convergence.append(_convergence_row("minimum principle, backward shooting", 20, 0, principle, principle.cost))
+
+    number = len(false_optima.GUESSES)
+    trials = progress(
+        false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS), "false optima", number
+    )
+    return Results(
+        machine=machine,
+        local=local,
+        near_peaks=near_peaks,
+        optimal=motion_of_plan(machine, plan, times, ROWS),
+        plan=plan,
+        audit=audit,
+        laws=laws(machine, audit, TIP_VELOCITY),
+        shooting=shooting,
+        principle=principle,
+        convergence=convergence,
+        sensitivity=sensitivity(),
+        trials=list(trials),
+    )
+
+
+def progress(items: Iterable[Item], title: str, total: int | None = None) -> Iterable[Item]:
+    """The items, with a bar on the terminal while they are worked through."""
+    bar: Iterable[Item] = tqdm(items, title, total, leave=False, disable=None)
+    return bar
+
+
+def sensitivity() -> list[Row]:
+    """Peaks of the pseudo-inverse motion when the links' length, which is not printed, is a little different."""
+    rows: list[Row] = []
+    for length in (2.0, 2.001, LENGTH_OF_FIRST_PEAK):
+        base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
+        robot = planar_chain([length] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
+        peaks, _ = pseudo_inverse(FreeFloating(robot, base="planar"), grid()).peak_joint_rates()
+        rows.append({"link_length_m": length, **{f"joint{i + 1}_deg_s": v for i, v in enumerate(np.degrees(peaks))}})
+    paper = dict(zip(list(rows[0])[1:], PAPER_PEAKS["pseudo-inverse"], strict=True))
+    return [*rows, {"link_length_m": "paper, Table 1", **paper}]
+
+
+def grid() -> Array:
+    """Times from 0 to the horizon, one every millisecond."""
+    return np.linspace(0.0, HORIZON, round(HORIZON / STEP) + 1)
+
+
+def _convergence_row(method: str, intervals: int, order: int, found: Solution, reference: float) -> Row:
+    return {
+        "method": method,
+        "intervals": intervals,
+        "order": order or "",
+        "cost": f"{found.cost:.14g}",
+        "difference": found.cost - reference,
+        "iterations": found.iterations,
+    }
