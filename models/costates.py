@@ -154,7 +154,9 @@ def costate_rate(
     """lam' = -dH*/dx (33), x and lam taken as independent. Shape (N,). Raises as `resolution`.
 
     When the end of the motion is free but for the task, lam(t_f) = 0. The paper's (35) also admits every
-    lam(t_f) = [F1 F2]^T mu: these change no motion and leave its boundary value problem without an isolated solution.
+    lam(t_f) = [F1 F2]^T mu. Where the task fixes all or none of the angular rows, or the machine is planar, these
+    change no motion, but leave the boundary value problem without an isolated solution; where it fixes some of the
+    angular rows they do change the motion, and (35) is not a condition of optimality.
     """
     lam = _checked_costates(chain, lam)
     at = resolution(chain, x, tip_velocity, rows)

@@ -1,6 +1,7 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it."""
 
 from ocp.audit import Audit, Finding
+from ocp.certificate import Certificate, certificate
 from ocp.collocation import Collocation
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect import Indirect
@@ -13,6 +14,7 @@ from ocp.solve import prepare, solve
 __all__ = [
     "Audit",
     "AuditError",
+    "Certificate",
     "Collocation",
     "Finding",
     "Indirect",
@@ -22,6 +24,7 @@ __all__ = [
     "RefinementWarning",
     "Solution",
     "SolveError",
+    "certificate",
     "prepare",
     "refine",
     "solve",

@@ -27,6 +27,7 @@ class Program:
             ``grad_f``, ``jac_g`` and ``hess_lag``.
         values: Function (x, p) -> (f, g).
         inside: Function (x, p) -> gradient of the cost inside the horizon, without the terminal cost.
+        parametric: Function (x, p, lam_g) -> gradient of f + lam_g . g in p.
     """
 
     nlp: dict[str, Any]
@@ -35,6 +36,7 @@ class Program:
     hessian: Any
     values: Any
     inside: Any
+    parametric: Any
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,24 @@ def assemble(fragment: Fragment, parameters: int, options: dict[str, Any] | None
         ),
         values=ca.Function("values", [x, p], [f, g]),
         inside=ca.Function("inside", [x, p], [gradient(inside)]),
+        parametric=ca.Function("parametric", [x, p, lam], [parametric(fragment, x, p, lam)]),
     )
+
+
+def parametric(fragment: Fragment, x: Any, p: Any, lam: Any) -> Any:
+    """Gradient in the parameters, block by block."""
+    total = ca.MX.zeros(p.numel())
+    if p.numel() == 0:
+        return total
+    for block in fragment.blocks:
+        function = block.function
+        symbol = (ca.SX if function.is_a("SXFunction") else ca.MX).sym
+        v, d, q = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
+        cost, g = function(v, d, q)
+        mu = symbol("mu", g.numel())
+        slope = ca.Function("slope", [v, d, q, mu], [ca.densify(ca.gradient(cost + ca.dot(mu, g), q))])
+        total += ca.sum2(mapped(slope, block, [*inputs(block, x), p, gather(lam, block.rows)])[0])
+    return total
 
 
 def derive(block: Block, options: dict[str, Any]) -> Derived:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from ocp.adjoint import Adjoint, adjoint
 from ocp.errors import ProblemError, unknown_name
 from ocp.formulation import Formulation
 from ocp.interpolation import PiecewisePolynomial
@@ -60,7 +61,7 @@ class Audit:
             each state, over the whole horizon. local_errors: the same of each interval alone, from its own start. (N,)
         t, states, controls: The re-integrated plan: times, s (M,), and values by name, each (M, n). Interior mesh
             times stand twice, with the controls of both sides.
-        optimality: Stationarity and Hamiltonian.
+        optimality: Stationarity and Hamiltonian. adjoint: The costates and their conditions at the ends.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Audit:
     states: dict[str, np.ndarray]
     controls: dict[str, np.ndarray]
     optimality: Optimality
+    adjoint: Adjoint
 
     @property
     def passed(self) -> bool:
@@ -110,7 +112,8 @@ def audit(
     integration: float = 1e-3,
     constraints: float = 1e-3,
     stationarity: float = 1e-2,
-    drift: float = 1e-2,
+    drift: float = 5e-2,
+    costates: float = 1e-2,
     tolerances: Mapping[str, float] | None = None,
 ) -> Audit:
     """Check a plan independently of the solver that made it.
@@ -122,6 +125,7 @@ def audit(
             the size of its bound, else 1.
         stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts.
         drift: Largest change of the Hamiltonian where time does not enter, relative to its parts.
+        costates: Largest error of the costates against their own equation, and of the conditions at the ends, relative.
         tolerances: Largest violation by name of a state, control or constraint, in its own unit.
 
     Raises:
@@ -169,14 +173,9 @@ def audit(
         ("control jump, relative", solution.control_interpolant, None),
     ):
         findings.append(jump(what, interpolant, solution.horizon, limit_of))
-    gradient = optimality.stationarity / optimality.gradient_scale
-    if form.nu:
-        findings.append(worst("stationarity, relative", gradient, optimality.t, stationarity))
-    h = optimality.drift / optimality.hamiltonian_scale
-    if form.autonomous:
-        findings.append(Finding("Hamiltonian drift, relative", h, drift))
-    else:
-        findings.append(Finding("Hamiltonian change, relative", h, None, None, "time enters the problem"))
+    findings += optimality_findings(form, optimality, stationarity, drift)
+    costate = adjoint(form, solution, p, bounds)
+    findings += costate_findings(costate, optimality, costates)
     return Audit(
         form.name,
         tuple(findings),
@@ -187,7 +186,41 @@ def audit(
         unstack(solution.states, again.states),
         unstack(solution.controls, again.controls),
         optimality,
+        costate,
     )
+
+
+def optimality_findings(form: Formulation, found: Optimality, stationarity: float, drift: float) -> list[Finding]:
+    """Stationarity and constancy of the Hamiltonian."""
+    findings = []
+    if form.nu:
+        note = f"{np.max(found.stationarity, initial=0.0):.2e} in cost per unit of control and second"
+        gradient = found.stationarity / found.gradient_scale
+        findings.append(worst("stationarity, relative", gradient, found.t, stationarity, note))
+    name, limit, note = "Hamiltonian drift, relative", drift, f"{found.drift:.2e} in cost per second"
+    if not form.autonomous:
+        name, note = "Hamiltonian change, relative", f"{note}; time enters the problem"
+    findings.append(
+        Finding(name, found.drift / found.hamiltonian_scale, limit if form.autonomous else None, None, note)
+    )
+    return findings
+
+
+def costate_findings(found: Adjoint, optimality: Optimality, limit: float) -> list[Finding]:
+    """The costate equation and the conditions at the ends."""
+    findings = []
+    if found.integrated is None:
+        findings.append(Finding("costate equation, relative", 0.0, None, None, f"not integrated: {found.reason}"))
+    else:
+        errors = np.abs(found.integrated - found.plan).max(axis=1) / found.scale
+        findings.append(worst("costate equation, relative", errors, found.t, limit))
+    note = f"{found.transversality:.2e} in cost per unit of state"
+    findings.append(Finding("transversality, relative", found.transversality / found.scale, limit, None, note))
+    if found.horizon:
+        note = f"{found.horizon:.2e} in cost per second"
+        relative = found.horizon / optimality.hamiltonian_scale
+        findings.append(Finding("condition of the free horizon, relative", relative, limit, None, note))
+    return findings
 
 
 def check_belongs(form: Formulation, solution: Solution) -> None:

@@ -184,6 +184,13 @@ class BoundaryProblem:
         except RuntimeError:
             return np.full(integrator.size_out(0), np.nan), np.full(2, np.nan)
 
+    def end_multipliers(self, z: np.ndarray, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
+        """Multipliers of the start and of the end constraints."""
+        if self.backward:
+            return np.zeros(0), np.zeros(0)
+        at = self.layout(arcs)
+        return z[at["start"]], z[at["end"]]
+
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """y at a place 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
         if place == 0.0:

@@ -45,7 +45,8 @@ class Collocation:
 
     def __post_init__(self) -> None:
         check_intervals("Collocation", self.intervals, self.mesh)
-        if self.degree not in range(1, 10):
+        integer = isinstance(self.degree, int | np.integer) and not isinstance(self.degree, bool)
+        if not (integer and 1 <= self.degree <= 9):
             raise ProblemError(f"Collocation: degree must be 1 to 9, not {self.degree!r}")
         if self.scheme not in ("radau", "legendre"):
             raise ProblemError(f"Collocation: scheme must be 'radau' or 'legendre', not {self.scheme!r}")

@@ -86,6 +86,13 @@ class BoundTable:
     function: Any
     places: dict[str, np.ndarray]
 
+    def pull(self, p: np.ndarray, push: np.ndarray) -> np.ndarray:
+        """Sum of ``push`` (2, n) on lower and upper bounds times their derivatives in the parameters. Shape (np,)."""
+        q = ca.MX.sym("p", len(p))
+        slopes = ca.Function("slopes", [q], [ca.jacobian(bound, q) for bound in self.function(q)])(p)
+        pulls = [np.asarray((slope.T @ ca.DM(force)).full()) for slope, force in zip(slopes, push, strict=True)]
+        return np.asarray(sum(pulls)).reshape(-1)
+
 
 class Formulation:
     """Vectors and functions of a checked problem. Later changes of the problem do not reach it.

@@ -28,6 +28,7 @@ class Hamiltonian:
     Attributes:
         form: The problem.
         lam, mu: Symbols of the costates (nx, 1) and of the multipliers of the path equalities (m, 1).
+        rows: Path equalities, zero where they hold. Shape (m, 1).
         value: H. Scalar expression of x, u, lam, mu, t, T, p.
         smooth, linear: Indices of the controls in which H is curved, and of those in which it is linear.
         unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that make H least. ``bang`` are
@@ -38,6 +39,7 @@ class Hamiltonian:
     form: Formulation
     lam: Any
     mu: Any
+    rows: Any
     value: Any
     smooth: tuple[int, ...]
     linear: tuple[int, ...]
@@ -54,16 +56,17 @@ class Hamiltonian:
         """
         check_constraints(form)
         sym = form.problem.symbols.sym
-        rows = form.path.expression
+        levels = [form.bounds.function(form.p)[0][int(i)] for i in form.path.bounds]
+        rows = form.path.expression - ca.vertcat(form.problem.symbols(0, 1), *levels)
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
         curved = used_columns(ca.sparsify(ca.hessian(value, form.u)[0]).sparsity())
         in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
         smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
         linear = [i for i in range(form.nu) if i not in smooth]
-        system = Stationarity(form, lam, mu, value, smooth, linear)
+        system = Stationarity(form, lam, mu, rows, value, smooth, linear)
         unknowns, how = system.solve()
-        return cls(form, lam, mu, value, tuple(smooth), tuple(linear), unknowns, how)
+        return cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), unknowns, how)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -139,6 +142,7 @@ class Stationarity:
     form: Formulation
     lam: Any
     mu: Any
+    rows: Any
     value: Any
     smooth: list[int]
     linear: list[int]
@@ -176,9 +180,7 @@ class Stationarity:
         """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[self.smooth]
-        lower = [self.form.bounds.function(self.form.p)[0][int(i)] for i in self.form.path.bounds]
-        level = ca.vertcat(self.form.problem.symbols(0, 1), *lower)
-        stacked = ca.densify(ca.vertcat(gradient, self.form.path.expression - level))
+        stacked = ca.densify(ca.vertcat(gradient, self.rows))
         control = assemble_control(self.form, self.smooth, self.linear, w, bang)
         return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
 

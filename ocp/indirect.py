@@ -18,6 +18,7 @@ import numpy as np
 
 from ocp.boundary import NODES, BoundaryProblem
 from ocp.collocation import Collocation
+from ocp.envelope import Extremal, cost_gradient
 from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
@@ -144,7 +145,7 @@ class PreparedIndirect:
         data = np.concatenate([[horizon], p, ends, arcs.bang.ravel(), guess.ravel()])
         if self.method.shooting == "backward":
             return x[-1], data
-        y = np.hstack([x, lam])
+        y: np.ndarray = np.hstack([x, lam])
         free = [horizon] if form.horizon_is_free else []
         multipliers = np.zeros(len(form.start) + len(form.end))
         return np.concatenate([y.ravel(), arcs.switches * horizon, free, multipliers]), data
@@ -184,24 +185,39 @@ class PreparedIndirect:
             dense[i, 0] = first
             states, spent = self.boundary.integrate(self.boundary.dense, first, piece)
             dense[i, 1:], cost = states.T, cost + float(spent[0])
-        q = np.vstack([piece for _, piece in pieces]).T
+        q: np.ndarray = np.array([piece for _, piece in pieces]).T
         times = q[0][:, None] + q[1][:, None] * NODES
         flat = dense.reshape(count, -1)
         repeated = np.repeat(q, len(NODES), axis=1)
         arguments = self.boundary.arguments(flat.T, times.reshape(1, -1), repeated[2:3], repeated)
-        control = np.asarray(self.boundary.outputs.map(count)(*arguments)[0].full()).reshape(form.nu, count).T
+        control, multiplier = (np.asarray(out.full()).T for out in self.boundary.outputs.map(count)(*arguments)[:2])
         terminal = ca.Function("terminal", [form.x, form.x0, form.u0, form.t, form.T, form.p], [form.terminal])
         cost += float(terminal(flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu), horizon, horizon, p))
 
+        shape = (len(pieces), len(NODES))
+        nu_start, nu_end = self.boundary.end_multipliers(found.unknowns, arcs)
+        extremal = Extremal(
+            NODES,
+            q[1],
+            times,
+            dense[..., : form.nx],
+            dense[..., form.nx :],
+            control.reshape(*shape, form.nu),
+            multiplier.reshape(*shape, len(form.path)),
+            horizon,
+            nu_start,
+            nu_end,
+        )
+        by_parameter = cost_gradient(ham, extremal, p, bounds) if form.np else np.zeros(0)
         breaks = np.concatenate([q[0], [horizon]]) / horizon
-        keep = np.ones((len(pieces), len(NODES)), dtype=bool)
-        keep[:-1, -1] = False  # the end of a piece is the start of the next
-        keep = keep.ravel()
+        own = np.ones(shape, dtype=bool)
+        own[:-1, -1] = False  # the end of a piece is the start of the next
+        keep = own.ravel()
         reported = times.ravel()[keep]
         reported[-1] = horizon
         interpolants = [
-            PiecewisePolynomial(breaks, NODES, values.reshape(len(pieces), len(NODES), -1))
-            for values in (dense[..., : form.nx], control, dense[..., form.nx :])
+            PiecewisePolynomial(breaks, NODES, values)
+            for values in (extremal.states, extremal.controls, extremal.costates)
         ]
         settings = dataclasses.asdict(self.method)
         return Solution(
@@ -218,6 +234,7 @@ class PreparedIndirect:
             controls={name: control[keep][:, s] for name, s in form.controls.items()},
             costates={name: flat[keep][:, form.nx :][:, s] for name, s in form.states.items()},
             parameters={name: p[s] for name, s in form.parameters.items()},
+            cost_gradients={name: by_parameter[s] for name, s in form.parameters.items()},
             state_interpolant=interpolants[0],
             control_interpolant=interpolants[1],
             costate_interpolant=interpolants[2],

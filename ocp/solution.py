@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Refinement", "Sample", "Solution"]
 
 VERSION = 1
+POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
 
 
@@ -72,7 +73,7 @@ class Solution:
         t: Reported times, s; first 0, last the horizon. Shape (M,).
         states, controls, costates: Values at the reported times by name, each (M, n). Costates are
             d(optimal cost)/d(state), so that H = running cost + costate . derivative.
-        parameters: Their values by name.
+        parameters: Their values by name. cost_gradients: Derivatives of the optimal cost in them, by name.
         state_interpolant, control_interpolant, costate_interpolant: Over fractions 0..1 of the horizon, of all states
             (controls, costates) stacked.
         variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
@@ -93,6 +94,7 @@ class Solution:
     controls: dict[str, np.ndarray]
     costates: dict[str, np.ndarray]
     parameters: dict[str, np.ndarray]
+    cost_gradients: dict[str, np.ndarray]
     state_interpolant: PiecewisePolynomial
     control_interpolant: PiecewisePolynomial
     costate_interpolant: PiecewisePolynomial
@@ -114,6 +116,12 @@ class Solution:
         if name not in self.costates:
             raise unknown_name("state", name, self.costates)
         return self.costates[name]
+
+    def cost_gradient(self, name: str) -> np.ndarray:
+        """Derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""
+        if name not in self.cost_gradients:
+            raise unknown_name("parameter", name, self.cost_gradients)
+        return self.cost_gradients[name]
 
     def at(self, time: Any) -> Sample:
         """States and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own interpolant.
@@ -166,14 +174,14 @@ class Solution:
             "variables": self.variables,
             "multipliers": self.multipliers,
         }
-        for kind in ("states", "controls", "costates", "parameters"):
+        for kind in POOLS:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
             part = getattr(self, kind)
             arrays |= {f"{kind}/{what}": getattr(part, what) for what in ("breaks", "nodes", "values")}
         simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
         head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
-        head["order"] = {k: list(getattr(self, k)) for k in ("states", "controls", "costates", "parameters")}
+        head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
         arrays["head"] = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)

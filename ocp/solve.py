@@ -93,6 +93,7 @@ class Prepared:
         at = mesh[piece] + np.diff(mesh)[piece] * place
         at[-1] = 1.0
         costates = self._costates(outcome, p)
+        by_parameter = self._cost_gradient(outcome, p) if form.np else np.zeros(0)
         stacked = {
             "states": v[fragment.report_states],
             "controls": controls_at(controls, fragment, piece, place),
@@ -112,6 +113,7 @@ class Prepared:
             controls={name: stacked["controls"][:, s] for name, s in form.controls.items()},
             costates={name: costates[:, s] for name, s in form.states.items()},
             parameters={name: p[s] for name, s in form.parameters.items()},
+            cost_gradients={name: by_parameter[s] for name, s in form.parameters.items()},
             state_interpolant=states,
             control_interpolant=controls,
             costate_interpolant=costate_interpolant(fragment, costates),
@@ -145,6 +147,19 @@ class Prepared:
         at_node = fragment.costate_rows < 0
         costates[at_node] = behind[fragment.nodes.T[fragment.costate_nodes]][at_node]
         return np.asarray(costates)
+
+    def _cost_gradient(self, outcome: Outcome, p: np.ndarray) -> np.ndarray:
+        """Derivative of the optimal cost in the parameters: of the Lagrangian, and through every active bound."""
+        form, fragment = self.formulation, self.fragment
+        v, lam = outcome.variables, outcome.multipliers
+        direct = np.asarray(self.program.parametric(v, p, lam).full()).reshape(-1)
+        gradient = self.program.gradient(v, p)[1] + self.program.jacobian(v, p)[1].T @ lam
+        lam_x = -np.asarray(gradient.full()).reshape(-1)
+        push = np.zeros((2, sum(len(place) for place in form.bounds.places.values())))
+        for index, force in ((fragment.variable_bounds, lam_x), (fragment.row_bounds, lam)):
+            np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound
+            np.add.at(push[1], index, np.maximum(force, 0.0))
+        return np.asarray(direct - form.bounds.pull(p, push))
 
     def _diagnosis(self, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> str:
         """What went wrong: the worst residuals by constraint, state and time."""

@@ -129,7 +129,7 @@ def check_chattering(
         for k in range(len(quick) - CHATTER + 1):
             if quick[k : k + CHATTER].all():
                 raise SolveError(
-                    f"control {labels[index]!r} switches in every interval of the seed from {at[k] * seed.horizon:.4g} s on: "
+                    f"control {labels[index]!r} switches in every interval from {at[k] * seed.horizon:.4g} s on: "
                     "a singular arc or chattering, where the Hamiltonian does not determine it; use a direct method "
                     "with held controls, or add a small quadratic term in it to the cost"
                 )

@@ -22,7 +22,10 @@ def check_intervals(method: str, intervals: Any, mesh: tuple[float, ...] | None)
         raise ProblemError(f"{method}: intervals must be a positive integer, not {intervals!r}")
     if mesh is None:
         return
-    at = np.asarray(mesh, dtype=float)
+    try:
+        at = np.asarray(mesh, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{method}: mesh must be fractions from 0 to 1, not {mesh!r}") from error
     if at.shape != (intervals + 1,):
         raise ProblemError(f"{method}: mesh has {at.size} entries, {intervals + 1} expected (fractions 0 to 1)")
     if not (at[0] == 0.0 and at[-1] == 1.0 and np.all(np.diff(at) > 0)):

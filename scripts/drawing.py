@@ -71,7 +71,7 @@ STYLE: Any = {
 }
 
 NOTE_SIZE = 7.0
-NOTE_CHARACTERS_PER_INCH = 17.5  # of the note's font
+NOTE_CHARACTERS_PER_INCH = 19.0  # of the note's font
 
 
 @contextmanager

@@ -72,18 +72,27 @@ def write(results: Results, folder: Path) -> None:
 
 def report(results: Results) -> None:
     """Print paper value, our value and the difference."""
-    best = results.principle.cost
+    print("Table 1, peak joint velocity")
+    _print_table(peak_table(results))
+    print("\nTable 2, joint acceleration at the peak")
+    _print_table(acceleration_table(results))
+    print("\nPeaks of the pseudo-inverse for other link lengths\n" + text_table(results.sensitivity))
+    print(f"\nOptimum, horizon {HORIZON:g} s: J = {results.principle.cost:.12f} rad^2/s")
+    print(text_table(results.convergence, 4))
     laws = results.laws
-    print("Table 1, peak joint velocity, deg/s\n" + text_table(peak_table(results)))
-    print("\nTable 2, joint acceleration at the peak, deg/s^2\n" + text_table(acceleration_table(results)))
-    print("\nPeaks of the pseudo-inverse for other link lengths, deg/s\n" + text_table(results.sensitivity))
-    print(f"\nCost J of the optimum, horizon {HORIZON:g} s: {best:.12f}\n" + text_table(results.convergence, 4))
-    print(f"\nThe plan, re-integrated: tip off its line by {laws.tip_error:.1e} m, momentum {laws.momentum_drift:.1e},")
-    print(f"centre of mass moved by {laws.center_of_mass_drift:.1e} m\n{results.audit}")
+    print(f"\nThe plan, re-integrated: tip off its line by {laws.tip_error:.1e} m, momentum {laws.momentum_drift:.1e}")
+    print(f"(SI), centre of mass moved by {laws.center_of_mass_drift:.1e} m\n{results.audit}")
     columns = ("guess", "seed", "cost", "jump_deg_s", "task_error_m_s", "audit", "intervals", "refined_cost", "verdict")
     rows = [{name: trial.row()[name] for name in columns} for trial in results.trials]
     print(f"\nFrom other guesses, horizon {FALSE_HORIZON:g} s\n" + text_table(rows))
-    print(f"\nAssumed. {NOTE}")
+    print(f"\n{NOTE}")
+
+
+def _print_table(rows: list[Row]) -> None:
+    """A table, its notes below it."""
+    print(text_table([{name: value for name, value in row.items() if name != "note"} for row in rows]))
+    for method, note in dict.fromkeys((row["method"], row["note"]) for row in rows):
+        print(f"  {method}: {note}")
 
 
 def peak_table(results: Results) -> list[Row]:

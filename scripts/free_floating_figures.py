@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from scripts.free_floating_motion import Array, Motion, outline
 __all__ = ["draw", "draw_animation", "draw_convergence", "draw_false_optima"]
 
 PLATE = 2.0  # side of the base, m; printed
-TIME_COLORS = ListedColormap(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.88, 256)))  # its yellow is too pale
+VIRIDIS: Any = matplotlib.colormaps["viridis"]
+TIME_COLORS = ListedColormap(VIRIDIS(np.linspace(0.0, 0.88, 256)))  # its yellow is too pale
 STROBE = 0.5  # s between two pictures of the arm
 NAMES = ("pseudo-inverse", "optimum")
 FRAME = 0.05  # s between two frames of the animation
@@ -29,29 +31,29 @@ FRAME = 0.05  # s between two frames of the animation
 def draw(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion, note: str) -> None:
     """Write the figures of both motions, the paper's two of a kind side by side on equal axes."""
     motions = (local, optimal)
-    with sheet(folder / "fig03_08_motion.png", columns=2, size=(8.2, 4.3), note=note, sharey=True) as (figure, axes):
+    with sheet(folder / "fig03_08_motion.png", columns=2, size=(8.2, 5.2), note=note, sharey=True) as (figure, axes):
         for ax, motion, name, number in zip(axes[0], motions, NAMES, (3, 8), strict=True):
             _strobe(ax, machine, motion)
             ax.set_title(f"{name} (figure {number})")
             ax.set_xlabel("x, m")
         axes[0, 0].set_ylabel("y, m")
-        axes[0, 0].legend(loc="upper right")
+        axes[0, 0].legend(loc="lower right")
         _time_bar(figure, axes, local.t[-1])
-    alone = ("Optimal motion: tip at (-1, -1) m/s, nothing holds the base", (6.3, 4.6))
-    with sheet(folder / "optimal_motion.png", size=alone[1], note=note) as (figure, axes):
+    with sheet(folder / "optimal_motion.png", size=(4.6, 5.4), note=note) as (figure, axes):
         _strobe(axes[0, 0], machine, optimal)
-        axes[0, 0].set(xlabel="x, m", ylabel="y, m", title=alone[0])
-        axes[0, 0].legend(loc="upper right")
+        axes[0, 0].set(xlabel="x, m", ylabel="y, m", title="Optimal motion on a free-floating base")
+        axes[0, 0].legend(loc="lower right")
         _time_bar(figure, axes, optimal.t[-1])
 
     joints = [f"joint {i + 1}" for i in range(local.joints.shape[1])]
     _pose(folder / "fig04_09_base_pose.png", motions, (4, 9), lambda m: m.base, ("position, m", "angle, deg"), note)
     units = ("velocity, m/s", "angular velocity, deg/s")
     _pose(folder / "fig06_11_base_velocity.png", motions, (6, 11), lambda m: m.base_rates, units, note)
-    for file, numbers, of, label in (
+    kinds: tuple[tuple[str, tuple[int, int], Callable[[Motion], Array], str], ...] = (
         ("fig05_10_joint_angles.png", (5, 10), lambda m: m.joints, "joint angle, deg"),
         ("fig07_12_joint_velocity.png", (7, 12), lambda m: m.joint_rates, "joint velocity, deg/s"),
-    ):
+    )
+    for file, numbers, of, label in kinds:
         with sheet(folder / file, columns=2, size=(8.2, 3.3), note=note, sharey=True) as (_, axes):
             for ax, motion, name, number in zip(axes[0], motions, NAMES, numbers, strict=True):
                 _curves(ax, motion.t, np.degrees(of(motion)), joints)
@@ -69,13 +71,14 @@ def draw(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion, no
         text = f"{where[1]:.3f} at {where[0]:.3f} s"
         ax.annotate(text, where, xytext=(-8, 2), textcoords="offset points", fontsize=8, ha="right")
         ax.set(xlabel="time, s", ylabel="manipulability $\\sqrt{\\det GG^T}$, m$^2$", ylim=(0, None))
+        ax.set_xlim(local.t[0], local.t[-1])
         ax.set_title("Manipulability (figure 13)")
         ax.legend(loc="best")
 
 
 def draw_convergence(folder: Path, rows: Sequence[Row], note: str) -> None:
     """Distance of the cost from the reference against the number of intervals, one curve a method."""
-    with sheet(folder / "convergence.png", size=(6.3, 3.8), note=note) as (_, axes):
+    with sheet(folder / "convergence.png", size=(8.2, 3.8), note=note) as (_, axes):
         ax = axes[0, 0]
         direct = [row for row in rows if row["intervals"] and row["order"]]
         colors = ("blue", "green", "orange", "purple")
@@ -93,11 +96,12 @@ def draw_convergence(folder: Path, rows: Sequence[Row], note: str) -> None:
 
 def draw_false_optima(folder: Path, trials: Sequence[Trial], note: str) -> None:
     """Cost and largest jump of every plan that the solver calls optimal, and what such a jump looks like."""
+    passed = [t for t in trials if t.audit]
     false = sorted((t for t in trials if t.verdict == FALSE), key=lambda t: t.cost)
     with sheet(folder / "false_optima.png", columns=2, size=(8.2, 3.7), note=note) as (_, axes):
         left, right = axes[0]
         kinds = {
-            "passes its audit": ([t for t in trials if t.audit], "o", "blue"),
+            "passes its audit": (passed, "o", "blue"),
             "sound, but fails: mesh too coarse": (
                 [t for t in trials if not t.audit and t.verdict not in (FALSE, EXTREMAL)],
                 "s",
@@ -109,6 +113,9 @@ def draw_false_optima(folder: Path, trials: Sequence[Trial], note: str) -> None:
             if mine:
                 costs, jumps = [t.cost for t in mine], [t.jump_deg_s for t in mine]
                 left.loglog(jumps, costs, marker, color=COLORS[color], ms=6, label=f"{label} ({len(mine)})")
+        reached = Counter(f"{t.cost:.5f}" for t in passed)
+        text = "\n".join(f"J = {cost}: {count} times" for cost, count in sorted(reached.items()))
+        left.text(0.3, 0.03, text, transform=left.transAxes, fontsize=8, color=COLORS["blue"])
         left.set(xlabel="largest jump of a joint velocity, deg/s", ylabel="cost J, rad$^2$/s")
         left.set_title(f"{len(trials)} plans that the solver calls optimal")
         left.legend(loc="upper left")
@@ -132,13 +139,15 @@ def draw_animation(
 ) -> None:
     """Both motions side by side in real time, above their joint velocities."""
     times = np.arange(0.0, local.t[-1] + FRAME / 2, FRAME)
-    with sheet(None, rows=2, columns=2, size=(5.4, 4.4), sharey="row", height_ratios=(2.4, 1)) as (figure, axes):
+    with sheet(None, rows=2, columns=2, size=(5.0, 4.9), sharey="row", height_ratios=(3, 1)) as (figure, axes):
         moving = [_animated(axes[:, i], machine, m, NAMES[i]) for i, m in enumerate((local, optimal))]
         axes[0, 0].set_ylabel("y, m")
         axes[1, 0].set_ylabel("joint rates, deg/s")
-        axes[1, 1].legend([f"joint {i + 1}" for i in range(local.joints.shape[1])], loc="lower left", fontsize=6.5)
+        curves = axes[1, 1].lines[: local.joints.shape[1]]
+        names = [f"joint {i + 1}" for i in range(len(curves))]
+        axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=5.5, color=COLORS["grey"])
+        figure.supxlabel(note, x=0.01, ha="left", fontsize=6, color=COLORS["grey"])
 
         def frames() -> Iterator[Figure]:
             for time in progress(times.tolist()):
@@ -185,7 +194,8 @@ def _strobe(ax: Any, machine: FreeFloating, motion: Motion) -> None:
         k = motion.at(time)
         color = TIME_COLORS(time / horizon)
         square, arm = shape(motion.base[k], motion.joints[k])
-        ax.fill(*square.T, facecolor="none", edgecolor=color, lw=1.0)
+        ends = time in (0.0, horizon)  # the base hardly moves: only its first and last place stand out
+        ax.fill(*square.T, facecolor="none", edgecolor=color, lw=1.4 if ends else 0.7, alpha=1.0 if ends else 0.45)
         ax.plot(*arm.T, "-o", color=color, lw=1.6, ms=3, solid_capstyle="round")
         ax.plot(*arm[-1], "o", color=color, ms=5, markeredgecolor="white", markeredgewidth=0.6, zorder=5)
     ax.set_aspect("equal")
@@ -208,9 +218,9 @@ def _animated(column: Any, machine: FreeFloating, motion: Motion, name: str) -> 
     everything = np.vstack([np.vstack(parts) for parts in corners])
     (low_x, low_y), (high_x, high_y) = everything.min(axis=0) - 0.3, everything.max(axis=0) + 0.3
     above.plot(*motion.tip_in_world.T, color=COLORS["grey"], ls=(0, (4, 2)), lw=0.8)
-    (plate,) = above.plot([], [], color=COLORS["black"], lw=1.2)
-    (links,) = above.plot([], [], "-o", color=COLORS["blue"], lw=2.2, ms=3.5)
-    (trace,) = above.plot([], [], color=COLORS["orange"], lw=1.4)
+    (trace,) = above.plot([], [], color=COLORS["orange"], lw=2.0)
+    (plate,) = above.plot([], [], color=COLORS["grey"], lw=1.4)
+    (links,) = above.plot([], [], "-o", color=COLORS["black"], lw=2.2, ms=4)
     above.set(xlim=(low_x, high_x), ylim=(low_y, high_y), aspect="equal", xlabel="x, m")
     above.set_title(name, fontsize=9)
     _curves(below, motion.t, np.degrees(motion.joint_rates), ["1", "2", "3"])

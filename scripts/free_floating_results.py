@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
-from models import FreeFloating, Link, paper_example, planar_chain
+from models import FreeFloating, paper_example
 from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.local import resolve
@@ -30,6 +30,8 @@ HORIZON = 5.0  # s, chosen
 STEP = 1e-3  # s, of the grids that peaks are read from
 PLAN = Collocation(100, degree=3, scheme="legendre")
 SECOND_OPINION = MultipleShooting(100, control="linear")
+BACKWARD = Indirect(20, shooting="backward", tolerance=1e-13)
+FORWARD = Indirect(20, shooting="multiple", tolerance=1e-13)
 
 ASSUMED = (
     "Not printed in the paper: links 2 m long, arm mounted at (1, 0) m of the base, centres of mass at mid-link "
@@ -60,8 +62,8 @@ CAVEATS = {
         "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s",
     },
 }
-LENGTH_OF_FIRST_PEAK = 2.00214
-"""Link length, m, at which the first peak alone would agree with Table 1: shown, never used."""
+LENGTHS = (1.998, 2.0, 2.001, 2.00214)
+"""Link lengths of the sensitivity table, m. The last would bring the first peak to Table 1: shown, never used."""
 
 METHODS: tuple[tuple[str, int, tuple[int, ...], Callable[[int], Any]], ...] = (
     ("Radau 3", 5, (50, 100, 200), lambda n: Collocation(n)),
@@ -117,44 +119,43 @@ def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:
 def compute() -> Results:
     """Solve everything."""
     machine = paper_example()
-    times = grid()
-    local = pseudo_inverse(machine, times)
+    local = pseudo_inverse(machine, grid())
     around = [np.arange(-STEP, STEP, 1e-6) + peak for peak in local.peak_joint_rates()[1]]
-    near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([times, *around]).round(9)))
+    near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([grid(), *around]).round(9)))
 
     rates, null_space = problem(), problem(formulation="null_space")
     plan = solve(rates, PLAN)
     audit = plan.audit()
-    principle = solve(rates, Indirect(shooting="backward", tolerance=1e-13), guess=plan)
-    forward = solve(rates, Indirect(shooting="multiple", tolerance=1e-13), guess=plan)
-    convergence = []
-    for method, order, counts, make in METHODS:
-        for intervals in progress(counts, f"convergence, {method}"):
-            found = solve(null_space if "shooting" in method else rates, make(intervals))
-            convergence.append(_convergence_row(method, intervals, order, found, principle.cost))
-            if make(intervals) == SECOND_OPINION:
-                shooting = found
-    convergence.append(_convergence_row("minimum principle, forward multiple shooting", 20, 0, forward, principle.cost))
-    convergence.append(_convergence_row("minimum principle, backward shooting", 20, 0, principle, principle.cost))
-
-    number = len(false_optima.GUESSES)
-    trials = progress(
-        false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS), "false optima", number
-    )
+    principle = solve(rates, BACKWARD, guess=plan)
+    study = false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS)
     return Results(
         machine=machine,
         local=local,
         near_peaks=near_peaks,
-        optimal=motion_of_plan(machine, plan, times, ROWS),
+        optimal=motion_of_plan(machine, plan, grid(), ROWS),
         plan=plan,
         audit=audit,
         laws=laws(machine, audit, TIP_VELOCITY),
-        shooting=shooting,
+        shooting=solve(null_space, SECOND_OPINION),
         principle=principle,
-        convergence=convergence,
+        convergence=convergence(rates, null_space, plan, principle),
         sensitivity=sensitivity(),
-        trials=list(trials),
+        trials=list(progress(study, "false optima", len(false_optima.GUESSES))),
     )
+
+
+def convergence(rates: Problem, null_space: Problem, plan: Solution, principle: Solution) -> list[Row]:
+    """Cost by every method and mesh, and its difference from the minimum principle's."""
+    runs = [(name, order, n, make(n)) for name, order, counts, make in METHODS for n in counts]
+    rows: list[Row] = []
+    for name, order, intervals, method in progress(runs, "convergence"):
+        found = solve(null_space if isinstance(method, MultipleShooting) else rates, method)
+        rows.append(_convergence_row(name, intervals, order, found, principle.cost))
+    forward = solve(rates, FORWARD, guess=plan)
+    for shooting, found in (("forward multiple", forward), ("backward", principle)):
+        name = f"minimum principle, {shooting} shooting"
+        rows.append(_convergence_row(name, BACKWARD.segments, 0, found, principle.cost))
+    return rows
 
 
 def progress(items: Iterable[Item], title: str, total: int | None = None) -> Iterable[Item]:
@@ -166,13 +167,19 @@ def progress(items: Iterable[Item], title: str, total: int | None = None) -> Ite
 def sensitivity() -> list[Row]:
     """Peaks of the pseudo-inverse motion when the links' length, which is not printed, is a little different."""
     rows: list[Row] = []
-    for length in (2.0, 2.001, LENGTH_OF_FIRST_PEAK):
-        base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
-        robot = planar_chain([length] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
-        peaks, _ = pseudo_inverse(FreeFloating(robot, base="planar"), grid()).peak_joint_rates()
+    for length in LENGTHS:
+        peaks, _ = pseudo_inverse(_stretched(length), grid()).peak_joint_rates()
         rows.append({"link_length_m": length, **{f"joint{i + 1}_deg_s": v for i, v in enumerate(np.degrees(peaks))}})
     paper = dict(zip(list(rows[0])[1:], PAPER_PEAKS["pseudo-inverse"], strict=True))
     return [*rows, {"link_length_m": "paper, Table 1", **paper}]
+
+
+def _stretched(length: float) -> FreeFloating:
+    """The example with links of another length, their mass, inertia and centre of mass unchanged."""
+    robot = paper_example().robot
+    place = (length, 0.0, 0.0)
+    joints = [replace(joint, translation=place) if k else joint for k, joint in enumerate(robot.joints)]
+    return FreeFloating(replace(robot, joints=tuple(joints), tip_translation=place), base="planar")
 
 
 def grid() -> Array:

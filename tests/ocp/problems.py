@@ -112,7 +112,7 @@ class LogarithmicRegulator:
 
 
 def swing(symbols: Any = ca.SX, *, control_ties: bool = False) -> Problem:
-    """A cyclic swing in a free time: everything at once (ties of both ends, path, start and end constraints, bounds)."""
+    """A cyclic swing in a free time: ties of both ends, path, start and end constraints, bounds, parameters."""
     problem = Problem("swing", symbols)
     k = problem.parameter("k", 2)
     x = problem.state("x", 2, lower=[-3.0, -3.0], upper=3.0)

@@ -1,0 +1,195 @@
+"""The costates of a plan against their own equations: lambda' = -dH/dx, and the conditions at the ends.
+
+The costates come from the multipliers of whatever method made the plan; here they are integrated backwards from the end
+along the plan, by an integrator that has never seen these multipliers. Bryson, Ho 1975, chapters 2 and 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.formulation import Formulation
+from ocp.reintegration import OPTIONS, basis
+from ocp.solution import Solution
+
+__all__ = ["Adjoint", "adjoint"]
+
+ACTIVE = 1e-5  # a bound nearer than this, relative to its scale, is active
+
+
+@dataclass(frozen=True)
+class Adjoint:
+    """How well the costates of a plan meet their equations.
+
+    Attributes:
+        t: Ends of the intervals in which the costates are interpolated, s. Shape (N + 1,).
+        integrated: Costates integrated backwards from the plan's own at the end. Shape (N + 1, nx), or None.
+        plan: The plan's costates there. Shape (N + 1, nx).
+        reason: Why they were not integrated, or "".
+        transversality: Largest entry that no multiplier of an end condition explains, in cost per unit of the state.
+        horizon: H(T) + dPhi/dT where the final time is free, in cost per second; 0 where it is given.
+        scale: Largest costate.
+    """
+
+    t: np.ndarray
+    integrated: np.ndarray | None
+    plan: np.ndarray
+    reason: str
+    transversality: float
+    horizon: float
+    scale: float
+
+    @property
+    def error(self) -> float:
+        """Largest difference of integrated and plan's costates, relative to the largest costate of the plan."""
+        if self.integrated is None:
+            return 0.0
+        return float(np.max(np.abs(self.integrated - self.plan), initial=0.0) / self.scale)
+
+
+def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> Adjoint:
+    """Integrate the costates of a plan backwards and look at their conditions at the ends."""
+    breaks = solution.state_interpolant.breaks
+    n = len(breaks) - 1
+    costates = solution.costate_interpolant
+    plan = costates(costates.breaks)
+    size = float(np.max(np.abs(costates.values), initial=0.0))
+    scale = size if size > 0 else 1.0
+    ends = end_residuals(form, solution, p, bounds)
+    reason = obstacle(form, solution, bounds)
+    integrated = None
+    if not reason:
+        nodes = solution.state_interpolant.nodes
+        samples = solution.control_interpolant.nodes
+        places = breaks[:-1, None] + np.diff(breaks)[:, None] * samples
+        owner = np.searchsorted(solution.control_interpolant.breaks, breaks[:-1] + 0.5 * np.diff(breaks)) - 1
+        begin, width = solution.control_interpolant.breaks[owner], np.diff(solution.control_interpolant.breaks)[owner]
+        within = (places - begin[:, None]) / width[:, None]
+        controls = solution.control_interpolant.within(np.repeat(owner, len(samples)), within.ravel())
+        data = np.vstack(
+            [
+                solution.state_interpolant.values.reshape(n, -1).T,
+                controls.reshape(n, -1).T,
+                breaks[:-1],
+                np.diff(breaks),
+                np.full(n, solution.horizon),
+                np.tile(p[:, None], (1, n)),
+            ]
+        )
+        integrator = costate_integrator(form, nodes, samples)
+        everywhere = np.full((n + 1, form.nx), np.inf)
+        everywhere[-1] = lam = plan[-1]
+        for k in reversed(range(n)):
+            try:
+                lam = np.asarray(integrator(x0=lam, p=data[:, k])["xf"].full()).reshape(-1)
+            except RuntimeError:
+                break
+            everywhere[k] = lam
+        integrated = everywhere[np.searchsorted(breaks, costates.breaks - 1e-12)]
+    return Adjoint(costates.breaks * solution.horizon, integrated, plan, reason, *ends, scale)
+
+
+def obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+    """Why the costate equation alone does not say what the costates are, or ""."""
+    x = np.hstack(list(solution.states.values()))
+    index = form.bounds.places["state"]
+    if np.any(near(x[1:-1], bounds[0][index], bounds[1][index])):
+        return "a state is at its bound"
+    if len(form.path) and not np.all(form.path.equality & form.path.uses_control):
+        return "there are path constraints beyond equalities with a control"
+    if len(form.path):
+        u = np.hstack(list(solution.controls.values()))
+        index = form.bounds.places["control"]
+        if np.any(near(u, bounds[0][index], bounds[1][index])):
+            return "a control is at its bound where path equalities hold"
+    return ""
+
+
+def near(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Where values (M, n) are at a bound."""
+    with np.errstate(invalid="ignore"):
+        size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
+    return np.asarray((values <= lower + ACTIVE * size) | (values >= upper - ACTIVE * size))
+
+
+def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray) -> Any:
+    """Integrator of the costates over one interval backwards; p = [x values, u values, s, h, T, parameters].
+
+    Multipliers of path equalities are those that make H stationary: mu = -(A A')^-1 A (L_u + f_u' lambda), A = h_u.
+    """
+    sym = form.problem.symbols.sym
+    nx, nu = form.nx, form.nu
+    lam, back = sym("lam", nx), sym("back")
+    cuts = np.cumsum([0, nx * len(nodes), nu * len(samples), 1, 1, 1, form.np])
+    q = sym("q", int(cuts[-1]))
+    xs, us, s, h, horizon, p = (q[int(a) : int(b)] for a, b in pairwise(cuts))
+    place = 1 - back
+    x = ca.mtimes(ca.reshape(xs, nx, len(nodes)), ca.vertcat(*basis(nodes, place)))
+    u = ca.mtimes(ca.reshape(us, nu, len(samples)), ca.vertcat(*basis(samples, place)))
+    value = form.running + ca.dot(lam, form.f)
+    if len(form.path):
+        gradient = ca.gradient(value, form.u)
+        rows = ca.jacobian(form.path.expression, form.u)
+        mu = -ca.solve(ca.mtimes(rows, rows.T), ca.mtimes(rows, gradient))
+        held = sym("mu", len(form.path))
+        rate = ca.gradient(value + ca.dot(held, form.path.expression), form.x)
+        rate = ca.substitute([rate], [held], [mu])[0]
+    else:
+        rate = ca.gradient(value, form.x)
+    function = ca.Function("rate", [form.x, form.u, form.t, form.T, form.p, lam], [ca.densify(rate)], {"cse": True})
+    ode = h * horizon * function(x, u, (s + h * place) * horizon, horizon, p, lam)
+    dae = {"x": lam, "t": back, "p": q, "ode": ode}
+    return ca.integrator("costates", "cvodes", dae, 0.0, 1.0, OPTIONS)
+
+
+def end_residuals(
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, float]:
+    """What of the transversality conditions no multiplier explains: (of the states, of the horizon)."""
+    low, high = bounds
+    nx = form.nx
+    x0, x1, lam0, lam1 = (
+        np.hstack([pool[name][k] for name in form.states])
+        for pool in (solution.states, solution.costates)
+        for k in (0, -1)
+    )
+    controls = [np.hstack([v[k] for v in solution.controls.values()]) if form.nu else np.zeros(0) for k in (0, -1)]
+    begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
+    last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+    symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
+    rows = ca.vertcat(begin, last[0])
+    both = ca.vertcat(form.x, form.x0, form.T)
+    function = ca.Function("ends", symbols, [rows, ca.densify(ca.jacobian(rows, both)), ca.gradient(last[1], both)])
+    found = function(x1, x0, controls[1], controls[0], solution.horizon, p)
+    values, slopes, gradient = (np.asarray(v.full()) for v in found)
+    index = np.concatenate([form.start.bounds, form.end.bounds])
+    active = near(values.T, low[index], high[index])[0]
+    places = form.bounds.places
+    free = np.concatenate(
+        [~near(x[None], low[places[k]], high[places[k]])[0] for x, k in ((x1, "terminal"), (x0, "initial"))]
+    )
+    # gradient of the cost at the ends + multipliers . slopes = (lambda(T), -lambda(0))
+    left = np.concatenate([lam1, -lam0]) - gradient[: 2 * nx, 0]
+    columns = slopes[active].T
+    horizon_free = (
+        form.horizon_is_free
+        and not near(np.array([[solution.horizon]]), low[places["horizon"]], high[places["horizon"]]).any()
+    )
+    explicit = ca.depends_on(ca.vertcat(form.f, form.running, form.path.expression), form.T)
+    target, matrix = left[free], columns[: 2 * nx][free]
+    if horizon_free and not explicit:
+        hamiltonian = ca.Function("h", [form.x, form.u, form.t, form.T, form.p], [form.running, form.f])
+        running, rate = hamiltonian(x1, controls[1], solution.horizon, solution.horizon, p)
+        final = float(running) + float(np.dot(np.asarray(rate.full()).reshape(-1), lam1))
+        target = np.append(target, -final - gradient[2 * nx, 0])
+        matrix = np.vstack([matrix, columns[2 * nx]])
+    multipliers = np.linalg.lstsq(matrix, target, rcond=None)[0] if matrix.size else np.zeros(matrix.shape[1])
+    residual = target - matrix @ multipliers
+    if horizon_free and not explicit:
+        return float(np.max(np.abs(residual[:-1]), initial=0.0)), float(abs(residual[-1]))
+    return float(np.max(np.abs(residual), initial=0.0)), 0.0

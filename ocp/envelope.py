@@ -1,0 +1,86 @@
+"""Derivatives of the optimal cost in the parameters along an extremal, by the envelope theorem.
+
+dJ/dp = integral of dH/dp dt + dPhi/dp, and through every bound, end value and horizon that depends on p, each times the
+multiplier that holds it. Bryson, Ho 1975, section 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ocp.collocation import quadrature_weights
+from ocp.hamiltonian import Hamiltonian
+
+__all__ = ["Extremal", "cost_gradient"]
+
+
+@dataclass(frozen=True)
+class Extremal:
+    """Samples of an extremal in pieces of its horizon.
+
+    Attributes:
+        places: Places of the samples in each piece, 0..1. Shape (m,). widths: of the pieces, s. Shape (K,).
+        t: Times, s. Shape (K, m).
+        states, costates, controls, multipliers: Shapes (K, m, .); multipliers of the path equalities.
+        horizon: s. nu_start, nu_end: Multipliers of the start and end constraints.
+    """
+
+    places: np.ndarray
+    widths: np.ndarray
+    t: np.ndarray
+    states: np.ndarray
+    costates: np.ndarray
+    controls: np.ndarray
+    multipliers: np.ndarray
+    horizon: float
+    nu_start: np.ndarray
+    nu_end: np.ndarray
+
+
+def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Derivative of the optimal cost in the parameters. Shape (np,)."""
+    form = ham.form
+    symbols = [form.x, form.u, ham.lam, ham.mu, form.t, form.T, form.p]
+    slopes = [ca.gradient(ham.value, s) for s in (form.p, form.T, form.u)]
+    function = ca.Function("slopes", symbols, [ca.densify(s) for s in (*slopes, ham.value)])
+    count = path.t.size
+    weights = (path.widths[:, None] * quadrature_weights(path.places)).ravel()
+    ones = np.ones((1, count))
+    samples = [v.reshape(count, -1).T for v in (path.states, path.controls, path.costates, path.multipliers)]
+    arguments = (*samples, path.t.reshape(1, -1), path.horizon * ones, p[:, None] * ones)
+    by_p, by_horizon, by_control, value = (np.asarray(v.full()) for v in function.map(count)(*arguments))
+
+    x0, x1 = path.states[0, 0], path.states[-1, -1]
+    phi_p, phi_horizon, phi_x0, phi_x1 = end_gradients(ham, path, x0, x1, p)
+    places = form.bounds.places
+    push = np.zeros((2, len(bounds[0])))  # multipliers of lower and upper bounds, as of f + lam . g
+    controls = samples[1]
+    low, high = (bound[places["control"]][:, None] for bound in bounds)
+    middle = 0.5 * (np.where(np.isfinite(low), low, controls) + np.where(np.isfinite(high), high, controls))
+    push[0, places["control"]] = -(by_control * (controls <= middle)) @ weights
+    push[1, places["control"]] = -(by_control * (controls > middle)) @ weights
+    push[0, form.start.bounds], push[0, form.end.bounds] = path.nu_start, path.nu_end
+    push[0, places["initial"]] = -(path.costates[0, 0] + phi_x0)
+    push[0, places["terminal"]] = path.costates[-1, -1] - phi_x1
+    for end in ("initial", "terminal"):  # only given entries are held
+        push[0, places[end]] *= bounds[0][places[end]] == bounds[1][places[end]]
+    if not form.horizon_is_free:
+        push[0, places["horizon"]] = -(value[0, -1] + phi_horizon + float(by_horizon[0] @ weights))
+    return np.asarray(by_p @ weights + phi_p - form.bounds.pull(p, push))
+
+
+def end_gradients(
+    ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """Gradients of Phi = terminal cost + nu . end constraints in p, T, the first and the last state."""
+    form = ham.form
+    begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
+    end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+    phi = terminal + ca.dot(ca.DM(path.nu_start), begin) + ca.dot(ca.DM(path.nu_end), end)
+    symbols = [form.x0, form.x, form.T, form.p]
+    gradients = [ca.densify(ca.gradient(phi, s)) for s in (form.p, form.T, form.x0, form.x)]
+    found = [np.asarray(v.full()).reshape(-1) for v in ca.Function("phi", symbols, gradients)(x0, x1, path.horizon, p)]
+    return found[0], float(found[1][0]), found[2], found[3]
