@@ -125,12 +125,14 @@ def certificate(
         if not np.array_equal(form.parameter_vector(solution.parameters), p):
             raise ProblemError(f"plans {reference!r} and {name!r} were solved at different parameters")
     audits = {name: audit(problem, named[name]) for name in order}
-    curves = {name: sample(form, named[name], p) for name in order}
     first = named[reference]
+    spread = (np.arange(SAMPLES) + 0.5) / SAMPLES
     comparisons = []
     for name in order:
         solution = named[name]
-        off = [difference(mine, own) for mine, own in zip(curves[name], curves[reference], strict=True)]
+        own = solution.t[:-1] / solution.horizon  # costates are best where they are reported
+        mine, other = (sample(form, plan, p, spread, own) for plan in (solution, first))
+        off = [difference(a, b) for a, b in zip(mine, other, strict=True)]
         comparisons.append(
             Comparison(
                 name,
@@ -167,18 +169,17 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
     return named
 
 
-def sample(form: Formulation, solution: Solution, p: np.ndarray) -> list[np.ndarray]:
-    """States, controls, costates and Hamiltonian at places spread over the horizon, each (SAMPLES, n)."""
-    s = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    x, u, lam = (
-        interpolant(s)
-        for interpolant in (solution.state_interpolant, solution.control_interpolant, solution.costate_interpolant)
-    )
+def sample(
+    form: Formulation, solution: Solution, p: np.ndarray, spread: np.ndarray, own: np.ndarray
+) -> list[np.ndarray]:
+    """States and controls at fractions ``spread``, costates and Hamiltonian at fractions ``own``."""
+    lam = solution.costate_interpolant(own)
     symbol = form.problem.symbols.sym("lam", form.nx)
     value = form.running + ca.dot(symbol, form.f)
     function = ca.Function("hamiltonian", [form.x, form.u, form.t, form.T, form.p, symbol], [value])
-    hamiltonian = numbers(function, x, u, s * solution.horizon, solution.horizon, p, lam)[0]
-    return [x, u, lam, hamiltonian]
+    x, u = solution.state_interpolant(own), solution.control_interpolant(own)
+    hamiltonian = numbers(function, x, u, own * solution.horizon, solution.horizon, p, lam)[0]
+    return [solution.state_interpolant(spread), solution.control_interpolant(spread), lam, hamiltonian]
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
