@@ -16,7 +16,7 @@ from ocp.errors import ProblemError
 from ocp.formulation import Formulation
 from ocp.fragment import Block, Fragment
 from ocp.interpolation import PiecewisePolynomial, differentiation_matrix, lagrange
-from ocp.transcription import FragmentBuilder, check_intervals, fractions
+from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["Collocation"]
 
@@ -52,6 +52,7 @@ class Collocation:
             raise ProblemError(f"Collocation: scheme must be 'radau' or 'legendre', not {self.scheme!r}")
         if self.control not in ("points", "held"):
             raise ProblemError(f"Collocation: control must be 'points' or 'held', not {self.control!r}")
+        settled(self, intervals=self.intervals, degree=self.degree)
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from tqdm import tqdm
 
 from ocp.assembly import Program
 from ocp.errors import ProblemError
@@ -76,12 +77,15 @@ class Progress(ca.Callback):  # type: ignore[misc]
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
         self.title, self.show = title, show
         self.stop = False
-        self.reset(np.zeros(m), np.zeros(m))
+        self.bar: Any = None
         self.construct("progress", {})
 
-    def reset(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        self.lower, self.upper = lower, upper
-        self.count, self.began, self.drawn, self.stop = 0, time.monotonic(), 0.0, False
+    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
+        self.lower, self.upper, self.stop = lower, upper, False
+        disable = None if self.show else True
+        form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
+        self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
 
     def get_n_in(self) -> int:
         return int(ca.nlpsol_n_out())
@@ -96,21 +100,17 @@ class Progress(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arguments: list[Any]) -> list[int]:
-        now = time.monotonic()
-        if self.show and now - self.began > 1.0 and now - self.drawn > 0.1:
+        if self.bar is not None and not self.bar.disable:
             g = np.asarray(arguments[2].full()).reshape(-1)
             worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-            line = f"{self.title}: iteration {self.count}, cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
-            sys.stderr.write(f"\r{line[:110]:<110}")
-            sys.stderr.flush()
-            self.drawn = now
-        self.count += 1
+            cost = float(arguments[1])
+            self.bar.set_postfix_str(f"cost {cost:.6g}, infeasibility {worst:.1e}", refresh=False)
+            self.bar.update()
         return [int(self.stop)]
 
     def close(self) -> None:
-        if self.drawn:
-            sys.stderr.write("\r" + " " * 110 + "\r")
-            sys.stderr.flush()
+        if self.bar is not None:
+            self.bar.close()
 
 
 def build_solver(
@@ -132,7 +132,7 @@ def build_solver(
     progress = None
     if solver == "ipopt":
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
-        progress = Progress(n, m, n_p, title, bool(sys.stderr.isatty()) and not own["print_level"])
+        progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
     else:
         assert stages is not None
@@ -182,7 +182,7 @@ def call_solver(
     """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned."""
     began = time.monotonic()
     if progress is not None:
-        progress.reset(arguments["lbg"], arguments["ubg"])
+        progress.open(arguments["lbg"], arguments["ubg"])
     try:
         with interruptible(progress):
             result = solver(**(arguments if progress is not None else tightened(arguments)))
@@ -190,8 +190,9 @@ def call_solver(
         if "option not supported" in str(error).lower():  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}") from error
         raise
-    if progress is not None:
-        progress.close()
+    finally:
+        if progress is not None:
+            progress.close()
     stats = solver.stats()
     word = str(stats.get("return_status", ""))
     if "fatrop" in stats:

@@ -15,7 +15,7 @@ from ocp.errors import ProblemError
 from ocp.formulation import Formulation
 from ocp.fragment import Block, Fragment
 from ocp.interpolation import PiecewisePolynomial
-from ocp.transcription import FragmentBuilder, check_intervals, fractions
+from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["MultipleShooting"]
 
@@ -54,6 +54,7 @@ class MultipleShooting:
             raise ProblemError(f"MultipleShooting: steps must be a positive integer, not {self.steps!r}")
         if self.control not in ("held", "linear"):
             raise ProblemError(f"MultipleShooting: control must be 'held' or 'linear', not {self.control!r}")
+        settled(self, intervals=self.intervals, steps=self.steps)
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""

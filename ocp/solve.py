@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import tempfile
 import time
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -49,8 +51,7 @@ class Prepared:
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
-        jit = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O1"], "verbose": False}}
-        self.program = assemble(self.fragment, self.formulation.np, jit if compiled else None)
+        self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         self._solver, self._progress = build_solver(
             self.program, solver, dict(options), self.fragment.stages, problem.name
         )
@@ -82,6 +83,27 @@ class Prepared:
         if check and not outcome.success:
             raise SolveError(self._diagnosis(outcome, arguments, solution.horizon), solution)
         return solution
+
+    def _at_bounds(self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
+        """Which states and controls sit at their bounds, and for how much of the plan."""
+        form, fragment = self.formulation, self.fragment
+        lines = []
+        for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
+            for i, label in enumerate(labels):
+                mine = (fragment.variable_role == role) & (fragment.variable_entry == i)
+                mine &= arguments["lbx"] < arguments["ubx"]  # not what is given
+                for side, key in (("lower", "lbx"), ("upper", "ubx")):
+                    bound = arguments[key][mine]
+                    with np.errstate(invalid="ignore"):
+                        at = np.abs(values[mine] - bound) <= 1e-6 * np.maximum(1.0, np.abs(bound))
+                    at &= np.isfinite(bound)
+                    if np.any(at):
+                        where = fragment.variable_fraction[mine][at]
+                        lines.append(
+                            f"  {role} {label} is at its {side} bound {bound[at][0]:.4g} at {np.mean(at):.0%} of its "
+                            f"points, from {where.min() * horizon:.4g} to {where.max() * horizon:.4g} s"
+                        )
+        return lines
 
     def _solution(self, outcome: Outcome, p: np.ndarray) -> Solution:
         form, fragment = self.formulation, self.fragment
@@ -179,9 +201,17 @@ class Prepared:
             if label not in seen:
                 seen.add(label)
                 lines.append(f"  {label} is missed by {miss[i]:.3g} at {fragment.row_fractions[i] * horizon:.4g} s")
+        lines += self._at_bounds(outcome.variables, arguments, horizon)
         if not seen and not broken.size:
             lines.append("  all constraints are met; the plan is feasible but not optimal")
         return "\n".join(lines)
+
+
+def compiler_options() -> dict[str, Any]:
+    """Options that make casadi compile a function with the machine's C compiler, its files in the temporary folder."""
+    folder = tempfile.gettempdir()
+    shell = {"flags": ["-O1"], "directory": f"{folder}{os.sep}"}
+    return {"jit": True, "compiler": "shell", "jit_name": os.path.join(folder, "selfmotion"), "jit_options": shell}
 
 
 def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:

@@ -13,7 +13,7 @@ from ocp.formulation import Formulation, Rows
 from ocp.fragment import Block, Fragment, InterpolantMaker, Stages
 from ocp.layout import Layout, plain_layout, staged_layout
 
-__all__ = ["FragmentBuilder", "check_intervals", "fractions"]
+__all__ = ["FragmentBuilder", "check_intervals", "fractions", "settled"]
 
 
 def check_intervals(method: str, intervals: Any, mesh: tuple[float, ...] | None) -> None:
@@ -30,6 +30,14 @@ def check_intervals(method: str, intervals: Any, mesh: tuple[float, ...] | None)
         raise ProblemError(f"{method}: mesh has {at.size} entries, {intervals + 1} expected (fractions 0 to 1)")
     if not (at[0] == 0.0 and at[-1] == 1.0 and np.all(np.diff(at) > 0)):
         raise ProblemError(f"{method}: mesh must increase from 0 to 1, not {at.tolist()}")
+
+
+def settled(method: Any, **whole: Any) -> None:
+    """Turn whole numbers and the mesh of a method into plain Python, so that it compares, hashes and is saved."""
+    for name, value in whole.items():
+        object.__setattr__(method, name, int(value))
+    if method.mesh is not None:
+        object.__setattr__(method, "mesh", tuple(float(s) for s in method.mesh))
 
 
 def fractions(intervals: int, mesh: tuple[float, ...] | None) -> np.ndarray:
