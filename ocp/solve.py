@@ -209,9 +209,8 @@ class Prepared:
 
 def compiler_options() -> dict[str, Any]:
     """Options that make casadi compile a function with the machine's C compiler, its files in the temporary folder."""
-    folder = tempfile.gettempdir()
-    shell = {"flags": ["-O1"], "directory": f"{folder}{os.sep}"}
-    return {"jit": True, "compiler": "shell", "jit_name": os.path.join(folder, "selfmotion"), "jit_options": shell}
+    shell = {"flags": ["-O1"], "directory": tempfile.gettempdir() + os.sep}
+    return {"jit": True, "compiler": "shell", "jit_name": "selfmotion", "jit_options": shell}
 
 
 def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:
