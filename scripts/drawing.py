@@ -23,6 +23,7 @@ __all__ = [
     "COLORS",
     "DASHES",
     "STYLE",
+    "add_note",
     "gif",
     "sheet",
     "text_table",
@@ -118,11 +119,16 @@ def sheet(
         axes = figure.subplots(rows, columns, squeeze=False, **subplots)
         yield figure, axes
         if note:
-            text = textwrap.fill(note, int(size[0] * NOTE_CHARACTERS_PER_INCH))
-            figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
+            add_note(figure, note)
         if path is not None:
             with written(path) as temporary:
                 figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def add_note(figure: Figure, note: str) -> None:
+    """Fine print under a figure, wrapped to its width."""
+    text = textwrap.fill(note, int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
+    figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
 
 
 def gif(path: Path, frames: Iterable[Figure], *, seconds: float, colors: int = 64, hold: float = 1.0) -> None:

@@ -65,9 +65,9 @@ def write(results: Results, folder: Path) -> None:
         path.write_text(f"{results.audit}\n", encoding="utf-8")
     draw(folder, results.machine, results.local, results.optimal, NOTE)
     draw_convergence(folder, results.convergence, NOTE)
-    draw_false_optima(folder, results.trials, f"{ASSUMED}; horizon {FALSE_HORIZON:g} s.")
+    draw_false_optima(folder, results.trials, f"{ASSUMED}; horizon {FALSE_HORIZON:g} s (chosen, not printed).")
     motions = results.machine, results.local, results.optimal
-    draw_animation(folder, *motions, CHOSEN, lambda times: progress(times, "animation"))
+    draw_animation(folder, *motions, NOTE, lambda times: progress(times, "animation"))
 
 
 def report(results: Results) -> None:
@@ -80,8 +80,9 @@ def report(results: Results) -> None:
     print(f"\nOptimum, horizon {HORIZON:g} s: J = {results.principle.cost:.12f} rad^2/s")
     print(text_table(results.convergence, 4))
     laws = results.laws
-    print(f"\nThe plan, re-integrated: tip off its line by {laws.tip_error:.1e} m, momentum {laws.momentum_drift:.1e}")
-    print(f"(SI), centre of mass moved by {laws.center_of_mass_drift:.1e} m\n{results.audit}")
+    print(f"\nThe plan, re-integrated: tip off its line by {laws.tip_error:.1e} m, momentum at most", end=" ")
+    print(f"{laws.momentum_drift:.1e} (SI units), centre of mass moved by {laws.center_of_mass_drift:.1e} m")
+    print(results.audit)
     columns = ("guess", "seed", "cost", "jump_deg_s", "task_error_m_s", "audit", "intervals", "refined_cost", "verdict")
     rows = [{name: trial.row()[name] for name in columns} for trial in results.trials]
     print(f"\nFrom other guesses, horizon {FALSE_HORIZON:g} s\n" + text_table(rows))
@@ -156,7 +157,7 @@ def summary(results: Results) -> dict[str, Any]:
         "pseudo_inverse": {
             "peak_joint_velocity_deg_s": np.degrees(peaks["pseudo-inverse"][0]),
             "peak_time_s": peaks["pseudo-inverse"][1],
-            "largest_joint_acceleration_deg_s2": np.degrees(np.abs(local.joint_accelerations).max(axis=0)),
+            "largest_joint_acceleration_deg_s2": np.degrees(np.abs(results.near_peaks.joint_accelerations).max(axis=0)),
             "min_manipulability": local.manipulability[least],
             "min_manipulability_time_s": local.t[least],
         },

@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from models import FreeFloating
-from scripts.drawing import COLORS, DASHES, Row, gif, sheet
+from scripts.drawing import COLORS, DASHES, Row, add_note, gif, sheet
 from scripts.false_optima import EXTREMAL, FALSE, HORIZON, Trial
 from scripts.free_floating_motion import Array, Motion, outline
 
@@ -147,7 +147,7 @@ def draw_animation(
         names = [f"joint {i + 1}" for i in range(len(curves))]
         axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=6, color=COLORS["grey"])
+        add_note(figure, note)  # now, not when the block ends: the frames are drawn before
 
         def frames() -> Iterator[Figure]:
             for time in progress(times.tolist()):

@@ -78,8 +78,14 @@ def motion_of_local(machine: FreeFloating, local: LocalSolution, tip_velocity: A
     )
 
 
-def motion_of_plan(machine: FreeFloating, plan: Solution, times: Array, rows: Sequence[int]) -> Motion:
-    """A plan with the control "rates" at any times, by its own interpolants."""
+def motion_of_plan(
+    machine: FreeFloating, plan: Solution, times: Array, rows: Sequence[int], extremal: Solution
+) -> Motion:
+    """A plan with the control "rates" at any times, by its own interpolants.
+
+    The accelerations are those of `extremal`, the same optimum by the minimum principle: the slope of a collocation
+    plan's control, a polynomial of degree 2 in every interval, is right to a few digits only.
+    """
     sample = plan.at(times)
     base, joints = _symbols(machine)
     jacobian = machine.tip_jacobian(base, joints)[list(rows), :]
@@ -90,7 +96,7 @@ def motion_of_plan(machine: FreeFloating, plan: Solution, times: Array, rows: Se
         sample["joints"],
         _base_rates(machine, sample["base"], sample["joints"], sample["rates"]),
         sample["rates"],
-        _derivative(plan.control_interpolant, plan.horizon)(times / plan.horizon),
+        _derivative(extremal.control_interpolant, extremal.horizon)(times / extremal.horizon),
         _tip(machine, sample["base"], sample["joints"]),
         _along(ca.Function("manipulability", [base, joints], [size]), sample["base"], sample["joints"])[:, 0],
     )

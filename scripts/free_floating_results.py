@@ -132,7 +132,7 @@ def compute() -> Results:
         machine=machine,
         local=local,
         near_peaks=near_peaks,
-        optimal=motion_of_plan(machine, plan, grid(), ROWS),
+        optimal=motion_of_plan(machine, plan, grid(), ROWS, principle),
         plan=plan,
         audit=audit,
         laws=laws(machine, audit, TIP_VELOCITY),

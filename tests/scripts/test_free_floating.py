@@ -117,10 +117,12 @@ def test_pseudo_inverse_motion_does_the_task_with_the_least_joint_rates(run: Run
 
 
 def test_accelerations_of_both_motions_are_the_slopes_of_their_velocities(run: Run) -> None:
-    for motion, error in ((run.results.local, 1e-2), (run.results.optimal, 1e-3)):
-        slope = np.gradient(motion.joint_rates, motion.t, axis=0)[1:-1]
+    rates = run.results.principle.at(run.results.optimal.t)["rates"]
+    for motion, velocities in ((run.results.local, run.results.local.joint_rates), (run.results.optimal, rates)):
+        slope = np.gradient(velocities, motion.t, axis=0)[1:-1]  # its own error: 1e-3 where the curve is sharpest
         size = np.abs(motion.joint_accelerations).max()
-        assert np.abs(slope - motion.joint_accelerations[1:-1]).max() < error * size
+        assert np.abs(slope - motion.joint_accelerations[1:-1]).max() < 2e-3 * size
+    assert np.abs(rates - run.results.optimal.joint_rates).max() < 1e-4
 
 
 def test_acceleration_vanishes_at_a_peak_inside_the_motion(run: Run) -> None:
@@ -212,9 +214,8 @@ def test_tip_stays_on_its_line_on_half_the_intervals(machine: FreeFloating) -> N
 def test_plan_passes_its_audit_and_the_script_succeeds(run: Run) -> None:
     assert run.summary["optimal"]["audit_passed"] is True
     assert run.status == 0
-    assert (
-        (run.folder / "audit.txt").read_text(encoding="utf-8").startswith("Audit of 'minimum velocity, rates': passed")
-    )
+    table = (run.folder / "audit.txt").read_text(encoding="utf-8")
+    assert table.splitlines()[0] == "Audit of 'minimum velocity, rates': passed"
 
 
 # ---- the instruments
