@@ -8,14 +8,14 @@ so building costs the same for 10 intervals and for 1000. Fragments of several p
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from ocp.interpolation import PiecewisePolynomial
 
-__all__ = ["Block", "Fragment", "InterpolantMaker", "Stages"]
+__all__ = ["Block", "Fragment", "InterpolantMaker", "Stages", "shifted"]
 
 InterpolantMaker: TypeAlias = Callable[[np.ndarray, np.ndarray, float], tuple[PiecewisePolynomial, PiecewisePolynomial]]
 
@@ -107,3 +107,16 @@ class Fragment:
     def end(self) -> np.ndarray:
         """Indices of the last state, the joint to a later phase. Shape (nx,)."""
         return self.nodes[:, -1]
+
+
+def shifted(fragment: Fragment, variables: int, rows: int) -> Fragment:
+    """The same fragment with its variables and rows moved up, to stand behind another one in a larger program."""
+    blocks = tuple(replace(b, variables=b.variables + variables, rows=b.rows + rows) for b in fragment.blocks)
+    at, columns, values = fragment.linear
+    return replace(
+        fragment,
+        blocks=blocks,
+        linear=(at + rows, columns + variables, values),
+        nodes=fragment.nodes + variables,
+        horizon=None if fragment.horizon is None else fragment.horizon + variables,
+    )
