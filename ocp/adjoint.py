@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.formulation import Formulation
+from ocp.quiet import quiet
 from ocp.reintegration import OPTIONS, basis
 from ocp.solution import Solution
 
@@ -58,7 +59,7 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
     n = len(breaks) - 1
     costates = solution.costate_interpolant
     plan = costates(costates.breaks)
-    size = float(np.max(np.abs(costates.values), initial=0.0))
+    size = float(np.max(np.abs(costates.values), initial=1.0 if form.indifferent else 0.0))
     scale = size if size > 0 else 1.0
     ends = end_residuals(form, solution, p, bounds)
     reason = obstacle(form, solution, bounds)
@@ -86,7 +87,8 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
         everywhere[-1] = lam = plan[-1]
         for k in reversed(range(n)):
             try:
-                lam = np.asarray(integrator(x0=lam, p=data[:, k])["xf"].full()).reshape(-1)
+                with quiet():
+                    lam = np.asarray(integrator(x0=lam, p=data[:, k])["xf"].full()).reshape(-1)
             except RuntimeError:
                 break
             everywhere[k] = lam
@@ -162,12 +164,15 @@ def end_residuals(
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
     last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
     symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
-    rows = ca.vertcat(begin, last[0])
+    # a path constraint of the states alone that is active at an end holds them there as an end condition does
+    path = form.path.select(~form.path.uses_control)
+    first = ca.substitute([path.expression], [form.x, form.t], [form.x0, 0])[0]
+    rows = ca.vertcat(begin, last[0], ca.substitute([path.expression], [form.t], [form.T])[0], first)
     both = ca.vertcat(form.x, form.x0, form.T)
     function = ca.Function("ends", symbols, [rows, ca.densify(ca.jacobian(rows, both)), ca.gradient(last[1], both)])
     found = function(x1, x0, controls[1], controls[0], solution.horizon, p)
     values, slopes, gradient = (np.asarray(v.full()) for v in found)
-    index = np.concatenate([form.start.bounds, form.end.bounds])
+    index = np.concatenate([form.start.bounds, form.end.bounds, path.bounds, path.bounds])
     active = near(values.T, low[index], high[index])[0]
     places = form.bounds.places
     free = np.concatenate(

@@ -105,6 +105,7 @@ class Audit:
         return "\n".join(lines)
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is not a number fails by name
 def audit(
     problem: Problem,
     solution: Solution,
@@ -129,8 +130,14 @@ def audit(
         tolerances: Largest violation by name of a state, control or constraint, in its own unit.
 
     Raises:
-        ProblemError: The plan does not belong to the problem, or a name in ``tolerances`` is unknown.
+        ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
+            unknown.
     """
+    limits = dict(tolerances or {})
+    named = {"integration": integration, "constraints": constraints, "stationarity": stationarity}
+    for name, limit in {**named, "drift": drift, "costates": costates, **limits}.items():
+        if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
+            raise ProblemError(f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}")
     form = Formulation(problem)
     check_belongs(form, solution)
     p = form.parameter_vector(solution.parameters)
@@ -150,8 +157,8 @@ def audit(
     findings.append(worst("integration error, relative", errors.max(axis=1), again.t, integration, note))
     findings.append(worst("integration error of one interval", local.max(axis=1), again.t, integration))
     findings.append(cost_finding(form, solution, again, p, integration))
+    findings.append(reported_finding(solution, integration))
 
-    limits = dict(tolerances or {})
     names = [
         *form.states,
         *form.controls,
@@ -259,9 +266,31 @@ def cost_finding(form: Formulation, solution: Solution, again: Reintegration, p:
     terminal = ca.Function("terminal", symbols, [form.terminal])
     end = terminal(again.states[-1], again.states[0], again.controls[0], solution.horizon, solution.horizon, p)
     cost = again.cost + float(end)
-    size = max(abs(cost), abs(again.cost), abs(float(end)), abs(solution.cost))
+    # parts of the running cost may cancel: judge by their size
+    m = len(again.t)
+    running = ca.Function("running", [form.x, form.u, form.t, form.T, form.p], [form.running]).map(m, "serial")
+    ones = np.ones((1, m))
+    inputs = (again.plan.T, again.controls.T, again.t[None, :], solution.horizon * ones, p[:, None] * ones)
+    parts = np.abs(np.asarray(running.call([ca.DM(v) for v in inputs])[0].full()).ravel())
+    spent = float(np.sum(np.diff(again.t) * (parts[:-1] + parts[1:]) / 2))
+    size = max(abs(cost), abs(again.cost), abs(float(end)), abs(solution.cost), spent)
     off = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
     return Finding("cost, relative", off, limit, None, f"reported {solution.cost:.8g}, integrated {cost:.8g}")
+
+
+def reported_finding(solution: Solution, limit: float) -> Finding:
+    """The reported arrays against the interpolants, relative; at a break the value of either side will do."""
+    off = np.zeros(len(solution.t))
+    for pool, curve in (
+        (solution.states, solution.state_interpolant),
+        (solution.controls, solution.control_interpolant),
+        (solution.costates, solution.costate_interpolant),
+    ):
+        values = np.hstack([np.zeros((len(off), 0)), *pool.values()])
+        sides = [curve(solution.t / solution.horizon + shift) - values for shift in (-1e-12, 1e-12)]
+        size = np.max(np.abs(curve.values), initial=0.0) or 1.0
+        off = np.maximum(off, np.min([np.abs(side).max(axis=1, initial=0.0) for side in sides], axis=0) / size)
+    return worst("reported values, relative", off, solution.t, limit)
 
 
 Check = tuple[str, str, np.ndarray, np.ndarray, float]  # label, name, violations (K,), times (K,), scale

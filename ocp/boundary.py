@@ -10,7 +10,8 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.formulation import Formulation
-from ocp.hamiltonian import Hamiltonian
+from ocp.hamiltonian import Hamiltonian, numeric_bounds
+from ocp.quiet import quiet
 from ocp.switching import Arcs
 
 __all__ = ["NODES", "BoundaryProblem"]
@@ -31,6 +32,8 @@ class BoundaryProblem:
 
     def __init__(self, ham: Hamiltonian, *, backward: bool, tolerance: float) -> None:
         self.ham, self.form, self.backward, self.tolerance = ham, ham.form, backward, tolerance
+        if backward:
+            check_backward(ham)
         self.outputs = ham.outputs()
         self.step = self._integrator(np.array([1.0]))
         self.dense = self._integrator(NODES[1:])
@@ -77,11 +80,6 @@ class BoundaryProblem:
     def _backward(self, arcs: Arcs) -> tuple[Any, Any, Any]:
         """Backward shooting: unknown end state only; the start must be met."""
         form = self.form
-        if len(form.end) or len(form.start) or form.horizon_is_free or arcs.components or form.ties_ends:
-            raise ProblemError(
-                "backward shooting takes problems with a given start, a free end state, a fixed horizon, no switches; "
-                "use Indirect(shooting='multiple')"
-            )
         of = self._data(arcs)
         total = sum(arcs.segments)
         z, data = ca.MX.sym("z", form.nx), ca.MX.sym("data", of["guess"].stop)
@@ -169,6 +167,7 @@ class BoundaryProblem:
             "quad_err_con": True,
             "linear_multistep_method": "adams",
             "show_eval_warnings": False,
+            "disable_internal_warnings": True,  # a trial step of Newton's method may go anywhere
         }
         dae = {"x": y, "t": place, "p": q, "ode": ode, "quad": quad}
         integrator = ca.integrator("flow", "cvodes", dae, 0.0, places.tolist(), options)
@@ -179,7 +178,8 @@ class BoundaryProblem:
     def integrate(self, integrator: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (2 nx, places) and integrals (2,); nan where the integration breaks down."""
         try:
-            states, spent = integrator(y, q)
+            with quiet():
+                states, spent = integrator(y, q)
             return np.asarray(states.full()), np.asarray(spent.full()).reshape(-1)
         except RuntimeError:
             return np.full(integrator.size_out(0), np.nan), np.full(2, np.nan)
@@ -204,7 +204,12 @@ class BoundaryProblem:
         if self.backward:
             symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
             nodes, _ = self._chain(*symbols, arcs, total)
-            y = np.asarray(ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])(z, data).full())
+            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])
+            try:
+                with quiet():
+                    y = np.asarray(chain(z, data).full())
+            except RuntimeError:  # the integration broke down
+                y = np.full((2 * form.nx, total + 1), np.nan)
         else:
             at = self.layout(arcs)
             y = z[at["y"]].reshape(total + 1, 2 * form.nx).T
@@ -213,6 +218,28 @@ class BoundaryProblem:
         w, at_end, given = ca.MX.sym("w", switches.size), ca.MX.sym("T"), ca.MX.sym("data", data.size)
         inputs = ca.Function("q", [w, at_end, given], [self._segment_data(w, at_end, given, arcs)])
         return y, np.asarray(inputs(switches, horizon, data).full()), switches, horizon
+
+
+def check_backward(ham: Hamiltonian) -> None:
+    """Raise ProblemError where backward shooting cannot take the problem."""
+    form = ham.form
+    low, high = numeric_bounds(form)
+    given = {end: low[form.bounds.places[end]] == high[form.bounds.places[end]] for end in ("initial", "terminal")}
+    reasons = {
+        "start constraints": len(form.start) > 0,
+        "end constraints": len(form.end) > 0,
+        "a free horizon": form.horizon_is_free,
+        "a cost that ties both ends": form.ties_ends,
+        "controls that switch": len(ham.linear) > 0,
+        "a state that is free at the start": not np.all(given["initial"]),
+        "a state that is given at the end": bool(np.any(given["terminal"])),
+    }
+    found = [reason for reason, holds in reasons.items() if holds]
+    if found:
+        raise ProblemError(
+            f"backward shooting cannot take {', '.join(found)}: it needs a given start, a free end state and a fixed "
+            "horizon; use Indirect(shooting='multiple')"
+        )
 
 
 def end_conditions(form: Formulation) -> Any:

@@ -24,6 +24,8 @@ SAMPLES = 400
 class Comparison:
     """A solution against the reference, each difference relative to the size of the reference's own.
 
+    The Hamiltonian is judged by the size of its parts, the cost by that of the running cost too: both may vanish.
+
     Attributes:
         name: The solution. passed: Whether its audit passed.
         cost, horizon: Values. cost_difference, horizon_difference: relative.
@@ -131,15 +133,17 @@ def certificate(
     for name in order:
         solution = named[name]
         own = solution.t[:-1] / solution.horizon  # costates are best where they are reported
-        mine, other = (sample(form, plan, p, spread, own) for plan in (solution, first))
-        off = [difference(a, b) for a, b in zip(mine, other, strict=True)]
+        (mine, _, _), (other, parts, running) = (sample(form, plan, p, spread, own) for plan in (solution, first))
+        off = [difference(a, b) for a, b in zip(mine[:3], other[:3], strict=True)]
+        off.append(np.abs(mine[3] - other[3]) / (parts or 1.0))
+        size = max(abs(first.cost), running * first.horizon) or 1.0
         comparisons.append(
             Comparison(
                 name,
                 audits[name].passed,
                 solution.cost,
                 solution.horizon,
-                abs(solution.cost - first.cost) / max(abs(first.cost), np.finfo(float).tiny),
+                abs(solution.cost - first.cost) / size,
                 abs(solution.horizon - first.horizon) / first.horizon,
                 float(np.max(off[0], initial=0.0)),
                 float(np.max(np.mean(off[1], axis=0), initial=0.0)),
@@ -171,15 +175,23 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 
 def sample(
     form: Formulation, solution: Solution, p: np.ndarray, spread: np.ndarray, own: np.ndarray
-) -> list[np.ndarray]:
-    """States and controls at fractions ``spread``, costates and Hamiltonian at fractions ``own``."""
+) -> tuple[list[np.ndarray], float, float]:
+    """States and controls at fractions ``spread``, costates and Hamiltonian at fractions ``own``, and two sizes.
+
+    The sizes are the largest sum of the sizes of the Hamiltonian's parts, for H itself vanishes where the horizon is
+    free, and the mean size of the running cost, for the cost may vanish as well.
+    """
     lam = solution.costate_interpolant(own)
     symbol = form.problem.symbols.sym("lam", form.nx)
-    value = form.running + ca.dot(symbol, form.f)
-    function = ca.Function("hamiltonian", [form.x, form.u, form.t, form.T, form.p, symbol], [value])
+    parts = ca.vertcat(form.running, symbol * form.f)
+    function = ca.Function("hamiltonian", [form.x, form.u, form.t, form.T, form.p, symbol], [parts])
     x, u = solution.state_interpolant(own), solution.control_interpolant(own)
-    hamiltonian = numbers(function, x, u, own * solution.horizon, solution.horizon, p, lam)[0]
-    return [solution.state_interpolant(spread), solution.control_interpolant(spread), lam, hamiltonian]
+    found = numbers(function, x, u, own * solution.horizon, solution.horizon, p, lam)[0]
+    hamiltonian, size = found.sum(axis=1), float(np.max(np.abs(found).sum(axis=1), initial=0.0))
+    x, u = solution.state_interpolant(spread), solution.control_interpolant(spread)
+    lam_spread = solution.costate_interpolant(spread)
+    running = numbers(function, x, u, spread * solution.horizon, solution.horizon, p, lam_spread)[0][:, 0]
+    return [x, u, lam, hamiltonian], size, float(np.mean(np.abs(running)))
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:

@@ -56,6 +56,10 @@ def set_(value: Any) -> bool:
 
 def column(value: Any) -> str:
     """A column of numbers or expressions; one number where all entries are the same."""
+    if isinstance(value, ca.MX):
+        if ca.symvar(value):
+            return short(str(value))
+        value = ca.evalf(value)
     entries = [str(entry) for entry in ca.vertsplit(value)]
     return entries[0] if len(set(entries)) == 1 else short("[" + ", ".join(entries) + "]")
 

@@ -109,6 +109,7 @@ class Formulation:
         horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
         ties_ends: Whether anything at the end refers to the start.
+        indifferent: Whether the cost is a constant, so that every plan that meets the constraints is optimal.
         autonomous: Whether dynamics, running cost and path are free of time.
     """
 
@@ -135,6 +136,7 @@ class Formulation:
         self.f = self._flat(ca.vertcat(*[declared.dynamics[name] for name in self.states]))
         self.running = self._flat(0 if declared.running is None else declared.running)
         self.terminal = self._flat(0 if declared.terminal is None else declared.terminal)
+        self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
         self.horizon_value = self._flat(horizon.lower)  # of use where it is fixed
         self.path = self._rows("path", declared.path)

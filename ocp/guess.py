@@ -11,7 +11,7 @@ import numpy as np
 from ocp.errors import ProblemError, unknown_name
 from ocp.formulation import Formulation
 from ocp.fragment import Fragment
-from ocp.problem import numeric
+from ocp.problem import numeric, table
 from ocp.solution import Solution
 
 __all__ = ["Samples", "initial_point"]
@@ -48,9 +48,10 @@ def initial_point(
     elif guess is not None:
         raise ProblemError(f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}")
     if "horizon" in given:
-        horizon = float(numeric("guess of the horizon", given.pop("horizon"))[0])
-        if not (np.isfinite(horizon) and horizon > 0):
-            raise ProblemError(f"guess of the horizon must be positive and finite, not {horizon:g} s")
+        number = numeric("guess of the horizon", given.pop("horizon"))
+        if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
+            raise ProblemError(f"guess of the horizon must be one positive finite number, not {number.tolist()} s")
+        horizon = float(number[0])
     entries.update(given)
     times = None if guess is None or isinstance(guess, Solution) else guess.get("t")
 
@@ -81,10 +82,10 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
         return lambda at: value.over(at * horizon)
     if callable(value):
         return lambda at: np.array([fitted(name, value(float(s) * horizon), size) for s in at])
-    array = np.asarray(value, dtype=float)
-    if array.ndim == 2 and array.shape[0] > 1:
+    array = table(f"guess of {name!r}", value)
+    if array.ndim == 2 and array.shape[0] > 1 and array.shape != (size, 1):
         rows = len(array)
-        at = np.linspace(0.0, horizon, rows) if times is None else np.asarray(times, dtype=float).reshape(-1)
+        at = np.linspace(0.0, horizon, rows) if times is None else numeric("guess: its times 't'", times)
         if len(at) != rows or array.shape[1] != size:
             raise ProblemError(f"guess of {name!r} has shape {array.shape}, ({len(at)}, {size}) expected")
         if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):

@@ -60,7 +60,8 @@ class Hamiltonian:
         rows = form.path.expression - ca.vertcat(form.problem.symbols(0, 1), *levels)
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
-        curved = used_columns(ca.sparsify(ca.hessian(value, form.u)[0]).sparsity())
+        symbols = [form.x, form.u, lam, mu, form.t, form.T, form.p]
+        curved = used_columns(nonzeros(ca.hessian(value, form.u)[0], symbols))
         in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
         smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
         linear = [i for i in range(form.nu) if i not in smooth]
@@ -83,8 +84,29 @@ class Hamiltonian:
 
     def outputs(self) -> Any:
         """Function (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls)."""
-        switching = ca.gradient(self.value, self.form.u)[list(self.linear)]
+        slope = ca.gradient(self.value, self.form.u)
+        switching = slope[list(self.linear)] if self.linear else slope[:0, :]
         return self._eliminated("outputs", [self.form.u, self.mu, self.value, switching])
+
+    def multipliers(self, u: np.ndarray, free: np.ndarray, *point: Any) -> np.ndarray:
+        """Multipliers of the path equalities that best make H stationary in the free controls. Shape (K, m).
+
+        Args:
+            u: Controls at K samples. Shape (K, nu). free: Which are off their bounds. Shape (K, nu), bool.
+            point: x, lam, t, T, p at the samples, each (size, K).
+        """
+        form, count = self.form, len(u)
+        slope = ca.substitute([ca.gradient(self.value, form.u)], [self.mu], [ca.DM.zeros(len(form.path))])[0]
+        symbols = [form.x, self.lam, form.t, form.T, form.p, form.u]
+        outputs = [ca.densify(slope), ca.densify(ca.vec(ca.jacobian(self.rows, form.u)))]
+        found = ca.Function("slopes", symbols, outputs).map(count)(*point, u.T)
+        slopes, rows = (np.asarray(v.full()).T for v in found)
+        mu = np.zeros((count, len(form.path)))
+        for k in range(count):
+            columns = rows[k].reshape(form.nu, -1)[free[k]]
+            if np.all(np.isfinite(columns)) and np.all(np.isfinite(slopes[k])):
+                mu[k] = np.linalg.lstsq(columns, -slopes[k][free[k]], rcond=None)[0]
+        return mu
 
     def _eliminated(self, name: str, outputs: list[Any]) -> Any:
         form = self.form
@@ -126,6 +148,8 @@ def check_constraints(form: Formulation) -> None:
                 f"the indirect method cannot take the path equality {label!r}, which contains no control; "
                 "differentiate it until one appears or use a direct method"
             )
+    if form.nu and ca.depends_on(form.terminal, form.u0):
+        raise ProblemError("the indirect method cannot take a terminal cost on the control at the start")
     controls = ca.vertcat(form.u, form.u0)
     for kind, rows in (("start", form.start), ("end", form.end)):
         for i, (label, equality) in enumerate(zip(rows.labels, rows.equality, strict=True)):
@@ -155,12 +179,15 @@ class Stationarity:
         w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
         known = [form.x, self.lam, form.t, form.T, form.p, bang]
         residual = self._residual(w, bang)
-        matrix = ca.sparsify(ca.jacobian(residual, w)) if n + m else self.form.problem.symbols(0, 0)
+        matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
+        pattern = nonzeros(matrix, [*known, w])
+        if isinstance(matrix, ca.SX):
+            matrix = ca.sparsify(matrix)
         self._check_regular(matrix, [*known, w])
         bounded = self._has_bounds()
         index = form.bounds.places["control"][self.smooth].tolist()
         low, high = (bound[index] for bound in form.bounds.function(form.p))
-        separate = m == 0 and matrix.sparsity().is_diag()
+        separate = m == 0 and pattern.is_diag()
         if not ca.depends_on(matrix, w) and (not bounded or separate):
             offset = ca.substitute([residual], [w], [ca.DM.zeros(n + m)])[0]
             found = -symmetric_solve(matrix, offset, n) if n + m else w
@@ -171,7 +198,7 @@ class Stationarity:
             inside = ca.fmax(low, ca.fmin(high, w[:n, :] - residual[:n, :]))
             residual = ca.vertcat(w[:n, :] - inside, residual[n:, :])
         equations = ca.Function("stationary", [w, ca.vertcat(*known)], [residual])
-        options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False}
+        options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
         finder = ca.rootfinder("control", "newton", equations, options)
         symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
@@ -179,7 +206,7 @@ class Stationarity:
     def _residual(self, w: Any, bang: Any) -> Any:
         """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
-        gradient = ca.gradient(self.value, self.form.u)[self.smooth]
+        gradient = ca.gradient(self.value, self.form.u)[self.smooth] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
         control = assemble_control(self.form, self.smooth, self.linear, w, bang)
         return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
@@ -211,6 +238,15 @@ class Stationarity:
                 "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
                 "that the path equalities leave; add a quadratic term in the control to the cost"
             )
+
+
+def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
+    """Sparsity of the entries that are not zero; of an MX expression, not zero at one of three random points."""
+    if isinstance(matrix, ca.SX):
+        return ca.sparsify(matrix).sparsity()
+    rng = np.random.default_rng(SEED)
+    size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan stays and counts
+    return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
 
 
 def used_columns(pattern: Any) -> list[bool]:

@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ocp.audit import check_belongs
 from ocp.boundary import NODES, BoundaryProblem
 from ocp.collocation import Collocation
 from ocp.envelope import Extremal, cost_gradient
@@ -23,8 +24,10 @@ from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
 from ocp.interpolation import PiecewisePolynomial
+from ocp.minimality import not_least
 from ocp.newton import Found, newton
 from ocp.problem import Problem
+from ocp.seeding import read_unknowns
 from ocp.solution import Solution
 from ocp.switching import Arcs, read_arcs
 
@@ -59,10 +62,13 @@ class Indirect:
             raise ProblemError(f"Indirect: shooting must be 'multiple' or 'backward', not {self.shooting!r}")
         for name in ("tolerance", "residual"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and 0 < value < 1):
+            if not (isinstance(value, int | float | np.number) and 0 < value < 1):
                 raise ProblemError(f"Indirect: {name} must be between 0 and 1, not {value!r}")
+        if not isinstance(self.seed, Collocation):
+            raise ProblemError(f"Indirect: seed must be a Collocation(...), not {self.seed!r}")
 
 
+SLACK = 1e-9  # relative, of what rounding may do to times
 Seeder = Callable[[Problem, Any, Any, Any], Solution]  # problem, method, parameters, guess
 
 
@@ -75,6 +81,8 @@ class PreparedIndirect:
 
     def __init__(self, problem: Problem, method: Indirect, seeder: Seeder) -> None:
         began = time.monotonic()
+        if not isinstance(problem, Problem):
+            raise ProblemError(f"a Problem is expected, not {type(problem).__name__}")
         self.problem, self.method, self._seeder = problem, method, seeder
         self.formulation = Formulation(problem)
         self.hamiltonian = Hamiltonian.of(self.formulation)
@@ -94,70 +102,67 @@ class PreparedIndirect:
             ProblemError: Wrong parameters or guess. SolveError: Newton failed, or a control has a singular arc.
         """
         form = self.formulation
+        if not isinstance(parameters, Mapping | None):
+            raise ProblemError(f"parameters must be a dictionary by name, not {parameters!r}")
         p = form.parameter_vector(dict(parameters or {}))
         bounds = form.bound_values(p)
         note = ""
         if isinstance(guess, Solution):
             seed = guess
-            if set(seed.costates) != set(form.states):
-                raise ProblemError(f"the guess, plan {seed.name!r}, has no costates of {sorted(form.states)}")
+            check_belongs(form, seed)
+            missing = [name for name in form.states if name not in seed.costates]
+            if missing:
+                raise ProblemError(f"the guess, plan {seed.name!r}, has no costates of {', '.join(missing)}")
         else:
             direct = self.method.seed
             if self.hamiltonian.linear:  # bang-bang controls ring between free collocation points
                 direct = dataclasses.replace(direct, control="held")
-            seed = self._seeder(self.problem, direct, parameters, guess)
+            try:
+                seed = self._seeder(self.problem, direct, parameters, guess)
+            except SolveError as error:
+                return self._no_seed(f"the direct solution that was to seed it failed: {error}", error.solution, check)
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
-        arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds, self.method.segments)
+        try:
+            arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds, self.method.segments)
+        except SolveError as error:
+            return self._no_seed(str(error), seed, check)
         system = self.boundary.system(arcs)
-        start, data = self._start(seed, arcs, p, bounds)
+        start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds, backward=self.boundary.backward)
         found = newton(system, start, data, self._scale(start, arcs), self.method.residual)
-        found = self._check_order(found, arcs)
+        found = self._check_order(found, arcs, bounds)
         solution = self._solution(found, arcs, data, p, bounds, note, time.monotonic() - began)
-        if check and not found.success:
+        if check and not solution.success:
             raise SolveError(self._diagnosis(found, solution), solution)
         return solution
 
+    def _no_seed(self, reason: str, seed: Solution | None, check: bool) -> Solution:
+        """Raise SolveError because of a seed that cannot be used, or return that seed as no success."""
+        if check or seed is None:
+            raise SolveError(f"problem {self.problem.name!r}: the indirect method failed: {reason}", seed)
+        return dataclasses.replace(seed, success=False, status=reason)
+
     # ---- before and after ------------------------------------------------------------------------------------
 
-    def _start(
-        self, seed: Solution, arcs: Arcs, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Unknowns and data from the seed."""
-        form = self.formulation
-        horizon = seed.horizon if form.horizon_is_free else float(form.horizon_at(p))
-        times = arcs.times(horizon)
-        fractions = times / horizon
-        sample = seed.at_fraction(fractions)
-        x = np.hstack([sample[name] for name in form.states])
-        stacked = np.hstack([seed.costates[name] for name in form.states])
-        lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in stacked.T])
-        low, high = bounds
-        places = form.bounds.places
-        given = [low[places[k]] == high[places[k]] for k in ("initial", "terminal")]
-        values = [np.where(fixed, low[places[k]], 0.0) for fixed, k in zip(given, ("initial", "terminal"), strict=True)]
-        ends = np.concatenate([given[0], values[0], given[1], values[1]])
-        middle = seed.at_fraction(0.5 * (fractions[:-1] + fractions[1:]))
-        control = (
-            np.hstack([middle[name] for name in form.controls]) if form.controls else np.zeros((len(times) - 1, 0))
-        )
-        guess = np.hstack([control[:, list(self.hamiltonian.smooth)], np.zeros((len(times) - 1, len(form.path)))])
-        data = np.concatenate([[horizon], p, ends, arcs.bang.ravel(), guess.ravel()])
-        if self.method.shooting == "backward":
-            return x[-1], data
-        y: np.ndarray = np.hstack([x, lam])
-        free = [horizon] if form.horizon_is_free else []
-        multipliers = np.zeros(len(form.start) + len(form.end))
-        return np.concatenate([y.ravel(), arcs.switches * horizon, free, multipliers]), data
-
-    def _check_order(self, found: Found, arcs: Arcs) -> Found:
-        """A root whose switches are out of order, or whose horizon is not positive, is no plan."""
+    def _check_order(self, found: Found, arcs: Arcs, bounds: tuple[np.ndarray, np.ndarray]) -> Found:
+        """A root whose switches are out of order, or whose horizon is beyond its bounds, is no plan."""
         if self.method.shooting == "backward" or not found.success:
             return found
         at = self.boundary.layout(arcs)
-        horizon = float(found.unknowns[at["horizon"]][0]) if self.formulation.horizon_is_free else np.inf
-        knots = np.concatenate([[0.0], found.unknowns[at["switches"]], [horizon]])
-        if horizon > 0 and np.all(np.diff(knots) > 0):
+        horizon = np.inf
+        if self.formulation.horizon_is_free:
+            horizon = float(found.unknowns[at["horizon"]][0])
+            place = self.formulation.bounds.places["horizon"][0]
+            low, high = bounds[0][place], bounds[1][place]
+            if not low * (1 - SLACK) <= horizon <= high * (1 + SLACK):
+                status = (
+                    f"the horizon comes out as {horizon:.6g} s, beyond its bounds {low:g} .. {high:g} s; where a bound "
+                    "holds it, fix it there"
+                )
+                return dataclasses.replace(found, success=False, status=status)
+        switches = found.unknowns[at["switches"]]
+        knots = np.concatenate([[0.0], switches, [horizon]])
+        if np.all(np.diff(knots) > -SLACK * np.max(np.abs(switches), initial=0.0)):  # two controls may switch at once
             return found
         status = f"the switches are not in order within the horizon: {np.round(knots[1:], 6).tolist()} s"
         return dataclasses.replace(found, success=False, status=status)
@@ -208,6 +213,10 @@ class PreparedIndirect:
             nu_start,
             nu_end,
         )
+        if found.success:
+            reason = not_least(ham, extremal, p, bounds)
+            if reason:
+                found = dataclasses.replace(found, success=False, status=reason)
         by_parameter = cost_gradient(ham, extremal, p, bounds) if form.np else np.zeros(0)
         breaks = np.concatenate([q[0], [horizon]]) / horizon
         own = np.ones(shape, dtype=bool)
@@ -266,6 +275,8 @@ class PreparedIndirect:
                     if np.any(before != after):
                         cuts.append(bisect(partial(at_bound, first, q), a, b, before))
             cuts = [cut for cut in cuts if cut < 1.0 - 1e-9]
+            if q[1] <= SLACK * (q[0] + q[1]):
+                continue  # an arc between two switches at once
             for a, b in zip(cuts, [*cuts[1:], 1.0], strict=True):
                 piece = np.concatenate([[q[0] + a * q[1], (b - a) * q[1]], q[2:]])
                 pieces.append((self.boundary.advance(first, q, a), piece))
@@ -273,7 +284,7 @@ class PreparedIndirect:
 
     def _diagnosis(self, found: Found, solution: Solution) -> str:
         return (
-            f"problem {self.problem.name!r}: the indirect method failed: {found.status} after {found.steps} Newton "
+            f"problem {self.problem.name!r}: the indirect method failed: {solution.status} after {found.steps} Newton "
             f"steps, residual {found.residual:.2e}\n  try a finer direct solution as guess, more segments, or a direct "
             "method"
         )

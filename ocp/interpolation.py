@@ -9,6 +9,9 @@ import numpy as np
 __all__ = ["PiecewisePolynomial", "barycentric_weights", "differentiation_matrix", "lagrange"]
 
 
+TOUCHING = 1e-100  # a place nearer to a node than this is the node: its barycentric weight would overflow
+
+
 @dataclass(frozen=True)
 class PiecewisePolynomial:
     """One polynomial a piece, given by its values at nodes.
@@ -47,7 +50,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     if len(nodes) == 1:
         return np.ones((len(at), 1))
     distance = at[:, None] - nodes[None, :]
-    hit = distance == 0.0
+    hit = np.abs(distance) < TOUCHING
     terms = barycentric_weights(nodes) / np.where(hit, 1.0, distance)
     on_node = hit.any(axis=1, keepdims=True)
     total = np.where(on_node, 1.0, terms.sum(axis=1, keepdims=True))

@@ -10,6 +10,7 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.nlp import Interrupt, interruptible
+from ocp.quiet import quiet
 
 __all__ = ["Found", "newton"]
 
@@ -34,7 +35,8 @@ def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: 
 
     def evaluate(z: np.ndarray) -> np.ndarray:
         try:
-            return np.asarray(residual(z, data).full()).reshape(-1)
+            with quiet():
+                return np.asarray(residual(z, data).full()).reshape(-1)
         except RuntimeError:  # the integration broke down: as bad as can be
             return np.full(z.size, np.inf)
 
@@ -54,11 +56,19 @@ def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: 
             if interrupt.stop or steps == STEPS:
                 break
             try:
-                step = np.asarray(ca.solve(jacobian(z, data), ca.DM(-value), "qr").full()).reshape(-1)
+                with quiet():
+                    slopes = jacobian(z, data)
             except RuntimeError:
-                return Found(z, size, steps, False, "the integration of the sensitivities broke down")
+                return Found(z, size, steps, polished, "the integration of the sensitivities broke down")
+            try:
+                step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
+            except RuntimeError:
+                step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
-                return Found(z, size, steps, False, "Newton's matrix is singular: the plan is not determined")
+                word = "Newton's matrix is singular: the plan is not determined"
+                return Found(
+                    z, size, steps, polished, f"Converged in {steps} Newton steps; {word}" if polished else word
+                )
             length = 1.0
             for _ in range(HALVINGS):
                 trial = z + length * step

@@ -24,10 +24,8 @@ __all__ = ["SOLVERS", "Interrupt", "Outcome", "build_solver", "call_solver", "in
 IPOPT = {
     "tol": 1e-10,
     "constr_viol_tol": 1e-9,
-    "dual_inf_tol": 1e-6,
     "acceptable_tol": 1e-8,
     "acceptable_constr_viol_tol": 1e-8,
-    "acceptable_dual_inf_tol": 1e-5,
     "acceptable_iter": 10,
     "max_iter": 1000,
     "bound_relax_factor": 0.0,
@@ -52,6 +50,8 @@ ADVICE = {
 }
 FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
 FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
+HUGE = 1e20
+ROUNDING = 1e-8  # of the residuals at which ipopt cannot move any more, relative to variables and multipliers
 SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -129,13 +129,14 @@ def build_solver(
     own = {**defaults, **options}
     if not own["print_level"] and "max_iter" in own:
         settings["show_eval_warnings"] = False
-    progress = None
+    progress, nlp = None, program.nlp
     if solver == "ipopt":
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
     else:
         assert stages is not None
+        nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
         # this interface has no options for ready-made derivatives; it looks for them in its cache under these names
         settings |= {
             "cache": fatrop_functions(program),
@@ -146,7 +147,7 @@ def build_solver(
             "N": len(stages.states) - 1,
         }
     try:
-        return ca.nlpsol("solver", solver, program.nlp, {**settings, solver: own}), progress
+        return ca.nlpsol("solver", solver, nlp, {**settings, solver: own}), progress
     except RuntimeError as error:
         raise ProblemError(f"{solver} does not take these options {options!r}: {last_line(error)}") from error
 
@@ -156,12 +157,13 @@ def fatrop_functions(program: Program) -> dict[str, Any]:
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     x, p = ca.MX.sym("x", n), ca.MX.sym("p", n_p)
     sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
-    gradient, jacobian = program.gradient(x, p)[1], program.jacobian(x, p)[1]
+    # fatrop loops for ever on what is not a number; from what is huge it steps back
+    gradient, (rows, jacobian) = finite(program.gradient(x, p)[1]), map(finite, program.jacobian(x, p))
     lagrangian = sigma * gradient + ca.mtimes(jacobian.T, lam)
-    hessian = ca.triu2symm(program.hessian(x, p, sigma, lam))
+    hessian = ca.triu2symm(finite(program.hessian(x, p, sigma, lam)))
     functions = (
         ca.Function("nlp_grad_f", [x, p], [gradient], ["x", "p"], ["grad_f_x"]),
-        program.jacobian,
+        ca.Function("nlp_jac_g", [x, p], [rows, jacobian], ["x", "p"], ["g", "jac_g_x"]),
         ca.Function(
             "nlp_hess_l",
             [x, p, sigma, lam],
@@ -173,21 +175,31 @@ def fatrop_functions(program: Program) -> dict[str, Any]:
     return {function.name(): function for function in functions}
 
 
+def finite(expression: Any) -> Any:
+    """The same with a huge number for every entry that is not a number."""
+    return ca.MX(expression.sparsity(), ca.fmin(expression.nz[:], HUGE))
+
+
 def call_solver(
     solver: Any,
     progress: Progress | None,
     arguments: dict[str, np.ndarray],
     options: dict[str, Any] | None = None,
 ) -> Outcome:
-    """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned."""
+    """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned.
+
+    fatrop has no way to be stopped; what it ends with counts as interrupted.
+    """
     began = time.monotonic()
+    asked = progress if progress is not None else Interrupt()
     if progress is not None:
         progress.open(arguments["lbg"], arguments["ubg"])
     try:
-        with interruptible(progress):
+        with interruptible(asked):
             result = solver(**(arguments if progress is not None else tightened(arguments)))
     except RuntimeError as error:
-        if "option not supported" in str(error).lower():  # fatrop looks at its options only now
+        words = str(error).lower()
+        if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}") from error
         raise
     finally:
@@ -197,12 +209,16 @@ def call_solver(
     word = str(stats.get("return_status", ""))
     if "fatrop" in stats:
         word = FATROP_WORDS.get(int(stats["fatrop"]["return_flag"]), "Error_In_Step_Computation")
-    if progress is not None and progress.stop:
+    if word == "Search_Direction_Becomes_Too_Small" and as_good_as_rounding_allows(stats, result):
+        word = "Solved_To_Acceptable_Level"
+    if asked.stop:
         word = "User_Requested_Stop"
-    success = bool(stats["success"]) or word in SUCCESSES
+    success = not asked.stop and (bool(stats["success"]) or word in SUCCESSES)
     values = {key: np.asarray(result[key].full()).reshape(-1) for key in ("x", "f", "g", "lam_g")}
     if success and not all(np.all(np.isfinite(v)) for v in values.values()):
         success, word = False, "Invalid_Number_Detected"
+    if word == "Solved_To_Acceptable_Level" and missed(values, arguments) > ROUNDING:
+        success, word = False, "Error_In_Step_Computation"
     advice = "" if success else ADVICE.get(word, "")
     return Outcome(
         values["x"],
@@ -214,6 +230,20 @@ def call_solver(
         int(stats.get("iter_count", 0)),
         time.monotonic() - began,
     )
+
+
+def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:
+    """Whether ipopt stands still at a solution: its tolerances are absolute, and large states round above them."""
+    history = stats["iterations"]
+    states, forces = (max(1.0, float(ca.norm_inf(result[key]))) for key in ("x", "lam_g"))
+    return bool(history["inf_pr"][-1] <= ROUNDING * states and history["inf_du"][-1] <= ROUNDING * forces)
+
+
+def missed(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
+    """Largest violation of the bounds of variables and rows, relative to the largest variable (at least 1)."""
+    gaps = [(arguments[f"lb{k}"] - values[k], values[k] - arguments[f"ub{k}"]) for k in ("x", "g")]
+    worst = max(float(np.max(gap, initial=0.0)) for pair in gaps for gap in pair)
+    return worst / max(1.0, float(np.max(np.abs(values["x"]), initial=0.0)))
 
 
 def tightened(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

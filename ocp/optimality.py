@@ -56,7 +56,8 @@ def minimum_principle(
     values = ca.Function("hamiltonian", symbols, [form.running, lam * form.f])
     running, products = numbers(values, x, u, solution.t, horizon, p, costate)
     hamiltonian = running[:, 0] + products.sum(axis=1)
-    scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
+    least = 1.0 if form.indifferent else 0.0  # without a cost all parts are rounding, and nothing to judge by
+    scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=least))
     if form.nu == 0:
         return Optimality(np.zeros(0), np.zeros(0), 1.0, hamiltonian, scale or 1.0)
 
@@ -91,7 +92,7 @@ def minimum_principle(
     for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
         directions = np.vstack([np.eye(form.nu), g_u[k].reshape(form.nu, -1).T])
         reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
-    parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=0.0))
+    parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
     return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)
 
 

@@ -197,8 +197,12 @@ class Problem:
             check_horizon(f"{what}: lower", constant(low))
             check_order(what, constant(low), constant(high))
             if guess is not None:
-                check_horizon(f"{what}: guess", np.array([float(guess)]))
-                check_inside(f"{what}: guess", np.array([float(guess)]), constant(low), constant(high))
+                number = numeric(f"{what}: guess", guess)
+                if number.size != 1 or np.isnan(number[0]):
+                    raise ProblemError(f"{what}: guess must be one number, not {guess!r}")
+                check_horizon(f"{what}: guess", number)
+                check_inside(f"{what}: guess", number, constant(low), constant(high))
+                guess = float(number[0])
         self.declared.horizon = Horizon(symbol, low, high, guess, value is not None)
         return symbol
 
@@ -293,8 +297,12 @@ class Problem:
             if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
                 raise ProblemError(f"{what}: size must be a positive integer, not {size!r}")
             return int(size)
-        lengths = {k: stacked(v).numel() if is_symbolic(v) else np.size(v) for k, v in given.items() if not callable(v)}
-        sizes = {k: n for k, n in lengths.items() if given[k] is not None and n != 1}
+        plain = {f"{what}: {k}": v for k, v in given.items() if v is not None and not callable(v)}
+        lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in plain.items()}
+        for label, n in lengths.items():
+            if n == 0:
+                raise ProblemError(f"{label} is empty")
+        sizes = {label.rpartition(" ")[2]: n for label, n in lengths.items() if n != 1}
         if len(set(sizes.values())) > 1:
             detail = ", ".join(f"{k} has {n}" for k, n in sizes.items())
             raise ProblemError(f"{what}: sizes do not match: {detail} entries")
@@ -305,7 +313,8 @@ class Problem:
         if value is None:
             return self.symbols(ca.DM.ones(size, 1) * default)
         if is_symbolic(value):
-            expression = self._expression(what, value, [v.symbol for v in self.declared.parameters.values()])
+            known = [v.symbol for v in self.declared.parameters.values()]
+            expression = self._expression(what, value, known, finite=False)  # nan frees an entry
         else:
             array = numeric(what, value)
             expression = self.symbols(ca.DM(array))
@@ -333,14 +342,17 @@ class Problem:
         if array.size not in (1, size):
             raise ProblemError(f"{what}: guess has {array.size} entries, {size} expected")
 
-    def _expression(self, what: str, value: Value, known: Sequence[Any]) -> Any:
+    def _expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
-            expression = stacked(value)
+            expression = stacked(what, value)
             if not isinstance(expression, self.symbols):
                 have, want = type(expression).__name__, self.symbols.__name__
                 raise ProblemError(f"{what} is made of {have} symbols, the problem of {want} symbols")
+            entries = ca.vertsplit(expression) if isinstance(expression, ca.SX) and expression.numel() else []
+            if finite and not all(np.isfinite(float(entry)) for entry in entries if entry.is_constant()):
+                raise ProblemError(f"{what} is not finite: {expression}")
         else:
             array = numeric(what, value)
             if not np.all(np.isfinite(array)):
@@ -387,6 +399,8 @@ class Problem:
             if name in other:
                 raise ProblemError(f"{what}: a constraint of this name exists already")
         vector = self._expression(what, expression, known)
+        if vector.numel() == 0:
+            raise ProblemError(f"{what} is empty")
         if lower is None and upper is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
@@ -400,9 +414,12 @@ def is_symbolic(value: Any) -> bool:
     return isinstance(value, ca.SX | ca.MX)
 
 
-def stacked(value: Any) -> Any:
+def stacked(what: str, value: Any) -> Any:
     """An expression as one column; a list or tuple of expressions and numbers is stacked."""
-    return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
+    try:
+        return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
+    except NotImplementedError as error:
+        raise ProblemError(f"{what}: a flat list of numbers and expressions is expected, not {value!r}") from error
 
 
 def identity(symbol: Any) -> int:
@@ -412,11 +429,18 @@ def identity(symbol: Any) -> int:
 
 def numeric(what: str, value: Any) -> np.ndarray:
     """A value as a flat float array, or ProblemError where it is none."""
+    return table(what, value).reshape(-1)
+
+
+def table(what: str, value: Any) -> np.ndarray:
+    """A value as a float array of its own shape, or ProblemError where it is none."""
     try:
-        array = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+        plain = value.full() if isinstance(value, ca.DM) else value
+        if np.asarray(plain).dtype.kind in "SU":  # numpy would read digits in a string
+            raise TypeError("a string")
+        return np.asarray(plain, dtype=float)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{what}: numbers or expressions are expected, not {value!r}") from error
-    return array.reshape(-1)
 
 
 def constant(expression: Any) -> np.ndarray:

@@ -57,8 +57,12 @@ def refine(
     Warns:
         RefinementWarning: The cap (or the least width) stopped it before the tolerance was reached.
     """
-    if not (np.isfinite(tolerance) and tolerance > 0):
+    if not isinstance(method, Collocation | MultipleShooting):
+        raise ProblemError(f"refine: Collocation(...) or MultipleShooting(...) is expected, not {method!r}")
+    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
         raise ProblemError(f"refine: tolerance must be positive and finite, not {tolerance!r}")
+    if not isinstance(max_intervals, int | np.integer):
+        raise ProblemError(f"refine: max_intervals must be a whole number, not {max_intervals!r}")
     if max_intervals < method.intervals:
         raise ProblemError(f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given")
     order = method.degree + 1 if isinstance(method, Collocation) else 4

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.formulation import Formulation
+from ocp.quiet import quiet
 from ocp.solution import Solution
 
 __all__ = ["TOLERANCE", "Reintegration", "reintegrate"]
@@ -21,6 +22,7 @@ OPTIONS = {
     "quad_err_con": True,
     "linear_multistep_method": "adams",  # between jumps of the control a plan is smooth
     "show_eval_warnings": False,
+    "disable_internal_warnings": True,
 }
 
 
@@ -80,14 +82,16 @@ def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, samples: i
     for k in range(n):
         local[k, 0], states[k, 0] = starts[k], state
         try:
-            out = integrator(x0=starts[k], p=constants[:, k])
+            with quiet():
+                out = integrator(x0=starts[k], p=constants[:, k])
             local[k, 1:] = out["xf"].full().T
         except RuntimeError:
             local[k, 1:] = np.nan
         if broke_down is not None:
             continue
         try:
-            out = integrator(x0=state, p=constants[:, k])
+            with quiet():
+                out = integrator(x0=state, p=constants[:, k])
             states[k, 1:] = out["xf"].full().T
             cost += float(out["qf"][-1])
         except RuntimeError:

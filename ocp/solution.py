@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -59,7 +59,7 @@ class Refinement:
     reached: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The result of a solve.
 
@@ -129,7 +129,10 @@ class Solution:
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
         """
-        times = np.asarray(time, dtype=float)
+        try:
+            times = np.asarray(time, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ProblemError(f"a time or an array of times is expected, not {time!r}") from error
         slack = 1e-12 * self.horizon
         if not np.all((times >= -slack) & (times <= self.horizon + slack)):
             raise ProblemError(f"time {time!r} is outside the plan, 0 to {self.horizon:g} s")
@@ -184,14 +187,14 @@ class Solution:
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
-        arrays["head"] = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".part")
+        arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
+        temporary = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
         try:
-            with os.fdopen(handle, "wb") as stream:
+            with open(temporary, "xb") as stream:
                 np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
             os.replace(temporary, target)
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
 
     @classmethod
@@ -202,7 +205,8 @@ class Solution:
             ProblemError: The file is not such a file, or of an unknown version.
         """
         try:
-            with np.load(Path(path), allow_pickle=False) as archive:
+            # opened here, because numpy leaves a broken archive open
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
                 arrays = {key: archive[key] for key in archive.files}
             head = json.loads(arrays.pop("head").tobytes().decode())
             version = head.pop("version")
@@ -226,10 +230,17 @@ class Solution:
             return cls(**head, **fields, refinement=refinement)
         except FileNotFoundError:
             raise
-        except (KeyError, ValueError, TypeError, OSError) as error:
-            if isinstance(error, ProblemError):
-                raise
+        except ProblemError:
+            raise
+        except Exception as error:  # what zip, zlib, numpy and JSON say of broken bytes is of many kinds
             raise ProblemError(f"{path} is not a saved solution: {error}") from error
+
+
+def plain(value: Any) -> Any:
+    """A number of numpy in the settings of a method as one of Python, for JSON."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{value!r} cannot be saved")
 
 
 def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from ocp.fragment import Fragment
 from ocp.guess import initial_point
 from ocp.indirect import Indirect, PreparedIndirect
 from ocp.interpolation import PiecewisePolynomial
-from ocp.nlp import Outcome, build_solver, call_solver
+from ocp.nlp import SOLVERS, Outcome, build_solver, call_solver
 from ocp.problem import Problem
 from ocp.solution import Solution
 
@@ -46,14 +47,14 @@ class Prepared:
         began = time.monotonic()
         if not isinstance(problem, Problem):
             raise ProblemError(f"a Problem is expected, not {type(problem).__name__}")
-        if not callable(getattr(method, "transcribe", None)):
+        if isinstance(method, type) or not callable(getattr(method, "transcribe", None)):
             raise ProblemError(f"a method such as Collocation(...) is expected, not {method!r}")
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         self._solver, self._progress = build_solver(
-            self.program, solver, dict(options), self.fragment.stages, problem.name
+            self.program, solver, by_name("options", options), self.fragment.stages, problem.name
         )
         self.seconds = time.monotonic() - began
 
@@ -65,7 +66,7 @@ class Prepared:
     ) -> Solution:
         """Solve with these parameters from this guess; see :func:`solve`."""
         form, fragment = self.formulation, self.fragment
-        p = form.parameter_vector(dict(parameters or {}))
+        p = form.parameter_vector(by_name("parameters", parameters))
         bounds = form.bound_values(p)
         lower, upper = bounds
         lbx, ubx = lower[fragment.variable_bounds], upper[fragment.variable_bounds]
@@ -79,10 +80,17 @@ class Prepared:
             "ubg": upper[fragment.row_bounds],
         }
         outcome = call_solver(self._solver, self._progress, arguments)
-        solution = self._solution(outcome, p)
+        try:
+            solution = self._solution(outcome, p)
+        except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
+            raise SolveError(self._diagnosis(outcome, arguments, self._horizon(outcome, p))) from error
         if check and not outcome.success:
             raise SolveError(self._diagnosis(outcome, arguments, solution.horizon), solution)
         return solution
+
+    def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
+        index = self.fragment.horizon
+        return float(self.formulation.horizon_at(p) if index is None else outcome.variables[index])
 
     def _at_bounds(self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
         """Which states and controls sit at their bounds, and for how much of the plan."""
@@ -108,7 +116,7 @@ class Prepared:
     def _solution(self, outcome: Outcome, p: np.ndarray) -> Solution:
         form, fragment = self.formulation, self.fragment
         v = outcome.variables
-        horizon = float(form.horizon_at(p)) if fragment.horizon is None else float(v[fragment.horizon])
+        horizon = self._horizon(outcome, p)
         states, controls = fragment.interpolants(v, p, horizon)
         piece, place = fragment.report
         mesh = fragment.mesh
@@ -183,28 +191,52 @@ class Prepared:
             np.add.at(push[1], index, np.maximum(force, 0.0))
         return np.asarray(direct - form.bounds.pull(p, push))
 
+    def _residuals(
+        self, v: np.ndarray, arguments: dict[str, np.ndarray]
+    ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+        """Label, fraction, value and miss of every row and of the bounds of every variable, evaluated anew."""
+        form, fragment = self.formulation, self.fragment
+        try:
+            g = np.asarray(self.program.values(v, arguments["p"])[1].full()).reshape(-1)
+        except RuntimeError:  # an integrator breaks down
+            g = np.full(fragment.n_rows, np.nan)
+        names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
+        bounds = [
+            f"{'' if role == 'horizon' else role + ' '}{names[role][entry]}"
+            for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+        ]
+        value = np.concatenate([g, v])
+        lower, upper = (np.concatenate([arguments[s + "g"], arguments[s + "x"]]) for s in ("lb", "ub"))
+        at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
+        labels = [*fragment.row_labels, *(f"bound of {name}" for name in bounds)]
+        return labels, at, value, np.maximum(lower - value, value - upper)
+
     def _diagnosis(self, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> str:
         """What went wrong: the worst residuals by constraint, state and time."""
-        fragment = self.fragment
-        g = outcome.rows
-        miss = np.maximum(arguments["lbg"] - g, g - arguments["ubg"])
+        labels, at, value, miss = self._residuals(outcome.variables, arguments)
         lines = [f"problem {self.problem.name!r}: {self.solver_name} ended with {outcome.status}"]
         lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
-        broken = np.flatnonzero(~np.isfinite(g))
+        broken = np.flatnonzero(~np.isfinite(value))
         for i in broken[:WORST]:
-            lines.append(f"  {fragment.row_labels[i]} is not finite at {fragment.row_fractions[i] * horizon:.4g} s")
+            lines.append(f"  {labels[i]} is not finite at {at[i] * horizon:.4g} s")
         seen: set[str] = set()
         for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
             if len(seen) == WORST or not miss[i] > 1e-8:
                 break
-            label = fragment.row_labels[i]
-            if label not in seen:
-                seen.add(label)
-                lines.append(f"  {label} is missed by {miss[i]:.3g} at {fragment.row_fractions[i] * horizon:.4g} s")
+            if labels[i] not in seen:
+                seen.add(labels[i])
+                lines.append(f"  {labels[i]} is missed by {miss[i]:.3g} at {at[i] * horizon:.4g} s")
         lines += self._at_bounds(outcome.variables, arguments, horizon)
         if not seen and not broken.size:
             lines.append("  all constraints are met; the plan is feasible but not optimal")
         return "\n".join(lines)
+
+
+def by_name(what: str, values: Any) -> dict[str, Any]:
+    """A dictionary or nothing as a dictionary of its own; ProblemError for anything else."""
+    if not isinstance(values, Mapping | None):
+        raise ProblemError(f"{what} must be a dictionary by name, not {values!r}")
+    return dict(values or {})
 
 
 def compiler_options() -> dict[str, Any]:
@@ -244,7 +276,8 @@ def prepare(
 
     Args:
         problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end).
+        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end). For the
+            indirect method, of the direct solution that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
 
@@ -252,12 +285,15 @@ def prepare(
         ProblemError: The problem is not complete, or the method or solver cannot take it.
     """
     if isinstance(method, Indirect):
-        return PreparedIndirect(problem, method, _seed)
+        if solver not in SOLVERS:
+            raise ProblemError(f"unknown solver {solver!r}; known: {', '.join(SOLVERS)}")
+        seeder = partial(_seed, solver=solver, options=by_name("options", options), compiled=compiled)
+        return PreparedIndirect(problem, method, seeder)
     return Prepared(problem, method, solver, options or {}, compiled)
 
 
-def _seed(problem: Problem, method: Method, parameters: Any, guess: Any) -> Solution:
-    return solve(problem, method, parameters=parameters, guess=guess)
+def _seed(problem: Problem, method: Method, parameters: Any, guess: Any, **how: Any) -> Solution:
+    return prepare(problem, method, **how).solve(parameters, guess)
 
 
 def solve(

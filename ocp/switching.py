@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ocp.errors import SolveError
+from ocp.errors import ProblemError, SolveError
+from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
 from ocp.solution import Solution
 
@@ -16,6 +17,7 @@ __all__ = ["Arcs", "read_arcs"]
 INSIDE = 0.1  # share of its range by which a control must be off both bounds to count as inside them
 SINGULAR = 0.1  # share of the horizon that a control may spend inside its bounds, for the sake of coarse seeds
 LONG = 3  # and the number of the seed's samples in a row
+NOISE = 1e-6  # share of the largest value of a switching function that says nothing of its sign
 CHATTER = 3  # arcs in a row that are shorter than an interval of the seed
 
 
@@ -63,19 +65,21 @@ def read_arcs(
     form = ham.form
     if not ham.linear:
         return Arcs(np.zeros(0), (), (segments,), np.zeros((segments, 0)))
-    index = form.bounds.places["control"][list(ham.linear)]
+    index_of = list(ham.linear)
+    index = form.bounds.places["control"][index_of]
     low, high = bounds[0][index], bounds[1][index]
     m = len(seed.t)
-    x, lam, u = (np.hstack([pool[name] for name in places]) for pool, places in (
+    x, lam, u = (np.hstack([np.zeros((m, 0)), *[pool[name] for name in places]]) for pool, places in (
         (seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls)))  # fmt: skip
     linear = u[:, list(ham.linear)]
     guess = np.hstack([u[:, list(ham.smooth)], np.zeros((m, len(form.path)))])
     ones = np.ones((1, m))
     arguments = (x.T, lam.T, seed.t[None, :], seed.horizon * ones, p[:, None] * ones, linear.T, guess.T)
     slope = np.asarray(outputs.map(m)(*arguments)[3].full()).T
-    check_singular(form.control_labels, ham.linear, seed, low, high)
+    own_low, own_high = own_bounds(form, seed, bounds)
+    check_singular(form.control_labels, ham.linear, seed, own_low[index_of], own_high[index_of], list(form.controls))
 
-    at_lower = slope > 0
+    at_lower = signs(slope) > 0
     events: list[tuple[float, int]] = []
     for j in range(len(ham.linear)):
         for k in np.flatnonzero(at_lower[1:, j] != at_lower[:-1, j]):
@@ -96,14 +100,50 @@ def read_arcs(
     return Arcs(switches, tuple(j for _, j in events), counts, np.array(values))
 
 
+def own_bounds(
+    form: Formulation, seed: Solution, bounds: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the controls that the seed was solved with, which may be other ones. Shape (nu,) each."""
+    source = form if seed.problem is None else Formulation(seed.problem)
+    try:
+        low, high = source.bound_values(source.parameter_vector(seed.parameters))
+    except ProblemError:  # loaded, and solved with other parameters altogether
+        source, (low, high) = form, bounds
+    places = source.bounds.places["control"]
+    index = np.concatenate([places[source.controls[name]] for name in form.controls])
+    return low[index], high[index]
+
+
+def signs(slope: np.ndarray) -> np.ndarray:
+    """Signs of sampled switching functions (M, n); one too small to tell takes that of the next clear one or the last.
+
+    A switching function that vanishes at an end, as of a free state there, has the noise of the seed for its sign.
+    """
+    found = np.sign(slope)
+    for j in range(slope.shape[1]):
+        clear = np.flatnonzero(np.abs(slope[:, j]) > NOISE * np.max(np.abs(slope[:, j])))
+        if clear.size:
+            nearest = np.clip(np.searchsorted(clear, np.arange(len(slope))), 0, len(clear) - 1)
+            found[:, j] = np.sign(slope[clear[nearest], j])
+    return np.asarray(found)
+
+
 def check_singular(
-    labels: tuple[str, ...], linear: tuple[int, ...], seed: Solution, low: np.ndarray, high: np.ndarray
+    labels: tuple[str, ...],
+    linear: tuple[int, ...],
+    seed: Solution,
+    low: np.ndarray,
+    high: np.ndarray,
+    order: list[str],
 ) -> None:
     """Raise SolveError where a linear control of the seed stays inside its bounds for long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
-    values = samples.values.reshape(len(at), -1)[:, list(linear)]
+    own = {name: np.arange(seed.controls[name].shape[1]) for name in seed.controls}  # the seed's own order
+    offsets = dict(zip(own, np.cumsum([0, *[len(i) for i in own.values()]]), strict=False))
+    columns = np.concatenate([offsets[name] + own[name] for name in order])[list(linear)]
+    values = samples.values.reshape(len(at), -1)[:, columns]
     for j, index in enumerate(linear):
         margin = INSIDE * (high[j] - low[j])
         inside = (values[:, j] > low[j] + margin) & (values[:, j] < high[j] - margin)

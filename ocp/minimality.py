@@ -1,0 +1,95 @@
+"""Does the control found for an extremal make the Hamiltonian least? First and second order, and at its bounds.
+
+Newton's method makes the Hamiltonian stationary and switches where told; a maximum, a saddle or a wrong order of
+bang-bang arcs solves these equations as well. Bryson, Ho 1975, section 3.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.envelope import Extremal
+from ocp.hamiltonian import Hamiltonian
+
+__all__ = ["not_least"]
+
+NEAR = 1e-9  # a bound nearer than this, relative to its range, holds the control
+SLOPE = 1e-6  # largest slope of H against what holds the control, relative to its parts
+CURVED = 1e-8  # most negative curvature of H in the free controls, relative to its largest entry
+
+
+def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+    """What keeps the controls of an extremal from making the Hamiltonian least, or "".
+
+    Each sample must be stationary in the free controls, push those at a bound outwards, and not curve downwards.
+    """
+    form = ham.form
+    if not form.nu:
+        return ""
+    u = path.controls.reshape(-1, form.nu)
+    index = form.bounds.places["control"]
+    low, high = bounds[0][index], bounds[1][index]
+    with np.errstate(invalid="ignore"):
+        width = np.where(np.isfinite(high - low), high - low, 1.0)
+    at_low, at_high = u <= low + NEAR * width, u >= high - NEAR * width
+    slope, parts, curvature, rows, by_control = samples(ham, path, p)
+    if not all(np.all(np.isfinite(v)) for v in (slope, curvature, rows)):
+        return "the Hamiltonian is not finite along the plan"
+
+    wrong = np.where(at_low, np.maximum(-slope, 0.0), np.where(at_high, np.maximum(slope, 0.0), np.abs(slope)))
+    wrong = np.where(at_low & at_high, 0.0, wrong) / max(float(np.max(parts)), np.finfo(float).tiny)
+    k, i = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
+    if wrong[k, i] > SLOPE:
+        label, time = form.control_labels[i], path.t.ravel()[k]
+        if i in ham.linear:
+            return (
+                f"control {label!r} is at the wrong bound at {time:.4g} s: the Hamiltonian would be less at the other; "
+                "its switches are not those of the seed, or it has a singular arc or chatters; seed it more finely or "
+                "use a direct method with held controls"
+            )
+        return f"the Hamiltonian is not least in control {label!r} at {time:.4g} s"
+    if len(form.path) and np.max(np.abs(rows)) > SLOPE * max(1.0, float(np.max(np.abs(u)))):
+        return "the path equalities are not met"
+    free = ~(at_low | at_high)
+    for k in np.flatnonzero(free.any(axis=1)):
+        inside = curvature[k][np.ix_(free[k], free[k])]
+        tangent = null_space(by_control[k][:, free[k]])
+        least = np.min(np.linalg.eigvalsh(tangent.T @ inside @ tangent), initial=0.0)
+        if least < -CURVED * np.max(np.abs(curvature[k])):
+            names = ", ".join(
+                repr(label) for label, is_free in zip(form.control_labels, free[k], strict=True) if is_free
+            )
+            return f"the Hamiltonian is stationary but not least in control {names} at {path.t.ravel()[k]:.4g} s"
+    return ""
+
+
+def samples(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list[np.ndarray]:
+    """At K samples: dH/du and the sum of sizes of its parts (K, nu), d2H/du2 (K, nu, nu), path (K, m), its Jacobian."""
+    form = ham.form
+    by_control = ca.jacobian(ham.rows, form.u)
+    parts = ca.fabs(ca.gradient(form.running, form.u)) + ca.mtimes(
+        ca.fabs(ca.jacobian(form.f, form.u)).T, ca.fabs(ham.lam)
+    )
+    hessian, slope = ca.hessian(ham.value, form.u)
+    outputs = [slope, parts, hessian, ham.rows, by_control]
+    symbols = [form.x, form.u, ham.lam, ham.mu, form.t, form.T, form.p]
+    function = ca.Function("curvature", symbols, [ca.densify(ca.vec(out)) for out in outputs], {"cse": True})
+    count = path.t.size
+    values = [v.reshape(count, -1).T for v in (path.states, path.controls, path.costates, path.multipliers)]
+    ones = np.ones((1, count))
+    found = function.map(count)(*values, path.t.reshape(1, -1), path.horizon * ones, p[:, None] * ones)
+    first, size, second, rows, jacobian = (np.asarray(v.full()).T for v in found)
+    square = second.reshape(count, form.nu, form.nu)
+    return [first, size, square, rows, jacobian.reshape(count, form.nu, len(form.path)).transpose(0, 2, 1)]
+
+
+def null_space(rows: np.ndarray) -> Any:
+    """Orthonormal directions (n, k) that ``rows`` (m, n) do not see."""
+    if rows.shape[0] == 0:
+        return np.eye(rows.shape[1])
+    _, sizes, directions = np.linalg.svd(rows)
+    rank = int(np.sum(sizes > 1e-12 * max(1.0, float(np.max(sizes, initial=0.0)))))
+    return directions[rank:].T

@@ -1,0 +1,267 @@
+"""The audit's costate equation and end conditions: closed forms pass, tampered costates do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
+from ocp.interpolation import PiecewisePolynomial
+from tests.ocp.extremals import EXTREMA
+from tests.ocp.problems import SOLVERS, Method, energy, started_anywhere, van_der_pol
+
+EQUATION, ENDS, HORIZON = (
+    "costate equation, relative",
+    "transversality, relative",
+    "condition of the free horizon, relative",
+)
+
+DIRECT: dict[str, Method] = {
+    "radau": Collocation(30),
+    "legendre": Collocation(30, scheme="legendre"),
+    "radau-held": Collocation(60, control="held"),
+    "rk4-linear": MultipleShooting(60, steps=2, control="linear"),
+    "rk4-held": MultipleShooting(60, steps=2),
+}
+every_method = pytest.mark.parametrize("method", DIRECT)
+both_solvers = pytest.mark.parametrize("solver", SOLVERS)
+
+
+@cache
+def free_end(method: str, solver: str = "ipopt") -> Solution:
+    return solve(started_anywhere(1.5), DIRECT[method], parameters={"x0": [0.8, -0.3]}, solver=solver)
+
+
+def bolza(**ends: Any) -> Problem:
+    """x' = u, x: 0 -> 1 in a free time, min T + int u^2/2: T = 1/sqrt 2, H = -1."""
+    problem = Problem("Bolza")
+    x = problem.state("x", initial=0.0, **ends)
+    u = problem.control("u", guess=1.0)
+    horizon = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2 / 2, terminal=horizon)
+    return problem
+
+
+def tampered(solution: Solution, change: Any) -> Solution:
+    """The plan with costates changed: ``change`` takes fractions (M, 1) and costates (M, nx) stacked."""
+    old = solution.costate_interpolant
+    places = (old.breaks[:-1, None] + np.diff(old.breaks)[:, None] * old.nodes)[..., None]
+    values = change(places, old.values)
+    fractions = (solution.t / solution.horizon)[:, None]
+    stacked = change(fractions, np.hstack(list(solution.costates.values())))
+    cuts = np.cumsum([v.shape[1] for v in solution.costates.values()])[:-1]
+    names = dict(zip(solution.costates, np.split(stacked, cuts, axis=1), strict=True))
+    return replace(solution, costates=names, costate_interpolant=PiecewisePolynomial(old.breaks, old.nodes, values))
+
+
+def failed(audit: Audit) -> set[str]:
+    return {finding.name for finding in audit.failures}
+
+
+@both_solvers
+@every_method
+def test_costates_of_direct_solutions_obey_their_own_equation(method: str, solver: str) -> None:
+    audit = free_end(method, solver).audit()
+    assert audit.passed, str(audit)
+    assert audit.adjoint.reason == ""
+    assert audit[EQUATION].value < 2e-3
+    assert audit[ENDS].value < 1e-6
+
+
+def test_the_integrated_costates_converge_with_the_mesh() -> None:
+    """Radau-3 costates are of fifth order at the nodes; three halvings gain well over a factor of a hundred."""
+    errors = []
+    for n in (4, 8, 16, 32):
+        plan = solve(started_anywhere(1.5), Collocation(n), parameters={"x0": [0.8, -0.3]})
+        errors.append(plan.audit().adjoint.error)
+    assert np.all(np.diff(errors) < 0)
+    assert errors[-1] < errors[0] / 100
+
+
+def test_the_integrated_costates_are_the_closed_form() -> None:
+    """Double integrator, least energy: lambda = (-12, 12 t - 6)."""
+    adjoint = solve(energy(), Collocation(10)).audit().adjoint
+    assert adjoint.integrated is not None
+    expected = np.column_stack([-12 + 0 * adjoint.t, 12 * adjoint.t - 6])
+    np.testing.assert_allclose(adjoint.integrated, expected, atol=1e-8)
+    np.testing.assert_allclose(adjoint.plan, expected, atol=1e-8)
+    assert adjoint.transversality == pytest.approx(0, abs=1e-8)
+    assert adjoint.horizon == 0
+    assert adjoint.scale == pytest.approx(12, abs=1e-7)
+
+
+@every_method
+def test_costates_scaled_or_shifted_or_bent_fail(method: str) -> None:
+    plan = free_end(method)
+    assert failed(tampered(plan, lambda s, lam: 1.1 * lam).audit()) & {EQUATION, ENDS, "stationarity, relative"}
+    shifted = tampered(plan, lambda s, lam: lam + 0.1 * np.max(np.abs(lam))).audit()
+    assert ENDS in failed(shifted)
+    bent = tampered(plan, lambda s, lam: lam + 0.1 * np.max(np.abs(lam)) * np.sin(np.pi * s)).audit()
+    assert EQUATION in failed(bent)
+    assert ENDS not in failed(bent)  # both ends are left alone
+
+
+def test_costates_of_the_other_sign_fail() -> None:
+    audit = tampered(solve(van_der_pol(), Collocation(20)), lambda s, lam: -lam).audit()
+    assert not audit.passed
+    assert EQUATION in failed(audit)
+
+
+@every_method
+def test_given_ends_ask_nothing_of_the_costates_and_free_ends_ask_for_the_slope_of_the_cost(method: str) -> None:
+    given = solve(energy(), DIRECT[method]).audit()
+    assert given[ENDS].value == pytest.approx(0, abs=1e-7)
+    plan = free_end(method)
+    x = plan["x"][-1]
+    np.testing.assert_allclose(plan.costate("x")[-1], [4 * x[0], np.cos(x[1])], atol=1e-5)
+
+
+def constrained(what: str) -> Problem:
+    """Two states, an end on a circle or beyond it, a start on a line, or ends tied together."""
+    problem = Problem(what)
+    x = problem.state("x", 2, initial=None if what in ("line", "cycle") else [0.6, 0.0], guess=[0.5, 0.5])
+    u = problem.control("u", 2)
+    problem.horizon(1.0)
+    problem.dynamics(x, ca.vertcat(x[1] + u[0], u[1] - ca.sin(x[0]) + ca.cos(2 * np.pi * problem.time)))
+    if what == "circle":
+        problem.end("circle", ca.sumsqr(x), 1.0, 1.0)
+    elif what == "beyond":
+        problem.end("circle", ca.sumsqr(x), lower=1.0)
+    elif what == "slack":
+        problem.end("circle", ca.sumsqr(x), upper=100.0)
+    elif what == "line":
+        problem.start("line", x[0] + 2 * x[1], 1.0, 1.0)
+    elif what == "cycle":
+        problem.end("cycle", x - problem.at_start(x), 0, 0)
+    problem.minimize(running=ca.sumsqr(u) / 2 + (x[0] - 0.5) ** 2, terminal=ca.sumsqr(x) if what != "cycle" else 0)
+    return problem
+
+
+@both_solvers
+@pytest.mark.parametrize("what", ["circle", "beyond", "slack", "line", "cycle"])
+def test_end_conditions_explain_the_costates_at_the_ends(what: str, solver: str) -> None:
+    """And only along their own slopes: a push aside of the circle's is found."""
+    plan = solve(constrained(what), Collocation(20), solver=solver)
+    audit = plan.audit()
+    assert audit.passed, str(audit)
+    assert audit[ENDS].value < 1e-6
+    size = np.max(np.abs(np.hstack(list(plan.costates.values()))))
+    end = plan["x"][-1]
+    aside = np.array([-end[1], end[0]]) / np.linalg.norm(end)
+    if what in ("circle", "beyond"):
+        along = tampered(plan, lambda s, lam: lam + 0.2 * size * s**8 * end / np.linalg.norm(end)).audit()
+        assert along[ENDS].value < 1e-6
+    sideways = tampered(plan, lambda s, lam: lam + 0.2 * size * s**8 * aside).audit()
+    assert ENDS in failed(sideways)
+
+
+@pytest.mark.parametrize("what", ["line", "cycle"])
+def test_conditions_at_the_start_are_looked_at_too(what: str) -> None:
+    plan = solve(constrained(what), Collocation(20))
+    size = np.max(np.abs(plan.costate("x")))
+    aside = np.array([2.0, -1.0]) / np.sqrt(5)  # off the slope (1, 2) of the line
+    audit = tampered(plan, lambda s, lam: lam + 0.2 * size * (1 - s) ** 8 * aside).audit()
+    assert ENDS in failed(audit)
+
+
+@pytest.mark.parametrize("method", ["radau", "legendre", "radau-held"])
+def test_a_path_constraint_active_at_the_end_is_a_condition_there(method: str) -> None:
+    """x' = u under a ceiling that it meets at 0.31 s and follows to the end: the costate there is the multiplier's."""
+    problem = Problem("ceiling")
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, u)
+    problem.path("ceiling", x, upper=0.6)
+    problem.minimize(running=(x - 2 * problem.time) ** 2 + 0.01 * u**2)
+    plan = solve(problem, DIRECT[method])
+    assert plan["x"][-1, 0] == pytest.approx(0.6, abs=1e-6)
+    assert plan.audit()[ENDS].passed
+
+
+@both_solvers
+@every_method
+def test_a_free_horizon_balances_the_hamiltonian(method: str, solver: str) -> None:
+    plan = solve(bolza(terminal=1.0), DIRECT[method], solver=solver)
+    audit = plan.audit()
+    assert audit.passed
+    assert audit.adjoint.horizon < 1e-6
+    assert plan.horizon == pytest.approx(1 / np.sqrt(2), abs=1e-7)
+    wrong = tampered(plan, lambda s, lam: 1.2 * lam).audit()
+    assert HORIZON in failed(wrong)
+    assert wrong.adjoint.horizon == pytest.approx(0.2 * 2, abs=1e-5)  # H = u^2/2 + 1.2 lambda u, u = sqrt 2 = -lambda
+
+
+@every_method
+def test_a_horizon_at_its_bound_balances_nothing(method: str) -> None:
+    """Held at 1/2: H(T) + 1 = 1 - u^2/2 = -1 there."""
+    problem = Problem("short")
+    x = problem.state("x", initial=0.0, terminal=1.0)
+    u = problem.control("u", guess=1.0)
+    horizon = problem.horizon(lower=0.1, upper=0.5, guess=0.4)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2 / 2, terminal=horizon)
+    plan = solve(problem, DIRECT[method])
+    assert plan.horizon == pytest.approx(0.5, abs=1e-6)
+    assert plan.audit().passed
+    assert HORIZON not in {finding.name for finding in plan.audit().findings}
+
+
+def test_the_end_constraint_may_move_with_the_horizon() -> None:
+    """x' = u to the moving target 1 + T: the multiplier enters the balance of the horizon as well."""
+    problem = Problem("moving target")
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u", guess=2.0)
+    horizon = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
+    problem.dynamics(x, u)
+    problem.end("meet", x - 1 - horizon, 0, 0)
+    problem.minimize(running=u**2 / 2, terminal=horizon / 2)
+    for by in (Collocation(10), MultipleShooting(10), Indirect()):
+        plan = solve(problem, by)
+        # u = (1 + T)/T; d/dT of (1 + T)^2 / (2 T) + T/2 vanishes at T = 1/sqrt 2
+        assert plan.horizon == pytest.approx(1 / np.sqrt(2), abs=1e-7)
+        audit = plan.audit()
+        assert audit.passed
+        assert audit.adjoint.horizon < 1e-6
+    assert HORIZON in failed(tampered(plan, lambda s, lam: 1.2 * lam).audit())
+
+
+def test_what_the_costate_equation_alone_cannot_say_is_said() -> None:
+    problem = Problem("corridor")
+    x = problem.state("x", 2, initial=[0.0, 0.0], terminal=[1.0, 0.0])
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.path("speed", x[1], upper=1.2)
+    problem.minimize(running=u**2 / 2)
+    adjoint = solve(problem, Collocation(20)).audit().adjoint
+    assert adjoint.integrated is None
+    assert "path constraints" in adjoint.reason
+    assert adjoint.error == 0
+
+
+@pytest.mark.parametrize("name", ["everything", "coupled", "mixed", "tabulated"])
+def test_costates_of_the_indirect_method_are_taken_to_task_too(name: str) -> None:
+    case = EXTREMA[name]
+    plan = solve(case.build(), Indirect(), parameters=case.parameters)
+    audit = plan.audit()
+    assert audit[EQUATION].value < 1e-6
+    assert audit[ENDS].value < 1e-7
+    size = np.max(np.abs(plan.costate_interpolant.values))
+    bent = tampered(plan, lambda s, lam: lam + 0.1 * size * np.sin(np.pi * s))
+    assert EQUATION in failed(bent.audit())
+    assert not bent.audit().passed
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_costates_that_are_no_numbers_fail(value: float) -> None:
+    plan = solve(constrained("circle"), Collocation(20))
+    audit = tampered(plan, lambda s, lam: lam + np.where(s > 0.5, value, 0.0)).audit()
+    assert not audit.passed
+    assert {EQUATION, ENDS} <= failed(audit)

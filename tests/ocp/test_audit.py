@@ -1,0 +1,469 @@
+"""The audit: good plans of every method pass, and every kind of wrong one is found where it is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp import Audit, Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
+from ocp.interpolation import PiecewisePolynomial
+from tests.ocp.problems import SWING, Array, LogarithmicRegulator, Method, energy, swing, van_der_pol
+
+FINE: dict[str, Method] = {
+    "radau": Collocation(20),
+    "radau-held": Collocation(60, control="held"),
+    "legendre": Collocation(20, scheme="legendre"),
+    "legendre-held": Collocation(60, scheme="legendre", control="held"),
+    "rk4-held": MultipleShooting(60),
+    "rk4-linear": MultipleShooting(60, control="linear"),
+    "cvodes-linear": MultipleShooting(20, integrator="cvodes", steps=3, control="linear"),
+}
+INTEGRATION = "integration error, relative"
+COST = "cost, relative"
+STATIONARITY = "stationarity, relative"
+DRIFT = "Hamiltonian drift, relative"
+
+
+@cache
+def plan(method: str) -> Solution:
+    return solve(van_der_pol(), FINE[method])
+
+
+def failed(audit: Audit) -> set[str]:
+    """Names of the findings beyond their limits."""
+    assert audit.passed == (not audit.failures)
+    return {finding.name for finding in audit.failures}
+
+
+every_method = pytest.mark.parametrize("method", FINE)
+
+
+# ---- what passes -------------------------------------------------------------------------------------------------
+
+
+@every_method
+def test_good_plans_pass(method: str) -> None:
+    audit = plan(method).audit()
+    assert failed(audit) == set()
+    assert audit.integration_error < 1e-3
+    assert audit.local_errors.shape == (FINE[method].intervals,)
+    assert audit.local_errors.max() < 1e-3
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_a_plan_with_everything_in_it_passes(solver: str) -> None:
+    audit = solve(swing(), Collocation(40), parameters=SWING, solver=solver).audit()
+    assert failed(audit) == set()
+    assert set(audit.constraints) == {"x", "w", "u", "b", "speed", "place", "balance", "push", "cyclic"}
+
+
+@every_method
+def test_a_plan_without_cost_is_optimal_if_it_is_feasible(method: str) -> None:
+    problem = Problem("indifferent")
+    x = problem.state("x", initial=1.0, terminal=0.0)
+    u = problem.control("u", lower=-3.0, upper=3.0)
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    assert failed(solve(problem, FINE[method]).audit()) == set()
+
+
+@every_method
+def test_a_plan_without_control_passes(method: str) -> None:
+    problem = Problem("falling")
+    x = problem.state("x", 2, initial=[1.0, 0.0])
+    problem.dynamics(x, ca.vertcat(x[1], -ca.sin(x[0])))
+    problem.horizon(2.0)
+    problem.minimize(running=ca.sumsqr(x))
+    assert failed(solve(problem, FINE[method]).audit()) == set()
+
+
+@every_method
+def test_the_reintegrated_plan_is_that_of_another_integrator(method: str) -> None:
+    """scipy integrates the controls of the plan once more."""
+    from scipy.integrate import solve_ivp
+
+    solution = plan(method)
+    audit = solution.audit()
+    mesh = solution.control_interpolant.breaks * solution.horizon
+    state = solution["x"][0]
+    for k, (a, b) in enumerate(pairwise(mesh)):
+
+        def rate(t: float, y: Array, k: int = k, a: float = a, b: float = b) -> list[float]:
+            place = np.clip(np.array([(t - a) / (b - a)]), 0.0, 1.0)
+            u = solution.control_interpolant.within(np.array([k]), place)[0, 0]
+            return [y[1], (1 - y[0] ** 2) * y[1] - y[0] + u]
+
+        state = solve_ivp(rate, (a, b), state, rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(audit.states["x"][-1], state, atol=1e-8)
+
+
+@given(unit=st.floats(-6.0, 6.0), time=st.floats(-2.0, 3.0))
+@settings(max_examples=15)
+def test_the_verdict_does_not_depend_on_units(unit: float, time: float) -> None:
+    """Distances of a micrometre to a thousand kilometres, 10 ms to a quarter of an hour."""
+    unit, time = 10.0**unit, 10.0**time
+
+    def scaled(terminal: float) -> Problem:
+        problem = Problem("in other units")
+        q = problem.state("q", initial=0.0, terminal=terminal * unit)
+        v = problem.state("v", initial=0.0, terminal=0.0)
+        u = problem.control("u")
+        problem.dynamics(q, v)
+        problem.dynamics(v, u * unit / time**2)
+        problem.horizon(time)
+        problem.minimize(running=u**2 / (2 * time))
+        return problem
+
+    solution = solve(scaled(1.0), Collocation(6))
+    assert failed(solution.audit()) == set()
+    values = solution.control_interpolant.values.copy()
+    values[2] *= 1.2
+    bad = replace(solution, control_interpolant=replace(solution.control_interpolant, values=values))
+    assert {INTEGRATION, STATIONARITY} <= failed(bad.audit())
+    assert "end of q" in failed(solution.audit(scaled(1.1)))
+
+
+# ---- what is tampered with ---------------------------------------------------------------------------------------
+
+
+def edited(curve: PiecewisePolynomial, edit: Callable[[Array], Any]) -> PiecewisePolynomial:
+    values = curve.values.copy()
+    edit(values)
+    return replace(curve, values=values)
+
+
+def add(amount: float, *where: Any) -> Callable[[Array], None]:
+    def edit(values: Array) -> None:
+        values[where if where else ...] += amount
+
+    return edit
+
+
+def scale(factor: float, *where: Any) -> Callable[[Array], None]:
+    def edit(values: Array) -> None:
+        values[where if where else ...] *= factor
+
+    return edit
+
+
+def states(edit: Callable[[Array], None]) -> Callable[[Solution], Solution]:
+    return lambda s: replace(s, state_interpolant=edited(s.state_interpolant, edit))
+
+
+def controls(edit: Callable[[Array], None]) -> Callable[[Solution], Solution]:
+    return lambda s: replace(s, control_interpolant=edited(s.control_interpolant, edit))
+
+
+JUMP, REPORTED = "state jump, relative", "reported values, relative"
+TAMPERED: dict[str, tuple[Callable[[Solution], Solution], set[str]]] = {
+    "unsuccessful": (lambda s: replace(s, success=False), {"solver"}),
+    "states shifted": (states(add(0.05)), {INTEGRATION, "start of x"}),
+    "one state node shifted": (states(add(0.05, 7, 1)), {INTEGRATION}),
+    "a jump between intervals": (states(add(0.2, slice(10, None), slice(None), 0)), {INTEGRATION, JUMP}),
+    "control of one interval shifted": (controls(add(0.3, 7)), {INTEGRATION, STATIONARITY}),
+    "all controls scaled": (controls(scale(1.1)), {INTEGRATION, STATIONARITY}),
+    "control nan": (controls(add(np.nan, 5)), {INTEGRATION, COST, STATIONARITY}),
+    "control infinite": (controls(add(np.inf, 5)), {INTEGRATION, COST, STATIONARITY}),
+    "state nan": (states(add(np.nan, 5)), {INTEGRATION}),
+    "state nan at the start": (states(add(np.nan, 0)), {INTEGRATION}),
+    "cost one per cent better": (lambda s: replace(s, cost=0.99 * s.cost), {COST}),
+    "cost of other sign": (lambda s: replace(s, cost=-s.cost), {COST}),
+    "cost nan": (lambda s: replace(s, cost=np.nan), {COST}),
+    "horizon longer": (lambda s: replace(s, horizon=1.1 * s.horizon, t=1.1 * s.t), {INTEGRATION, COST}),
+    "reported states shifted": (lambda s: replace(s, states={"x": s["x"] + 0.05}), {REPORTED}),
+    "reported control shifted": (lambda s: replace(s, controls={"u": s["u"] + 0.05}), {REPORTED}),
+    "reported state nan": (lambda s: replace(s, states={"x": s["x"] * np.nan}), {REPORTED}),
+    "reported costates shifted": (lambda s: replace(s, costates={"x": s.costate("x") + 0.1}), {REPORTED}),
+}  # fmt: skip
+
+
+@every_method
+@pytest.mark.parametrize("how", TAMPERED)
+def test_tampered_plans_fail_where_they_are_wrong(method: str, how: str, capfd: pytest.CaptureFixture[str]) -> None:
+    tamper, expected = TAMPERED[how]
+    assert expected <= failed(tamper(plan(method)).audit())
+    capfd.readouterr()  # the integrator complains of what is not a number
+
+
+@every_method
+@pytest.mark.parametrize("factor", [0.0, -1.0, 1.2, np.nan])
+def test_wrong_costates_fail(method: str, factor: float) -> None:
+    solution = plan(method)
+    wrong = replace(
+        solution,
+        costates={"x": factor * solution.costate("x")},
+        costate_interpolant=edited(solution.costate_interpolant, scale(factor)),
+    )
+    assert failed(wrong.audit()) & {STATIONARITY, DRIFT, "costate equation, relative"}
+
+
+def test_a_costate_that_no_control_sees_is_checked_by_its_own_equation() -> None:
+    """With time in the cost the Hamiltonian may change, and the costate of q does not enter stationarity."""
+    problem = energy()
+    problem.declared.running = problem.declared.running + problem.time * problem.declared.states["q"].symbol
+    solution = solve(problem, Collocation(8))
+    assert failed(solution.audit()) == set()
+    wrong = replace(
+        solution,
+        costates={**solution.costates, "q": 1.2 * solution.costate("q")},
+        costate_interpolant=edited(solution.costate_interpolant, scale(1.2, slice(None), slice(None), 0)),
+    )
+    assert "costate equation, relative" in failed(wrong.audit())
+
+
+# ---- plans for another problem -----------------------------------------------------------------------------------
+
+
+@every_method
+def test_a_wrong_start_or_end_fails_by_name(method: str) -> None:
+    assert "start of x" in failed(plan(method).audit(van_der_pol(initial=(1.05, 0.0))))
+    assert "end of x" in failed(plan(method).audit(van_der_pol(terminal=[0.5, np.nan])))
+
+
+@every_method
+def test_a_plan_that_ends_where_it_was_told_is_no_optimum_of_a_free_end(method: str) -> None:
+    """Stationary, with a constant Hamiltonian, and yet no extremal: transversality tells."""
+    pinned = solve(van_der_pol(terminal=[0.2, np.nan]), FINE[method])
+    assert failed(pinned.audit()) == set()
+    assert failed(pinned.audit(van_der_pol())) == {"transversality, relative"}
+
+
+@every_method
+@pytest.mark.parametrize("duration", [0.5, 1.0, 1.5])
+def test_a_plan_of_another_duration_is_no_optimum_of_a_free_time(method: str, duration: float) -> None:
+    """Bolza's problem has its optimum at 1/sqrt 2 s."""
+
+    def bolza(*fixed: float) -> Problem:
+        problem = Problem("Bolza")
+        x = problem.state("x", initial=0.0, terminal=1.0)
+        u = problem.control("u", guess=1.0)
+        horizon = problem.horizon(*fixed) if fixed else problem.horizon(lower=0.1, upper=5.0, guess=1.0)
+        problem.dynamics(x, u)
+        problem.minimize(running=u**2 / 2, terminal=horizon)
+        return problem
+
+    assert failed(solve(bolza(), FINE[method]).audit()) == set()
+    plan_of = solve(bolza(duration), FINE[method])
+    assert failed(plan_of.audit()) == set()
+    assert failed(plan_of.audit(bolza())) == {"condition of the free horizon, relative"}
+
+
+@every_method
+def test_a_feasible_plan_that_is_not_optimal_fails_by_the_minimum_principle_alone(method: str) -> None:
+    prescribed = van_der_pol()
+    u = prescribed.declared.controls["u"].symbol
+    prescribed.path("prescribed", u - ca.sin(3 * prescribed.time), 0, 0)
+    found = failed(solve(prescribed, FINE[method]).audit(van_der_pol()))
+    assert STATIONARITY in found
+    assert not found & {"solver", INTEGRATION, COST, "start of x", "state jump, relative"}
+
+
+def test_another_cost_is_found() -> None:
+    other = van_der_pol()
+    other.declared.running = other.declared.running + 0.2 * other.declared.controls["u"].symbol ** 2
+    assert {COST, STATIONARITY} <= failed(plan("radau").audit(other))
+
+
+def test_other_dynamics_are_found() -> None:
+    other = van_der_pol()
+    x = other.declared.states["x"].symbol
+    other.declared.dynamics["x"] = other.declared.dynamics["x"] + ca.vertcat(0, 0.1 * x[1])
+    assert INTEGRATION in failed(plan("legendre").audit(other))
+
+
+@pytest.mark.parametrize("method", ["radau", "rk4-held"])
+def test_a_bound_that_the_plan_does_not_keep_is_found(method: str) -> None:
+    audit = plan(method).audit(van_der_pol(upper=0.5))
+    assert "bounds of u" in failed(audit)
+    excess = plan(method)["u"].max() - 0.5
+    assert audit.constraints["u"] == pytest.approx(excess, abs=1e-2)
+    assert audit["bounds of u"].time == pytest.approx(plan(method).t[np.argmax(plan(method)["u"])], abs=0.1)
+
+
+# ---- between the nodes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["radau", "legendre"])
+def test_a_control_that_overshoots_its_bound_between_points_fails(scheme: str) -> None:
+    """Polynomials over a switch: inside the bounds at every point, outside between them."""
+    problem = Problem("minimum time")
+    q = problem.state("q", initial=0.0, terminal=1.0)
+    v = problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    horizon = problem.horizon(lower=0.5, upper=5.0, guess=2.5)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.minimize(terminal=horizon)
+    solution = solve(problem, Collocation(5, 4, scheme))
+    assert np.abs(solution.control_interpolant.values).max() <= 1.0
+    audit = solution.audit()
+    assert "bounds of u" in failed(audit)
+    assert audit.constraints["u"] > 0.05
+
+
+def round_a_disc(intervals: int, margin: float = 0.0) -> Solution:
+    """A point that passes a disc of radius 1/2: on a coarse mesh it cuts across between the nodes."""
+    problem = Problem("disc")
+    x = problem.state("x", 2, initial=[0.0, 0.0], terminal=[2.0, 0.0], guess=lambda t: [t, 0.8 * np.sin(np.pi * t / 2)])
+    u = problem.control("u", 2)
+    problem.dynamics(x, u)
+    problem.horizon(2.0)
+    problem.path("disc", ca.sumsqr(x - ca.DM([1.0, 0.0])), lower=(0.5 + margin) ** 2)
+    problem.minimize(running=ca.sumsqr(u))
+    return solve(problem, MultipleShooting(intervals))
+
+
+def test_a_constraint_that_is_cut_between_nodes_fails() -> None:
+    solution = round_a_disc(3)
+    nodes = np.linalg.norm(solution["x"] - [1.0, 0.0], axis=1)
+    assert nodes.min() >= 0.5 - 1e-8
+    audit = solution.audit()
+    assert "disc" in failed(audit)
+    nearest = np.linalg.norm(audit.states["x"] - [1.0, 0.0], axis=1).min()
+    assert audit.constraints["disc"] == pytest.approx(0.25 - nearest**2, abs=1e-3)
+    assert "disc" not in failed(round_a_disc(100).audit())
+
+
+def test_a_plan_that_jumps_over_a_singularity_fails() -> None:
+    """x' = u, but the optimum would leave through 1/x: the coarse plan steps from one side to the other."""
+    problem = Problem("pole")
+    x = problem.state("x", initial=-1.0, terminal=1.0)
+    u = problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.path("near", x**2, lower=0.04)
+    problem.minimize(running=u**2)
+    solution = solve(problem, MultipleShooting(3))
+    audit = solution.audit()
+    assert solution.success
+    assert "near" in failed(audit)
+
+
+def test_unstable_dynamics_on_a_coarse_mesh_fail() -> None:
+    problem = Problem("unstable")
+    x = problem.state("x", initial=0.01)
+    u = problem.control("u")
+    problem.dynamics(x, 12 * x + u)
+    problem.horizon(2.0)
+    problem.minimize(running=x**2 + u**2)
+    assert INTEGRATION in failed(solve(problem, Collocation(4, 2)).audit())
+
+
+def test_a_plan_that_breaks_the_integrator_down_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+    """x' = x^2 + u escapes to infinity before the end when its control is taken away."""
+    problem = Problem("escape")
+    x = problem.state("x", initial=1.0)
+    u = problem.control("u")
+    problem.dynamics(x, x**2 + u)
+    problem.horizon(2.0)
+    problem.minimize(running=x**2 + 0.1 * u**2)
+    solution = solve(problem, Collocation(10))
+    assert failed(solution.audit()) == set()
+    audit = controls(scale(0.0))(solution).audit()
+    assert {INTEGRATION, COST} <= failed(audit)
+    assert audit[INTEGRATION].value == np.inf
+    assert "the integration broke down at" in audit[INTEGRATION].note
+    assert "FAILED" in str(audit)
+    capfd.readouterr()
+
+
+# ---- the table, limits and names ---------------------------------------------------------------------------------
+
+
+def test_the_table_shows_every_finding() -> None:
+    audit = plan("radau").audit()
+    lines = str(audit).splitlines()
+    assert lines[0] == "Audit of 'van der Pol': passed"
+    assert lines[1].split() == ["check", "value", "limit", "at,", "s"]
+    assert len(lines) == 2 + len(audit.findings)
+    for line, finding in zip(lines[2:], audit.findings, strict=True):
+        assert line.startswith(f"  {finding.name} ")
+        assert f"{finding.value:.2e}" in line
+        assert (" ok" in line) == (finding.limit is not None)
+        assert line == line.rstrip()
+    assert "reported 1.047" in str(audit)
+
+
+def test_the_table_of_a_failed_plan_marks_what_failed() -> None:
+    audit = replace(plan("radau"), success=False, status="Restoration_Failed").audit()
+    lines = str(audit).splitlines()
+    assert lines[0].endswith("FAILED")
+    assert [line.split()[0] for line in lines[1:] if "FAILED" in line] == ["solver"]
+    assert "Restoration_Failed" in lines[2]
+
+
+def test_findings_are_found_by_name() -> None:
+    audit = plan("radau").audit()
+    assert audit["solver"].passed
+    with pytest.raises(ProblemError, match=r"unknown finding 'integratoin'"):
+        audit["integratoin"]
+
+
+def test_limits_are_what_was_asked() -> None:
+    solution = plan("rk4-linear")
+    assert failed(solution.audit(integration=1e-12)) >= {INTEGRATION}
+    assert failed(solution.audit(stationarity=1e-12)) == {STATIONARITY}
+    assert failed(solution.audit(drift=1e-12)) == {DRIFT}
+    assert "costate equation, relative" in failed(solution.audit(costates=1e-12))
+    coarse = round_a_disc(3)
+    assert "disc" not in failed(coarse.audit(constraints=10.0))
+    assert "disc" not in failed(coarse.audit(tolerances={"disc": 1.0}))
+    assert coarse.audit(tolerances={"disc": 0.015})["disc"].limit == 0.015
+    assert "disc" in failed(coarse.audit(tolerances={"disc": 0.0}))
+
+
+def test_an_exact_optimum_passes_strict_limits() -> None:
+    solution = solve(LogarithmicRegulator(2.0).build(), Collocation(24, 5, "legendre"))
+    strict = solution.audit(integration=1e-7, constraints=1e-7, stationarity=1e-6, drift=1e-6, costates=1e-6)
+    assert failed(strict) == set()
+
+
+@pytest.mark.parametrize(
+    "settings_",
+    [
+        {"integration": "a"},
+        {"integration": -1.0},
+        {"constraints": np.nan},
+        {"drift": None},
+        {"stationarity": True},
+        {"costates": [1.0]},
+        {"tolerances": {"x": "a"}},
+        {"tolerances": {"x": -1.0}},
+        {"tolerances": {"y": 1.0}},
+        {"tolerances": {"X": 1.0}},
+    ],
+)
+def test_bad_limits_are_named(settings_: dict[str, Any]) -> None:
+    with pytest.raises(ProblemError, match="tolerance"):
+        plan("radau").audit(**settings_)
+
+
+@pytest.mark.parametrize("problem", [energy, lambda: swing()])
+def test_a_plan_of_another_problem_is_refused(problem: Callable[[], Problem]) -> None:
+    with pytest.raises(ProblemError, match="plan 'van der Pol' has states"):
+        plan("radau").audit(problem())
+    more = van_der_pol()
+    more.parameter("extra")
+    with pytest.raises(ProblemError, match="parameter 'extra' has no value"):
+        plan("radau").audit(more)
+    wide = van_der_pol()
+    wide.control("extra", 2)
+    with pytest.raises(ProblemError, match="has controls"):
+        plan("radau").audit(wide)
+
+
+def test_auditing_changes_nothing() -> None:
+    solution = plan("radau")
+    before = solution.variables.copy()
+    first, second = solution.audit(), solution.audit()
+    assert str(first) == str(second)
+    np.testing.assert_array_equal(solution.variables, before)

@@ -1,0 +1,288 @@
+"""Several solutions of one problem against each other: what agrees, what does not, and what cannot be compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import paper_example
+from ocp import (
+    Certificate,
+    Collocation,
+    Indirect,
+    MultipleShooting,
+    Problem,
+    ProblemError,
+    Solution,
+    certificate,
+    solve,
+)
+from ocp.builders.redundancy import minimum_velocity
+from ocp.interpolation import PiecewisePolynomial
+from tests.ocp.extremals import EXTREMA
+from tests.ocp.problems import energy, van_der_pol
+
+NAMES: dict[str, Any] = {
+    "Collocation": Collocation(50, 3, "legendre"),
+    "MultipleShooting": MultipleShooting(100, control="linear"),
+    "Indirect": Indirect(),
+}
+
+
+@cache
+def three() -> tuple[Problem, dict[str, Solution]]:
+    problem = van_der_pol()
+    return problem, {name: solve(problem, method) for name, method in NAMES.items()}
+
+
+def paper(damping: float = 0.005, formulation: Any = "rates") -> Problem:
+    start = np.deg2rad([45.0, 60.0, -60.0])
+    return minimum_velocity(
+        paper_example(), [-1, -1], [3, 4], start, 5.0, guess_damping=damping, formulation=formulation
+    )
+
+
+def moved(solution: Solution, which: str, change: float) -> Solution:
+    """A solution whose states, costates or controls are bent in the middle by a share of their own size."""
+    pool = {"state": "states", "costate": "costates", "control": "controls"}[which]
+    old: PiecewisePolynomial = getattr(solution, f"{which}_interpolant")
+    size = change * float(np.max(np.abs(old.values)))
+    places = (old.breaks[:-1, None] + np.diff(old.breaks)[:, None] * old.nodes)[..., None]
+    curve = replace(old, values=old.values + size * np.sin(np.pi * places))
+    bump = size * np.sin(np.pi * solution.t / solution.horizon)[:, None]
+    named = {name: values + bump for name, values in getattr(solution, pool).items()}
+    return changed(solution, {pool: named, f"{which}_interpolant": curve})
+
+
+def changed(solution: Solution, fields: dict[str, Any]) -> Solution:
+    return replace(solution, **fields)
+
+
+def row(found: Certificate, name: str) -> Any:
+    return next(c for c in found.comparisons if c.name == name)
+
+
+# ---- agreement ---------------------------------------------------------------------------------------------------
+
+
+def test_three_methods_agree_and_the_indirect_one_is_the_reference() -> None:
+    problem, solutions = three()
+    found = certificate(problem, solutions)
+    assert found.passed
+    assert found.reference == "Indirect"
+    assert [c.name for c in found.comparisons] == ["Indirect", "Collocation", "MultipleShooting"]
+    assert row(found, "Indirect").worst == 0
+    assert row(found, "Collocation").worst < 1e-5
+    assert 0 < row(found, "MultipleShooting").worst < found.tolerance
+    assert set(found.audits) == set(solutions)
+    assert all(audit.passed for audit in found.audits.values())
+    assert "3 solutions agree to 0.001" in found.verdict
+
+
+def test_the_paper_example_is_certified_by_three_methods() -> None:
+    problem = paper(formulation="null_space")
+    direct = solve(problem, Collocation(100, 3, "legendre"))
+    shot = solve(problem, MultipleShooting(100, control="linear"), guess=direct)
+    indirect = solve(problem, Indirect(shooting="backward"), guess=direct)
+    found = certificate(problem, [direct, shot, indirect])
+    assert found.passed, str(found)
+    assert found.reference == "Indirect backward, 20"
+    by_collocation = row(found, "Collocation legendre-3, 100")
+    assert by_collocation.costate < 1e-5
+    assert by_collocation.cost_difference < 1e-9
+
+
+@pytest.mark.parametrize("name", ["everything", "free horizon", "mixed", "bang-bang", "bounded task", "tabulated"])
+def test_every_shape_of_problem_is_certified(name: str) -> None:
+    case = EXTREMA[name]
+    problem = case.build()
+    plans = [solve(problem, by, parameters=case.parameters) for by in (case.direct, Indirect())]
+    found = certificate(problem, plans, tolerance=2e-2 if case.switches else 1e-3)
+    assert found.passed, str(found)
+
+
+def test_differences_are_relative_and_measured() -> None:
+    """Energy scaled: the same relative differences whatever the unit of the cost."""
+    rows = []
+    for weight in (1.0, 1e6):
+        problem = Problem("weighted")
+        x = problem.state("x", initial=1.0)
+        u = problem.control("u")
+        problem.horizon(1.0)
+        problem.dynamics(x, u - x**3)
+        problem.minimize(running=weight * (x**2 + u**2))
+        found = certificate(
+            problem, {"coarse": solve(problem, MultipleShooting(10)), "exact": solve(problem, Indirect())}
+        )
+        rows.append(row(found, "coarse"))
+    for what in ("cost_difference", "state", "control", "costate", "hamiltonian"):
+        assert getattr(rows[0], what) == pytest.approx(getattr(rows[1], what), rel=1e-3)
+        assert getattr(rows[0], what) > 0
+
+
+def test_a_hamiltonian_and_a_cost_that_vanish_are_compared_by_their_parts() -> None:
+    """A cost that an offset brings to zero, and H = 0 of a free horizon (in the test above)."""
+    problem = Problem("vanishing")
+    x = problem.state("x", initial=1.0)
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, -x + u)
+    problem.minimize(running=x + u**2 / 2 - offset())
+    plans = {"indirect": solve(problem, Indirect()), "direct": solve(problem, Collocation(20))}
+    assert abs(plans["indirect"].cost) < 1e-9
+    found = certificate(problem, plans)
+    assert found.passed, str(found)
+    assert row(found, "direct").cost_difference < 1e-8
+
+
+def offset() -> float:
+    """Optimal cost of min int x + u^2/2, x' = u - x, x(0) = 1, over 1 s: u = e^(t-1) - 1 (minimum principle)."""
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    t, w = (1 + nodes) / 2, weights / 2
+    lam = 1 - np.exp(t - 1)
+    return float(1 - np.exp(-1.0) - w @ lam**2 / 2)  # lambda(0) x(0) - int lambda^2/2: the cost is linear in x
+
+
+def test_without_an_indirect_solution_the_first_is_the_reference() -> None:
+    problem, solutions = three()
+    found = certificate(problem, [solutions["MultipleShooting"], solutions["Collocation"]])
+    assert found.reference == "MultipleShooting rk4 linear, 100"
+    assert found.passed
+
+
+def test_solutions_of_one_method_are_numbered() -> None:
+    problem, solutions = three()
+    found = certificate(problem, [solutions["Collocation"]] * 3)
+    names = [c.name for c in found.comparisons]
+    assert names == ["Collocation legendre-3, 50", "Collocation legendre-3, 50 (2)", "Collocation legendre-3, 50 (3)"]
+
+
+def test_loaded_solutions_are_certified_too(tmp_path: Path) -> None:
+    problem, solutions = three()
+    loaded = {}
+    for name, solution in solutions.items():
+        solution.save(tmp_path / f"{name}.npz")
+        loaded[name] = Solution.load(tmp_path / f"{name}.npz")
+    again = certificate(problem, loaded)
+    assert again.passed
+    assert str(again) == str(certificate(problem, solutions))
+
+
+# ---- disagreement ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("which", ["state", "costate", "control"])
+def test_a_solution_that_was_bent_is_found_out(which: str) -> None:
+    problem, solutions = three()
+    bent = {**solutions, "bent": moved(solutions["Collocation"], which, 0.01)}
+    found = certificate(problem, bent)
+    assert not found.passed
+    assert getattr(row(found, "bent"), which) == pytest.approx(0.01, rel=0.5)
+    assert "bent differ from Indirect by more than 0.001" in found.verdict
+    assert row(found, "Collocation").worst < 1e-3
+
+
+def test_a_cost_or_a_horizon_that_was_changed_is_found_out() -> None:
+    problem, solutions = three()
+    for change in (
+        {"cost": solutions["Collocation"].cost * 1.01},
+        {"horizon": solutions["Collocation"].horizon * 1.01},
+    ):
+        found = certificate(problem, {**solutions, "changed": changed(solutions["Collocation"], change)})
+        assert not found.passed
+        assert not row(found, "changed").passed or "changed differ" in found.verdict
+
+
+def test_a_reference_that_is_wrong_fails_all_the_same() -> None:
+    problem, solutions = three()
+    found = certificate(problem, {**solutions, "Indirect": moved(solutions["Indirect"], "costate", 0.05)})
+    assert not found.passed
+    assert "the audit of Indirect failed" in found.verdict
+    assert "Collocation, MultipleShooting differ" in found.verdict
+
+
+def test_an_extremal_of_another_branch_is_found_out_though_it_passes_its_audit() -> None:
+    """J = 1.7351 and J = 1.7467 both satisfy the minimum principle of the paper's example."""
+    problem = paper()
+    best = solve(problem, Indirect(shooting="backward"))
+    other = solve(paper(0.03), Collocation(100))
+    assert best.cost == pytest.approx(1.735114311245, abs=1e-9)
+    assert other.cost > best.cost + 0.01
+    found = certificate(problem, {"best": best, "other": other})
+    assert found.audits["other"].passed
+    assert not found.passed
+    assert row(found, "other").cost_difference == pytest.approx(other.cost / best.cost - 1, rel=1e-4)
+    assert "other differ from best" in found.verdict
+
+
+def test_solutions_that_agree_on_a_failed_audit_are_not_certified() -> None:
+    problem, solutions = three()
+    wrong = replace(solutions["Collocation"], success=False, status="Maximum_Iterations_Exceeded")
+    found = certificate(problem, {"Indirect": solutions["Indirect"], "wrong": wrong})
+    assert row(found, "wrong").worst < 1e-3
+    assert not row(found, "wrong").passed
+    assert not found.passed
+    assert found.verdict == "the audit of wrong failed"
+
+
+def test_numbers_that_are_none_do_not_pass() -> None:
+    problem, solutions = three()
+    for change in ({"cost": np.nan}, {"cost": np.inf}):
+        found = certificate(problem, {**solutions, "broken": changed(solutions["Collocation"], change)})
+        assert not found.passed
+    found = certificate(problem, {**solutions, "broken": moved(solutions["Collocation"], "costate", np.nan)})
+    assert not found.passed
+    assert "broken" in found.verdict
+
+
+def test_the_tolerance_decides() -> None:
+    problem, solutions = three()
+    assert not certificate(problem, solutions, tolerance=1e-9).passed
+    assert certificate(problem, solutions, tolerance=1e-2).passed
+
+
+# ---- what cannot be compared -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_solution_is_no_certificate(count: int) -> None:
+    problem, solutions = three()
+    with pytest.raises(ProblemError, match=f"at least two solutions, not {count}"):
+        certificate(problem, list(solutions.values())[:count])
+
+
+def test_a_solution_of_another_problem_is_refused() -> None:
+    problem, solutions = three()
+    with pytest.raises(ProblemError, match=r"plan 'energy' has states .* problem 'van der Pol' has"):
+        certificate(problem, [solutions["Indirect"], solve(energy(), Collocation(5))])
+
+
+def test_solutions_at_other_parameters_are_refused() -> None:
+    case = EXTREMA["fixed horizon"]
+    plans = [solve(case.build(), Collocation(10), parameters={"h": h, "x0": 0.4}) for h in (1.7, 1.8)]
+    with pytest.raises(ProblemError, match="were solved at different parameters"):
+        certificate(case.build(), plans)
+
+
+# ---- the table ---------------------------------------------------------------------------------------------------
+
+
+def test_the_table_has_a_line_for_every_solution_and_the_verdict() -> None:
+    problem, solutions = three()
+    found = certificate(problem, {**solutions, "bent": moved(solutions["Collocation"], "costate", 0.02)})
+    lines = str(found).splitlines()
+    assert lines[0] == "Certificate of 'van der Pol': FAILED"
+    for head in ("cost", "d state", "d costate", "d H", "audit"):
+        assert head in lines[1]
+    assert [line.split()[0] for line in lines[2:-1]] == ["Indirect", "Collocation", "MultipleShooting", "bent"]
+    assert all(f"{solutions['Indirect'].cost:.6g}"[:6] in line for line in lines[2:5])
+    assert lines[2].endswith("passed")
+    assert lines[5].endswith("FAILED")
+    assert found.verdict in lines[-1]
+    assert len({len(line) for line in lines[2:-1]}) == 1  # columns line up
+    assert str(certificate(problem, solutions)).splitlines()[0].endswith("passed")

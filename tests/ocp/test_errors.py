@@ -1,0 +1,110 @@
+"""What is refused at the time of solving, and the exceptions themselves."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ocp
+from ocp import AuditError, Collocation, MultipleShooting, Problem, ProblemError, RefinementWarning, SolveError, solve
+from ocp.errors import unknown_name
+from tests.ocp.problems import energy, van_der_pol
+
+
+def with_parameter(size: int = 1) -> Problem:
+    problem = energy()
+    problem.parameter("mass", size)
+    return problem
+
+
+def test_exceptions_are_of_the_kinds_that_callers_expect() -> None:
+    assert issubclass(ProblemError, ValueError)
+    assert issubclass(SolveError, RuntimeError)
+    assert issubclass(AuditError, RuntimeError)
+    assert issubclass(RefinementWarning, UserWarning)
+    assert SolveError("x").solution is None
+    assert isinstance(pickle.loads(pickle.dumps(ProblemError("x"))), ProblemError)
+
+
+def test_everything_public_is_there() -> None:
+    for name in ocp.__all__:
+        assert getattr(ocp, name).__doc__, name
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "message"),
+    [
+        ("torqe", ["torque", "speed"], "unknown control 'torqe'; did you mean torque?"),
+        ("z", ["torque", "speed"], "unknown control 'z'; known: torque, speed"),
+        ("z", [], "unknown control 'z'; known: none"),
+        (3, ["torque"], "unknown control 3; known: torque"),
+    ],
+)
+def test_unknown_names_point_to_the_near_ones(name: object, known: list[str], message: str) -> None:
+    assert str(unknown_name("control", name, known)) == message
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (None, r"parameter 'mass' has no value; give parameters=\{'mass': ...\}"),
+        ({}, "parameter 'mass' has no value"),
+        ({"mas": 1.0}, "unknown parameter 'mas'; did you mean mass"),
+        ({"mass": 1.0, "q": 2.0}, "unknown parameter 'q'"),
+        ({"mass": [1.0, 2.0, 3.0]}, "parameter 'mass' has 3 entries, 2 expected"),
+        ({"mass": []}, "parameter 'mass' has 0 entries, 2 expected"),
+        ({"mass": np.nan}, "parameter 'mass' is not finite"),
+        ({"mass": [1.0, np.inf]}, "parameter 'mass' is not finite"),
+        ({"mass": None}, "parameter 'mass'"),
+        ({"mass": "heavy"}, "parameter 'mass': numbers"),
+        ({"mass": "1"}, "parameter 'mass': numbers"),
+        ({"mass": [[1.0], [2.0, 3.0]]}, "parameter 'mass': numbers"),
+        ([1.0], "parameters must be a dictionary by name"),
+        ("mass", "parameters must be a dictionary by name"),
+    ],
+)
+def test_bad_parameters_are_named(parameters: Any, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        solve(with_parameter(2), Collocation(2), parameters=parameters)
+
+
+@pytest.mark.parametrize("value", [2.0, [2.0, 2.0], (2, 2), np.array([[2.0], [2.0]]), np.float32(2.0)])
+def test_parameters_of_every_kind_are_taken(value: Any) -> None:
+    solution = solve(with_parameter(2), Collocation(2), parameters={"mass": value})
+    np.testing.assert_array_equal(solution.parameters["mass"], [2.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("problem", "method", "message"),
+    [
+        (None, Collocation(2), "a Problem is expected, not NoneType"),
+        (Collocation(2), energy(), "a Problem is expected, not Collocation"),
+        (energy(), None, r"a method such as Collocation\(...\) is expected, not None"),
+        (energy(), Collocation, "a method such as"),
+        (energy(), "radau", "a method such as"),
+        (energy(), {"intervals": 3}, "a method such as"),
+    ],
+)
+def test_wrong_arguments_are_named(problem: Any, method: Any, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        solve(problem, method)
+
+
+@pytest.mark.parametrize("options", [["max_iter"], "max_iter", 3])
+def test_options_that_are_no_dictionary_are_named(options: Any) -> None:
+    with pytest.raises(ProblemError, match="options must be a dictionary by name"):
+        solve(energy(), Collocation(2), options=options)
+
+
+@pytest.mark.parametrize("method", [Collocation(3), MultipleShooting(3)])
+def test_an_unsuccessful_solution_is_returned_without_check(method: Any) -> None:
+    solution = solve(van_der_pol(), method, options={"max_iter": 1}, check=False)
+    assert not solution.success
+    assert np.all(np.isfinite(solution["x"]))
+    assert solution.t[-1] == solution.horizon
+    audit = solution.audit()
+    assert not audit.passed
+    assert not audit["solver"].passed

@@ -1,0 +1,571 @@
+"""The Hamiltonian system by automatic differentiation; what the indirect method refuses, and how it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, Indirect, Problem, ProblemError, Solution, SolveError, prepare, solve
+from ocp.formulation import Formulation
+from ocp.hamiltonian import Hamiltonian
+from tests.ocp.extremals import EXTREMA, bang_bang
+from tests.ocp.problems import Array, energy, swing, van_der_pol
+
+SMOOTH = [name for name, case in EXTREMA.items() if case.switches == 0]
+RNG_SEED = 7
+
+
+def system(problem: Problem) -> tuple[Formulation, Hamiltonian]:
+    form = Formulation(problem)
+    return form, Hamiltonian.of(form)
+
+
+def point(form: Formulation, name: str, draw: int) -> list[Array]:
+    """x, lam, t, T, p near where the problem lives, from a seed."""
+    rng = np.random.default_rng(RNG_SEED + draw)
+    p = form.parameter_vector(dict(EXTREMA[name].parameters))
+    return [rng.uniform(0.2, 0.8, form.nx), rng.uniform(-0.8, -0.2, form.nx), np.array([0.4]), np.array([1.3]), p]
+
+
+def guess_of(form: Formulation, ham: Hamiltonian) -> Array:
+    return np.concatenate([np.full(len(ham.smooth), 0.3), np.zeros(len(form.path))])
+
+
+# ---- the equations -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("draw", range(3))
+@pytest.mark.parametrize("name", SMOOTH)
+def test_the_costate_rate_is_minus_the_slope_of_the_least_hamiltonian(name: str, draw: int) -> None:
+    """lambda' = -d(min over u of H)/dx and x' = d(min over u of H)/dlambda, by central differences (envelope)."""
+    form, ham = system(EXTREMA[name].build())
+    at = point(form, name, draw)
+    tail = [np.zeros(0), guess_of(form, ham)]
+    flow, outputs = ham.flow(), ham.outputs()
+
+    def least(x: Array, lam: Array, T: Array) -> float:
+        return float(outputs(x, lam, at[2], T, at[4], *tail)[2])
+
+    found = [np.asarray(out.full()).ravel() for out in flow(*at, *tail)]
+    step = 1e-6
+    for i, unit in enumerate(np.eye(form.nx)):
+        by_x = (least(at[0] + step * unit, at[1], at[3]) - least(at[0] - step * unit, at[1], at[3])) / (2 * step)
+        by_lam = (least(at[0], at[1] + step * unit, at[3]) - least(at[0], at[1] - step * unit, at[3])) / (2 * step)
+        assert found[1][i] == pytest.approx(-by_x, abs=1e-7)
+        assert found[0][i] == pytest.approx(by_lam, abs=1e-7)
+    by_horizon = (least(at[0], at[1], at[3] + step) - least(at[0], at[1], at[3] - step)) / (2 * step)
+    assert found[3][0] == pytest.approx(by_horizon, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_no_admissible_control_has_a_smaller_hamiltonian(name: str) -> None:
+    """Random controls inside the bounds, projected on the path equalities, against the one that was found."""
+    problem = EXTREMA[name].build()
+    form, ham = system(problem)
+    x, lam, t, T, p = point(form, name, 0)
+    u, mu = (np.asarray(out.full()).ravel() for out in ham.outputs()(x, lam, t, T, p, [], guess_of(form, ham))[:2])
+    index = form.bounds.places["control"]
+    low, high = (bound[index] for bound in form.bound_values(p))
+    assert np.all(u >= low - 1e-9)
+    assert np.all(u <= high + 1e-9)
+    values = ca.Function("h", [form.u], [ca.substitute(form.running + ca.dot(lam, form.f), *joined(form, x, t, T, p))])
+    rows = ca.Function("g", [form.u], [ca.substitute(ham.rows, *joined(form, x, t, T, p))])
+    assert mu.size == len(form.path)
+    if len(form.path):
+        assert np.max(np.abs(rows(u).full())) < 1e-10
+    slope = ca.Function("a", [form.u], [ca.jacobian(rows(form.u), form.u)]) if len(form.path) else None
+    rng = np.random.default_rng(RNG_SEED)
+    tried = 0
+    for _ in range(300):
+        step = rng.uniform(-1.0, 1.0, form.nu) * rng.choice([0.05, 0.5])
+        if slope is not None:
+            a = np.asarray(slope(u).full())
+            step -= np.linalg.pinv(a) @ (a @ step)
+        other = u + step
+        if np.all(other >= low) and np.all(other <= high):
+            tried += 1
+            assert float(values(other)) >= float(values(u)) - 1e-9
+    assert tried > 10
+
+
+def joined(form: Formulation, x: Array, t: Array, T: Array, p: Array) -> tuple[Any, Any]:
+    sort = form.problem.symbols
+    return ca.vertcat(form.x, form.t, form.T, form.p), sort(ca.DM(np.concatenate([x, t, T, p])))
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+def test_smooth_and_linear_controls_are_told_apart(symbols: Any) -> None:
+    problem = Problem("kinds", symbols)
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u", 2, lower=-1, upper=1)
+    w = problem.control("w", 2)
+    b = problem.control("b", lower=-1, upper=2)
+    problem.horizon(1.0)
+    problem.dynamics(x, u[0] * ca.sin(x) + u[1] + w[0] - w[1] + b)
+    problem.path("tie", w[1] - x, 0, 0)
+    problem.minimize(running=u[1] ** 2 + ca.exp(w[0]) + b * x)
+    ham = system(problem)[1]
+    assert ham.smooth == (1, 2, 3)  # u[1], w[0] by their cost, w[1] by the path equality
+    assert ham.linear == (0, 4)
+
+
+# ---- what it cannot take -----------------------------------------------------------------------------------------
+
+
+def declare(
+    running: Callable[[Any, Any], Any], *, size: int = 1, lower: Any = None, upper: Any = None, name: str = "plain"
+) -> Problem:
+    """x' = v, v' = sum u from rest, 1 s, terminal cost (x - 1)^2."""
+    problem = Problem(name)
+    x = problem.state("x", 2, initial=[0.0, 0.0])
+    u = problem.control("u", size, lower=lower, upper=upper)
+    problem.horizon(1.0)
+    problem.dynamics(x, ca.vertcat(x[1], ca.sum1(u)))
+    problem.minimize(running=running(x, u), terminal=(x[0] - 1) ** 2)
+    return problem
+
+
+def quadratic() -> Problem:
+    return declare(lambda x, u: ca.sumsqr(u))
+
+
+def symbol(problem: Problem, name: str) -> Any:
+    return {**problem.declared.states, **problem.declared.controls}[name].symbol
+
+
+def with_path_inequality() -> Problem:
+    problem = quadratic()
+    problem.path("corridor", symbol(problem, "x")[1], upper=0.7)
+    return problem
+
+
+def with_state_bounds() -> Problem:
+    problem = Problem("bounded state")
+    x = problem.state("x", initial=0.0, upper=2.0)
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2)
+    return problem
+
+
+def with_state_path_equality() -> Problem:
+    problem = quadratic()
+    problem.path("rail", symbol(problem, "x")[0] - problem.time, 0, 0)
+    return problem
+
+
+def with_start_inequality() -> Problem:
+    problem = quadratic()
+    problem.start("above", symbol(problem, "x")[1], lower=-1)
+    return problem
+
+
+def with_end_inequality() -> Problem:
+    problem = quadratic()
+    problem.end("beyond", symbol(problem, "x")[0], lower=0.9)
+    return problem
+
+
+def with_end_constraint_on_the_control() -> Problem:
+    problem = quadratic()
+    problem.end("rest", symbol(problem, "u"), 0, 0)
+    return problem
+
+
+def with_start_constraint_on_the_control() -> Problem:
+    problem = quadratic()
+    problem.start("push", symbol(problem, "u"), 0, 0)
+    return problem
+
+
+def with_tie_of_the_control() -> Problem:
+    problem = quadratic()
+    problem.end("tie", symbol(problem, "x")[0] - problem.at_start(symbol(problem, "u")), 0, 0)
+    return problem
+
+
+def with_cost_on_the_first_control() -> Problem:
+    problem = Problem("first control")
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2, terminal=problem.at_start(u) ** 2)
+    return problem
+
+
+REFUSED: dict[str, tuple[Callable[[], Problem], str]] = {
+    "path inequality": (with_path_inequality, "path inequality 'corridor'"),
+    "state bounds": (with_state_bounds, "bounds of state 'x'"),
+    "path equality without control": (with_state_path_equality, "path equality 'rail', which contains no control"),
+    "start inequality": (with_start_inequality, "start inequality 'above'"),
+    "end inequality": (with_end_inequality, "end inequality 'beyond'"),
+    "end constraint on the control": (with_end_constraint_on_the_control, "end constraint 'rest' on the control"),
+    "start constraint on the control": (with_start_constraint_on_the_control, "start constraint 'push' on the control"),
+    "tie of the control": (with_tie_of_the_control, "end constraint 'tie' on the control"),
+    "cost on the first control": (with_cost_on_the_first_control, "terminal cost on the control at the start"),
+    "linear in a free control": (lambda: declare(lambda x, u: x[0] ** 2), "linear in control 'u'"),
+    "linear in a half-bounded control": (lambda: declare(lambda x, u: x[0] ** 2, lower=0.0), "linear in control 'u'"),
+    "redundant controls": (lambda: declare(lambda x, u: ca.sum1(u) ** 2, size=2), "second derivative is singular"),
+    "redundant bounded controls": (
+        lambda: declare(lambda x, u: ca.sum1(u) ** 2, size=2, lower=-1, upper=1),
+        "second derivative is singular",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_problem_that_it_cannot_take_is_refused_by_name_before_it_is_solved(kind: str) -> None:
+    build, message = REFUSED[kind]
+    with pytest.raises(ProblemError, match=message):
+        prepare(build(), Indirect())
+
+
+def test_the_first_obstacle_of_a_problem_with_many_is_named() -> None:
+    with pytest.raises(ProblemError, match=r"bounds of state 'x'.*direct method"):
+        prepare(swing(), Indirect())
+
+
+def free_start() -> Problem:
+    problem = Problem("free start")
+    x = problem.state("x", 2, initial=[1.0, np.nan])
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.minimize(running=u**2, terminal=ca.sumsqr(x))
+    return problem
+
+
+BACKWARD: dict[str, tuple[Callable[[], Problem], str]] = {
+    "given end": (energy, "a state that is given at the end"),
+    "free start": (free_start, "a state that is free at the start"),
+    "free horizon": (EXTREMA["free horizon"].build, "a free horizon"),
+    "end constraints": (EXTREMA["everything"].build, "end constraints"),
+    "start constraints": (EXTREMA["everything"].build, "start constraints"),
+    "ties": (EXTREMA["free start"].build, "a cost that ties both ends"),
+    "switches": (bang_bang, "controls that switch"),
+}
+
+
+@pytest.mark.parametrize("kind", BACKWARD)
+def test_backward_shooting_says_what_it_cannot_take(kind: str) -> None:
+    build, message = BACKWARD[kind]
+    with pytest.raises(ProblemError, match=rf"backward shooting cannot take.*{message}.*shooting='multiple'"):
+        prepare(build(), Indirect(shooting="backward"))
+
+
+BAD_ARGUMENTS: list[tuple[dict[str, Any], str]] = [
+    ({"segments": 0}, "segments must be a positive integer, not 0"),
+    ({"segments": 2.0}, "segments"),
+    ({"segments": True}, "segments"),
+    ({"segments": "many"}, "segments"),
+    ({"shooting": "sideways"}, "'multiple' or 'backward', not 'sideways'"),
+    ({"shooting": None}, "shooting"),
+    ({"tolerance": 0.0}, "tolerance must be between 0 and 1"),
+    ({"tolerance": np.nan}, "tolerance"),
+    ({"tolerance": "tight"}, "tolerance"),
+    ({"residual": 1.0}, "residual must be between 0 and 1"),
+    ({"residual": -1e-9}, "residual"),
+    ({"seed": "coarse"}, r"seed must be a Collocation\(...\), not 'coarse'"),
+    ({"seed": Indirect()}, "seed"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS)
+def test_bad_settings_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        Indirect(**arguments)
+
+
+def test_what_is_no_problem_and_no_solver_is_refused() -> None:
+    with pytest.raises(ProblemError, match="a Problem is expected, not str"):
+        prepare("energy", Indirect())  # type: ignore[arg-type]
+    with pytest.raises(ProblemError, match="unknown solver 'snopt'"):
+        prepare(energy(), Indirect(), solver="snopt")
+    with pytest.raises(ProblemError, match="parameters must be a dictionary"):
+        solve(energy(), Indirect(), parameters=3)  # type: ignore[arg-type]
+    with pytest.raises(ProblemError, match="unknown parameter 'mass'"):
+        solve(energy(), Indirect(), parameters={"mass": 1.0})
+
+
+# ---- guesses -----------------------------------------------------------------------------------------------------
+
+
+def other(states: str = "q", controls: str = "w", size: int = 1) -> Solution:
+    problem = Problem("other")
+    q = problem.state(states, size, initial=0.0)
+    u = problem.control(controls, size)
+    problem.horizon(1.0)
+    problem.dynamics(q, u)
+    problem.minimize(running=ca.sumsqr(u - 1))
+    return solve(problem, Collocation(3))
+
+
+def test_a_guess_of_another_problem_is_refused() -> None:
+    for guess in (other(), other("x", "u"), other("x", "u", 2), other("q", "u", 2)):
+        with pytest.raises(ProblemError, match=r"plan 'other' has states"):
+            solve(energy(), Indirect(), guess=guess)
+
+
+def test_a_guess_with_other_controls_is_refused() -> None:
+    problem = Problem("one state")
+    q = problem.state("q", initial=0.0)
+    u = problem.control("u", 2)
+    problem.horizon(1.0)
+    problem.dynamics(q, ca.sum1(u))
+    problem.minimize(running=ca.sumsqr(u - 1))
+    with pytest.raises(ProblemError, match=r"plan 'other' has controls \{'w': 1\}"):
+        solve(problem, Indirect(), guess=other())
+
+
+def test_a_guess_without_costates_is_refused() -> None:
+    seed = solve(energy(), Collocation(5))
+    with pytest.raises(ProblemError, match=r"plan 'energy', has no costates of q, v"):
+        solve(energy(), Indirect(), guess=replace(seed, costates={}))
+    with pytest.raises(ProblemError, match=r"has no costates of v"):
+        solve(energy(), Indirect(), guess=replace(seed, costates={"q": seed.costates["q"]}))
+
+
+@pytest.mark.parametrize(("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "unknown variable in guess")])
+def test_what_is_no_guess_is_refused(guess: Any, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        solve(energy(), Indirect(), guess=guess)
+
+
+def test_variables_of_the_guess_may_be_declared_in_another_order() -> None:
+    def build(names: tuple[str, str], controls: tuple[str, str]) -> Problem:
+        problem = Problem("order")
+        states = {name: problem.state(name, initial=1.0, terminal=0.0) for name in names}
+        inputs = {name: problem.control(name, lower=-3, upper=3) for name in controls}
+        horizon = problem.horizon(lower=0.2, upper=9.0, guess=1.0)
+        problem.dynamics(states["a"], inputs["bang"])
+        problem.dynamics(states["b"], inputs["smooth"] - states["a"])
+        problem.minimize(running=inputs["smooth"] ** 2, terminal=horizon)
+        return problem
+
+    seed = solve(build(("b", "a"), ("smooth", "bang")), Collocation(40, control="held"))
+    solution = solve(build(("a", "b"), ("bang", "smooth")), Indirect(), guess=seed)
+    straight = solve(build(("b", "a"), ("smooth", "bang")), Indirect(), guess=seed)
+    assert solution.cost == pytest.approx(straight.cost, abs=1e-10)
+    np.testing.assert_allclose(solution.method["switches"], straight.method["switches"], atol=1e-9)
+    for name in ("a", "b"):
+        places = np.linspace(0, solution.horizon * (1 - 1e-9), 40)
+        np.testing.assert_allclose(solution.at(places)[name], straight.at(places)[name], atol=1e-9)
+    assert set(solution["bang"].ravel()) == {-3.0, 3.0}
+
+
+# ---- failures ----------------------------------------------------------------------------------------------------
+
+
+def singular_arc() -> Problem:
+    """x' = u, |u| <= 1, int (x - t^2/4)^2: from 0.3 the state meets the curve and follows it."""
+    problem = Problem("follow")
+    x = problem.state("x", initial=0.3)
+    u = problem.control("u", lower=-1, upper=1)
+    problem.horizon(1.5)
+    problem.dynamics(x, u)
+    problem.minimize(running=(x - problem.time**2 / 4) ** 2)
+    return problem
+
+
+def chattering() -> Problem:
+    """Fuller's problem."""
+    problem = Problem("Fuller")
+    x = problem.state("x", 2, initial=[0.0, 1.0], terminal=[0.0, 0.0])
+    u = problem.control("u", lower=-1, upper=1)
+    problem.horizon(3.0)
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.minimize(running=x[0] ** 2)
+    return problem
+
+
+@pytest.mark.parametrize("build", [singular_arc, chattering])
+def test_singular_arcs_and_chattering_are_named(build: Callable[[], Problem]) -> None:
+    with pytest.raises(SolveError, match=r"control 'u'.*singular arc.*direct method") as caught:
+        solve(build(), Indirect())
+    assert caught.value.solution is not None
+    unsolved = solve(build(), Indirect(), check=False)
+    assert not unsolved.success
+    assert "singular arc" in unsolved.status
+
+
+def test_chattering_is_told_from_the_switches_of_the_seed() -> None:
+    """A seed whose switching function changes sign at every other reported time."""
+    problem = bang_bang()
+    seed = solve(problem, Collocation(40, control="held"), parameters=EXTREMA["bang-bang"].parameters)
+    costates = dict(seed.costates)
+    costates["y"] = np.abs(costates["y"]) * np.where(np.arange(len(seed.t)) % 2 == 0, 1.0, -1.0)[:, None]
+    with pytest.raises(SolveError, match=r"control 'u\[1\]' switches in every interval.*chattering"):
+        solve(problem, Indirect(), parameters=EXTREMA["bang-bang"].parameters, guess=replace(seed, costates=costates))
+
+
+def oscillator(horizon: float, rate: float) -> Problem:
+    """min int x cos(rate t) of x'' = u - x: the costates do not depend on the plan, so nothing but signs is wrong."""
+    problem = Problem("oscillator")
+    x = problem.state("x", 2, initial=[0.0, 0.0])
+    u = problem.control("u", lower=-1, upper=1)
+    problem.horizon(horizon)
+    problem.dynamics(x, ca.vertcat(x[1], -x[0] + u))
+    problem.minimize(running=x[0] * ca.cos(rate * problem.time))
+    return problem
+
+
+@pytest.mark.parametrize(("horizon", "rate"), [(1.0, 0.2), (8.0, 0.3)])
+def test_the_switches_of_another_problem_are_found_out(horizon: float, rate: float) -> None:
+    """Newton's method converges all the same: only the sign of the switching function tells."""
+    right = solve(oscillator(8.0, 1.7), Indirect())
+    seed = solve(oscillator(horizon, rate), Collocation(40, control="held"))
+    with pytest.raises(SolveError, match=r"'u' is at the wrong bound at .* s.*not those of the seed"):
+        solve(oscillator(8.0, 1.7), Indirect(), guess=seed)
+    wrong = solve(oscillator(8.0, 1.7), Indirect(), guess=seed, check=False)
+    assert not wrong.success
+    assert wrong.cost > right.cost + 1e-3
+    assert not wrong.audit().passed
+
+
+def test_a_seed_of_other_bounds_is_no_singular_arc() -> None:
+    """A control at the bound that it had when the seed was solved is at a bound, though not at the new one."""
+    build = EXTREMA["mixed"].build
+    seed = solve(build(), Indirect(), parameters={"b": 0.5})
+    shifted = solve(build(), Indirect(), parameters={"b": 0.8}, guess=seed)
+    own = solve(build(), Indirect(), parameters={"b": 0.8})
+    np.testing.assert_allclose(np.abs(shifted["u"]), 0.8)
+    assert shifted.cost == pytest.approx(own.cost, abs=1e-9)
+    assert shifted.audit().passed
+
+
+def test_switches_out_of_order_are_no_plan() -> None:
+    """Two controls whose switches cross between the seed's parameter and the one asked for."""
+
+    def build() -> Problem:
+        problem = Problem("crossing")
+        shift = problem.parameter("shift")
+        x = problem.state("x", 2, initial=[0.0, 0.0])
+        u = problem.control("u", 2, lower=-1, upper=1)
+        problem.horizon(5.0)
+        problem.dynamics(x, u)
+        t = problem.time
+        problem.minimize(running=ca.cos(t) * x[0] + ca.cos(t - shift) * x[1])
+        return problem
+
+    seed = solve(build(), Collocation(40, control="held"), parameters={"shift": -0.1})
+    stale = replace(seed, parameters={"shift": np.array([0.1])})
+    with pytest.raises(SolveError, match=r"switches are not in order within the horizon"):
+        solve(build(), Indirect(), parameters={"shift": 0.1}, guess=stale)
+    right = solve(build(), Indirect(), parameters={"shift": 0.1})
+    first, second = right.method["switches"]
+    assert first == pytest.approx(3 * np.pi - 5, abs=1e-9)
+    assert second > first
+
+
+def test_a_maximum_of_the_hamiltonian_is_no_extremal() -> None:
+    """H = -u^2/2 + lambda u is stationary at u = lambda, where it is greatest."""
+    problem = Problem("concave")
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u", lower=-1, upper=2, guess=0.1)
+    problem.horizon(1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=-(u**2) / 2, terminal=x**2)
+    with pytest.raises(SolveError, match="stationary but not least in control 'u'"):
+        solve(problem, Indirect())
+
+
+def test_a_saddle_of_the_hamiltonian_is_no_extremal() -> None:
+    """H = u1^2/2 + 3 u1 u2 + u2^2/2 + lambda (u1 + u2) has one stationary point, a saddle."""
+    problem = declare(lambda x, u: ca.sumsqr(u) / 2 + 3 * u[0] * u[1], size=2, name="saddle")
+    seed = solve(declare(lambda x, u: ca.sumsqr(u), size=2), Collocation(10))
+    with pytest.raises(SolveError, match="stationary but not least"):
+        solve(problem, Indirect(), guess=seed)
+
+
+def test_the_wrong_branch_of_a_heading_is_no_extremal() -> None:
+    """Both directions along the costate make H stationary; the one that goes uphill is a maximum."""
+    case = EXTREMA["heading"]
+    seed = solve(case.build(), case.direct, parameters=case.parameters)
+    turned = replace(seed, costates={"x": -seed.costates["x"]})
+    solution = solve(case.build(), Indirect(), parameters=case.parameters, guess=turned, check=False)
+    right = solve(case.build(), Indirect(), parameters=case.parameters, guess=seed)
+    assert (not solution.success) or abs(solution.cost - right.cost) < 1e-9
+
+
+def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:
+    """Bolza: the best horizon is 1/sqrt 2, beyond the upper bound 1/2."""
+    problem = Problem("short")
+    x = problem.state("x", initial=0.0, terminal=1.0)
+    u = problem.control("u", guess=1.0)
+    horizon = problem.horizon(lower=0.1, upper=0.5, guess=0.4)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2 / 2, terminal=horizon)
+    with pytest.raises(SolveError, match=r"horizon comes out as 0\.707107 s, beyond its bounds 0\.1 \.\. 0\.5 s"):
+        solve(problem, Indirect())
+
+
+def stiff(shove: float) -> Problem:
+    problem = Problem("stiff")
+    x = problem.state("x", 2, initial=[1.0, 0.0])
+    u = problem.control("u")
+    problem.horizon(10.0)
+    problem.dynamics(x, ca.vertcat(x[1], shove * (1 - x[0] ** 2) * x[1] - x[0] + u))
+    problem.minimize(running=(ca.sumsqr(x) + u**2) / 2)
+    return problem
+
+
+@pytest.mark.parametrize("shooting", ["multiple", "backward"])
+def test_newton_from_a_bad_guess_says_so_and_returns_what_it_has(
+    shooting: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    guess = solve(stiff(0.0), Collocation(5))
+    by = Indirect(segments=1, shooting=shooting)
+    with pytest.raises(SolveError, match=r"problem 'stiff': the indirect method failed:.*Newton") as caught:
+        solve(stiff(8.0), by, guess=guess)
+    assert caught.value.solution is not None
+    unsolved = solve(stiff(8.0), by, guess=guess, check=False)
+    assert not unsolved.success
+    assert not unsolved.status.startswith("Converged")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_guess_that_is_not_finite_is_a_failure_with_words() -> None:
+    seed = solve(van_der_pol(), Collocation(5))
+    broken = replace(seed, costates={"x": seed.costates["x"] * np.nan})
+    with pytest.raises(SolveError, match="the integration broke down at the seed"):
+        solve(van_der_pol(), Indirect(), guess=broken)
+    assert not solve(van_der_pol(), Indirect(), guess=broken, check=False).success
+
+
+def unreachable() -> Problem:
+    problem = Problem("unreachable")
+    x = problem.state("x", initial=0.0, terminal=10.0)
+    u = problem.control("u", lower=-1, upper=1)
+    problem.horizon(1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2)
+    return problem
+
+
+def test_a_failure_of_its_own_seed_is_named_as_such() -> None:
+    with pytest.raises(SolveError, match=r"direct solution that was to seed it failed: problem 'unreachable': ipopt"):
+        solve(unreachable(), Indirect())
+    unsolved = solve(unreachable(), Indirect(), check=False)
+    assert not unsolved.success
+    assert "seed" in unsolved.status
+
+
+def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
+    """A cycle without a drive may stand still anywhere: Newton's matrix is singular at a root."""
+    problem = Problem("anywhere")
+    x = problem.state("x", 2)
+    u = problem.control("u")
+    problem.horizon(2.0)
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.end("cyclic", x - problem.at_start(x), 0, 0)
+    problem.minimize(running=u**2 / 2)
+    solution = solve(problem, Indirect())
+    assert solution.cost == pytest.approx(0, abs=1e-12)
+    assert "not determined" in solution.status
