@@ -275,7 +275,7 @@ class PreparedIndirect:
                     if np.any(before != after):
                         cuts.append(bisect(partial(at_bound, first, q), a, b, before))
             cuts = [cut for cut in cuts if cut < 1.0 - 1e-9]
-            if q[1] <= SLACK * (q[0] + q[1]):
+            if abs(q[1]) <= SLACK * (abs(q[0]) + abs(q[1])):
                 continue  # an arc between two switches at once
             for a, b in zip(cuts, [*cuts[1:], 1.0], strict=True):
                 piece = np.concatenate([[q[0] + a * q[1], (b - a) * q[1]], q[2:]])

@@ -11,6 +11,7 @@ import numpy as np
 
 from ocp.describe import describe
 from ocp.errors import ProblemError, unknown_name
+from ocp.values import check_horizon, check_inside, check_order, constant, identity, is_symbolic, numeric, stacked
 
 __all__ = ["Constraint", "Problem", "Variable"]
 
@@ -405,73 +406,3 @@ class Problem:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
         pool[name] = Constraint(name, vector, low, high)
-
-
-def is_symbolic(value: Any) -> bool:
-    """Whether a value is an expression, or a list or tuple that holds one."""
-    if isinstance(value, list | tuple):
-        return any(is_symbolic(entry) for entry in value)
-    return isinstance(value, ca.SX | ca.MX)
-
-
-def stacked(what: str, value: Any) -> Any:
-    """An expression as one column; a list or tuple of expressions and numbers is stacked."""
-    try:
-        return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
-    except NotImplementedError as error:
-        raise ProblemError(f"{what}: a flat list of numbers and expressions is expected, not {value!r}") from error
-
-
-def identity(symbol: Any) -> int:
-    """A number that is the same for the same scalar SX or the same MX symbol."""
-    return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
-
-
-def numeric(what: str, value: Any) -> np.ndarray:
-    """A value as a flat float array, or ProblemError where it is none."""
-    return table(what, value).reshape(-1)
-
-
-def table(what: str, value: Any) -> np.ndarray:
-    """A value as a float array of its own shape, or ProblemError where it is none."""
-    try:
-        plain = value.full() if isinstance(value, ca.DM) else value
-        if np.asarray(plain).dtype.kind in "SU":  # numpy would read digits in a string
-            raise TypeError("a string")
-        return np.asarray(plain, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ProblemError(f"{what}: numbers or expressions are expected, not {value!r}") from error
-
-
-def constant(expression: Any) -> np.ndarray:
-    """Numbers of a column of constants, nan where an entry is an expression of parameters. Shape (n,)."""
-    entries = ca.vertsplit(expression)
-    if isinstance(expression, ca.MX):
-        if not ca.symvar(expression):
-            return np.asarray(ca.evalf(expression).full()).reshape(-1)
-        return np.full(len(entries), np.nan)
-    return np.array([float(entry) if entry.is_constant() else np.nan for entry in entries])
-
-
-def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise where a lower bound lies above its upper bound, or bounds cannot be met at all."""
-    for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        if low > high:
-            raise ProblemError(f"{what}: lower bound {low:g} is above upper bound {high:g} (entry {i})")
-        if low == np.inf or high == -np.inf:
-            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})")
-
-
-def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise where a value (nan: free) is infinite or lies outside its bounds (nan: not known yet)."""
-    for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
-        if np.isinf(number):
-            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free")
-        if number < low or number > high:
-            raise ProblemError(f"{what} value {number:g} is outside the bounds [{low:g}, {high:g}] (entry {i})")
-
-
-def check_horizon(what: str, value: np.ndarray) -> None:
-    """Raise unless a horizon is a positive finite number (nan: an expression of parameters)."""
-    if np.isinf(value[0]) or value[0] <= 0:
-        raise ProblemError(f"{what} must be positive and finite, not {value[0]:g} s")

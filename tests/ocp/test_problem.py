@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ocp import Collocation, Problem, ProblemError, solve
 from ocp.formulation import Formulation
-from ocp.problem import constant
+from ocp.values import constant
 from tests.ocp.problems import SWING, energy, swing
 
 nan, inf = np.nan, np.inf
