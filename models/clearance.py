@@ -1,0 +1,219 @@
+"""Distance between capsules, boxes and walls as casadi expressions, for constraints, indices and reports.
+
+A capsule is a segment with a radius. Distances are signed: negative where bodies overlap (as far as noted), and their
+derivative is that of the nearest pair of points. `soft_minimum` joins many into one smooth lower bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models.cts import INCH, Rig, dh_frames
+from models.errors import ModelError
+from models.parts import ArrayInput, checked_array, checked_rotation
+from models.spatial import Expression, expression
+
+SEARCH_STEPS = 40
+GOLDEN = (5**0.5 - 1) / 2
+ROUND = 1e-12  # m; rounds off the kink of a distance at zero
+
+
+class Capsule(NamedTuple):
+    """All points within `radius` (m) of the segment from `a` to `b`, in world. Shapes (3, 1), m."""
+
+    a: Expression
+    b: Expression
+    radius: Expression
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A solid box in world.
+
+    Attributes:
+        center: Shape (3,), m.
+        half: Half of its edges. Shape (3,), m; inf for a box without ends along an axis.
+        rotation: Its axes as columns, in world. Shape (3, 3).
+
+    Raises:
+        ModelError: A half edge that is not positive, or a rotation that is none.
+    """
+
+    center: ArrayInput
+    half: ArrayInput
+    rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", checked_array(self.center, (3,), "box", "center"))
+        object.__setattr__(self, "half", checked_array(self.half, (3,), "box", "half", finite=False))
+        object.__setattr__(self, "rotation", checked_rotation(self.rotation, "box", "rotation"))
+        if not (self.half > 0).all():
+            raise ModelError(f"box: half edges {self.half.tolist()} m must be positive")
+        if np.isinf(self.half).all():
+            raise ModelError("box: every half edge is infinite; there is no outside")
+
+    def local(self, point: Expression) -> Expression:
+        """Coordinates of a world point in the axes of the box, of its finite axes only."""
+        inside = ca.mtimes(ca.DM(self.rotation).T, expression(point) - ca.DM(self.center))
+        return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(self.half[k])])
+
+    def reach(self) -> Expression:
+        """Finite half edges, m."""
+        return ca.DM([h for h in self.half if np.isfinite(h)])
+
+
+def box_distance(point: Expression, box: Box) -> Expression:
+    """Distance of a point to a box, negative inside: there minus the way to the nearest face. Convex. Shape (1, 1)."""
+    over = ca.fabs(box.local(point)) - box.reach()
+    outside = ca.fmax(over, 0)
+    deepest = over[0]
+    for k in range(1, over.numel()):
+        deepest = ca.fmax(deepest, over[k])
+    return ca.sqrt(ca.dot(outside, outside) + ROUND**2) - ROUND + ca.fmin(deepest, 0)
+
+
+def capsule_to_box(capsule: Capsule, box: Box) -> Expression:
+    """Distance of a capsule to a solid box. Shape (1, 1), m.
+
+    The distance of a box is convex along the segment: a golden-section search of fixed length finds the nearest
+    point, good to 1e-8 of the segment. Its place is piecewise constant to differentiation, as the theorem of the
+    envelope wants it.
+    """
+    a, b, radius = expression(capsule.a), expression(capsule.b), capsule.radius
+
+    def at(s: Expression) -> Expression:
+        return box_distance(a + s * (b - a), box)
+
+    low, high = 0.0, 1.0
+    left, right = 1 - GOLDEN, GOLDEN
+    f_left, f_right = at(left), at(right)
+    for _ in range(SEARCH_STEPS):
+        lower = f_left < f_right
+        low, high = ca.if_else(lower, low, left), ca.if_else(lower, right, high)
+        fresh = ca.if_else(lower, high - GOLDEN * (high - low), low + GOLDEN * (high - low))
+        value = at(fresh)
+        left, right, f_left, f_right = (
+            ca.if_else(lower, fresh, right),
+            ca.if_else(lower, left, fresh),
+            ca.if_else(lower, value, f_right),
+            ca.if_else(lower, f_left, value),
+        )
+    best = ca.fmin(at((low + high) / 2), ca.fmin(at(0.0), at(1.0)))
+    return best - radius
+
+
+def capsule_in_box(capsule: Capsule, walls: Box) -> Expression:
+    """Distance of a capsule inside a hollow box to its nearest wall, negative beyond it. Shape (1, 1), m."""
+    gaps = [walls.reach() - ca.fabs(walls.local(end)) for end in (capsule.a, capsule.b)]
+    both = ca.vertcat(*gaps)
+    least = both[0]
+    for k in range(1, both.numel()):
+        least = ca.fmin(least, both[k])
+    return least - capsule.radius
+
+
+def capsule_to_capsule(one: Capsule, other: Capsule) -> Expression:
+    """Distance of two capsules; of overlapping ones minus the overlap of radii. Shape (1, 1), m.
+
+    Nearest points of two segments in closed form (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
+    """
+    p, q = expression(one.a), expression(other.a)
+    u, v = expression(one.b) - p, expression(other.b) - q
+    gap = p - q
+    a, e, b = ca.dot(u, u) + ROUND**2, ca.dot(v, v) + ROUND**2, ca.dot(u, v)
+    c, f = ca.dot(u, gap), ca.dot(v, gap)
+    slack = a * e - b * b
+    s = _clip(ca.if_else(slack > 1e-12 * a * e, (b * f - c * e) / (slack + 1e-300), 0.0))
+    t = _clip((b * s + f) / e)
+    s = _clip((b * t - c) / a)
+    apart = gap + s * u - t * v
+    return ca.sqrt(ca.dot(apart, apart) + ROUND**2) - ROUND - one.radius - other.radius
+
+
+def _clip(x: Expression) -> Expression:
+    return ca.fmin(ca.fmax(x, 0), 1)
+
+
+def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
+    """A smooth lower bound of the least of n values, at most width log(n) below it. Shape (1, 1).
+
+    Raises:
+        ModelError: No value, or a width that is not positive.
+    """
+    if not values:
+        raise ModelError("soft_minimum of no values")
+    if not (np.isfinite(width) and width > 0):
+        raise ModelError(f"soft_minimum: width {width} must be positive")
+    stacked = ca.vertcat(*values)
+    least = values[0]
+    for value in values[1:]:
+        least = ca.fmin(least, value)
+    return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
+
+
+@dataclass(frozen=True)
+class Radii:
+    """Radii of the rig's capsules, m: yaw links, pitch link, goose-neck and sting."""
+
+    yaw: float = 2.0 * INCH
+    pitch: float = 1.5 * INCH
+    sting: float = 0.75 * INCH
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the rig must not touch.
+
+    Attributes:
+        walls: The tunnel, hollow; its floor is a wall. None for no walls.
+        solids: The floor's fittings, the parent aircraft, ... as boxes.
+        capsules: The same as capsules, in world.
+    """
+
+    walls: Box | None = None
+    solids: tuple[Box, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
+
+
+def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, Capsule]:
+    """Links of the rig as capsules, by name, from joint 2 to the store."""
+    radii = radii or Radii()
+    frames = dh_frames(rig, q)
+    joint2, joint3, joint4 = (frames[k].position for k in (1, 2, 3))
+    side = frames[3].point((0, 0, rig.yaw_offset))
+    corner, tool = frames[4].position, frames[7]
+    behind = tool.point((-rig.sting, 0, 0))
+    return {
+        "yaw link 1": Capsule(joint2, joint3, radii.yaw),
+        "yaw link 2": Capsule(joint3, joint4, radii.yaw),
+        "yaw offset": Capsule(joint4, side, radii.yaw),
+        "pitch link": Capsule(side, corner, radii.pitch),
+        "goose-neck": Capsule(corner, behind, radii.sting),
+        "sting": Capsule(behind, tool.position, radii.sting),
+    }
+
+
+def clearances(
+    rig: Rig, q: Expression, surroundings: Surroundings, radii: Radii | None = None
+) -> dict[tuple[str, str], Expression]:
+    """Distance of every link to everything around it, by (link, thing). Each of shape (1, 1), m.
+
+    Raises:
+        ModelError: Nothing around.
+    """
+    found: dict[tuple[str, str], Expression] = {}
+    for name, capsule in rig_capsules(rig, q, radii).items():
+        if surroundings.walls is not None:
+            found[name, "walls"] = capsule_in_box(capsule, surroundings.walls)
+        for k, box in enumerate(surroundings.solids):
+            found[name, f"solid {k}"] = capsule_to_box(capsule, box)
+        for k, other in enumerate(surroundings.capsules):
+            found[name, f"capsule {k}"] = capsule_to_capsule(capsule, other)
+    if not found:
+        raise ModelError("clearances: the surroundings are empty; give walls, solids or capsules")
+    return found

@@ -1,0 +1,289 @@
+"""Captive trajectory rig: six joints P-R-R-R-R-R that hold a store model on a goose-neck sting (Lee, Lee 2017).
+
+Yaw comes from joints 2 and 3, pitch from 4 and 5, roll from 6 alone. The task leaves the roll open, so that roll is a
+functional redundancy: it moves the corner P_G of the goose-neck and nothing else of the task. Equation numbers are the
+paper's; several are misprinted there and stand here corrected, as the D-H product demands.
+
+World is the rig's base frame: x along the prismatic joint towards the nose of the store, z up. A *target* is
+(x, y, z, yaw, pitch) of the tool frame in world, shape (5,), m and rad; a *pose* is a target and its roll, shape (6,).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array, ArrayInput, checked_array
+from models.spatial import Expression, Frame, expression, rotation
+
+INCH = 0.0254
+LENGTHS = ("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck")
+HALF_PI = np.pi / 2
+FLOOR = 1e-32  # under square roots: keeps derivatives finite where an arm is stretched
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Lengths and joint limits.
+
+    Attributes:
+        yaw_link_1, yaw_link_2: Ly1 and Ly2, the links after joints 2 and 3. m.
+        yaw_offset: Lm, sideways from joint 3's link to joint 4. m.
+        pitch_link: Lp1, from joint 4 to joint 5. m.
+        sting: Lp2, from the goose-neck's corner along the tool axis to the store. m.
+        goose_neck: Lg, from the sting's axis to the axis of joint 6. m.
+        lower, upper: Of the joints, m for the first and rad for the others. Shape (6,). A revolute joint has both
+            limits or none; an angle is the same after a full turn, so a position is taken in the turn nearest to the
+            middle of the limits.
+
+    Raises:
+        ModelError: A length that is not positive, limits that are crossed, or one limit of a revolute joint alone.
+    """
+
+    yaw_link_1: float
+    yaw_link_2: float
+    yaw_offset: float
+    pitch_link: float
+    sting: float
+    goose_neck: float
+    lower: ArrayInput = (-np.inf,) * 6
+    upper: ArrayInput = (np.inf,) * 6
+
+    def __post_init__(self) -> None:
+        for name in LENGTHS:
+            length = checked_array(getattr(self, name), (), "rig", name).item()
+            if length <= 0:
+                raise ModelError(f"rig: {name} is {length} m; every length must be positive")
+            object.__setattr__(self, name, length)
+        for name in ("lower", "upper"):
+            object.__setattr__(self, name, checked_array(getattr(self, name), (6,), "rig", name, finite=False))
+        for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
+            if not low < high:
+                raise ModelError(f"rig: joint {joint} has lower limit {low} not below its upper limit {high}")
+            if joint > 1 and np.isfinite(low) != np.isfinite(high):
+                raise ModelError(f"rig: joint {joint} has limits {low} .. {high}; give a revolute joint both or none")
+
+    def limited(self, joint: int) -> bool:
+        """Whether revolute joint 2..6 (counted from 1) has limits less than a full turn apart."""
+        return bool(self.upper[joint - 1] - self.lower[joint - 1] < 2 * np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Tunnel:
+    """What the index I1 measures the goose-neck's corner against, (35).
+
+    Attributes:
+        center: P_C in world. Shape (3,), m.
+        ranges: P_M - P_m, the useful extent along x, y, z. Shape (3,), m.
+        weights: w1, w2, w3. Shape (3,).
+
+    Raises:
+        ModelError: A range that is not positive, a negative weight, wrong shapes.
+    """
+
+    center: ArrayInput
+    ranges: ArrayInput
+    weights: ArrayInput = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        for name in ("center", "ranges", "weights"):
+            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "tunnel", name))
+        if not (self.ranges > 0).all():
+            raise ModelError(f"tunnel: ranges {self.ranges.tolist()} m must be positive")
+        if not (self.weights >= 0).all():
+            raise ModelError(f"tunnel: weights {self.weights.tolist()} must not be negative")
+
+    @property
+    def scale(self) -> Array:
+        """Diagonal of D, w / range^2. Shape (3,), 1/m^2."""
+        return np.asarray(self.weights / self.ranges**2)
+
+
+class Branch(NamedTuple):
+    """One of the four ways to reach a pose.
+
+    Attributes:
+        yaw: Sign of sin q2: +1 for q2 = +acos(.) in (25), -1 for -acos(.), the side of the home position.
+        pitch: Sign of cos q4: +1 for the principal asin in (23), -1 for pi minus it.
+    """
+
+    yaw: int = -1
+    pitch: int = 1
+
+
+BRANCHES = (Branch(-1, 1), Branch(-1, -1), Branch(1, 1), Branch(1, -1))
+HOME = BRANCHES[0]
+
+
+class Posture(NamedTuple):
+    """What a target, a roll and a branch make of the rig; scalar expressions unless said otherwise.
+
+    Attributes:
+        corner: P_G in world. Shape (3, 1), m.
+        sin4, cos4, sin2, cos2: Of the joint angles. sin4 and cos2 leave [-1, 1] where the pose is out of reach, and
+            their partners are as good as 0 there.
+        q1: Position of the prismatic joint, m.
+    """
+
+    corner: Expression
+    sin4: Expression
+    cos4: Expression
+    sin2: Expression
+    cos2: Expression
+    q1: Expression
+
+
+def reference_rig(**limits: Any) -> Rig:
+    """The rig of the reference numbers. The paper prints no lengths: these are chosen, 20, 20, 4, 30, 20, 10 in."""
+    return Rig(*(INCH * length for length in (20.0, 20.0, 4.0, 30.0, 20.0, 10.0)), **limits)
+
+
+def reference_tunnel() -> Tunnel:
+    """The tunnel of the reference numbers, chosen: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1."""
+    return Tunnel(INCH * np.array([80.0, 0.0, 0.0]), INCH * np.array([60.0, 48.0, 40.0]))
+
+
+# ---- forward ---------------------------------------------------------------------------------------------------
+
+
+def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
+    """Frames 0..6 and the tool in world by the D-H product (1)-(4), Table 1 with q2 and q5 taken as they are.
+
+    Args:
+        q: Joint positions. Shape (6, 1).
+    """
+    q = expression(q)
+    rows = (
+        (0.0, q[0], 0.0, -HALF_PI),
+        (q[1], 0.0, rig.yaw_link_1, 0.0),
+        (q[2], 0.0, rig.yaw_link_2, -HALF_PI),
+        (q[3], rig.yaw_offset, rig.pitch_link, 0.0),
+        (q[4], 0.0, 0.0, HALF_PI),
+        (q[5], rig.sting, rig.goose_neck, 0.0),
+    )
+    frames = [Frame(ca.DM([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), ca.DM.zeros(3))]
+    for theta, d, a, alpha in rows:
+        turn = ca.mtimes(rotation((0, 0, 1), theta), rotation((1, 0, 0), alpha))
+        shift = ca.vertcat(a * ca.cos(theta), a * ca.sin(theta), d)
+        last = frames[-1]
+        frames.append(Frame(ca.mtimes(last.rotation, turn), last.point(shift)))
+    tool = ca.mtimes(frames[-1].rotation, rotation((0, 1, 0), -HALF_PI))
+    return [*frames, Frame(tool, frames[-1].position)]
+
+
+def tool_frame(rig: Rig, q: Expression) -> Frame:
+    """Tool frame in world by the closed expressions (6)-(14), (19)-(21)."""
+    q = expression(q)
+    c23, s23 = ca.cos(q[1] + q[2]), ca.sin(q[1] + q[2])
+    c45, s45 = ca.cos(q[3] + q[4]), ca.sin(q[3] + q[4])
+    c6, s6 = ca.cos(q[5]), ca.sin(q[5])
+    turn = ca.vertcat(
+        ca.horzcat(-s23 * s45, c45 * s23 * s6 - c23 * c6, c23 * s6 + c45 * s23 * c6),
+        ca.horzcat(c23 * s45, -s23 * c6 - c23 * c45 * s6, s23 * s6 - c23 * c45 * c6),
+        ca.horzcat(c45, s45 * s6, s45 * c6),
+    )
+    return Frame(turn, forward(rig, q)[:3])
+
+
+def forward(rig: Rig, q: Expression) -> Expression:
+    """Pose (x, y, z, yaw, pitch, roll) of the tool in world, (16)-(22). Shape (6, 1), m and rad.
+
+    Yaw and pitch are the sums of the joint angles, not folded into one turn.
+    """
+    q = expression(q)
+    c23, s23 = ca.cos(q[1] + q[2]), ca.sin(q[1] + q[2])
+    c45, s45 = ca.cos(q[3] + q[4]), ca.sin(q[3] + q[4])
+    c6, s6 = ca.cos(q[5]), ca.sin(q[5])
+    along = rig.yaw_link_2 + rig.pitch_link * ca.cos(q[3]) + rig.sting * s45 + rig.goose_neck * c45 * c6
+    aside = rig.yaw_offset + rig.goose_neck * s6
+    return ca.vertcat(
+        q[0] - rig.yaw_link_1 * ca.sin(q[1]) - s23 * along - c23 * aside,
+        rig.yaw_link_1 * ca.cos(q[1]) + c23 * along - s23 * aside,
+        rig.sting * c45 - rig.pitch_link * ca.sin(q[3]) - rig.goose_neck * s45 * c6,
+        q[1] + q[2] + HALF_PI,
+        q[3] + q[4] - HALF_PI,
+        q[5],
+    )
+
+
+def task_jacobian(rig: Rig, q: Expression) -> Expression:
+    """Derivative of the target (x, y, z, yaw, pitch) by the joints, the Jacobian of Table 3. Shape (5, 6)."""
+    joints = ca.SX.sym("q", 6)
+    jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
+    return jacobian(q)
+
+
+# ---- inverse ---------------------------------------------------------------------------------------------------
+
+
+def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
+    """P_G = p - Lp2 x + Lg z in tool axes, (32)-(34), in world. Shape (3, 1), m."""
+    roll = expression(roll)
+    return corner_at(rig, expression(target), ca.cos(roll), ca.sin(roll))
+
+
+def corner_at(rig: Rig, target: Expression, c: Expression, s: Expression) -> Expression:
+    """P_G for a roll given by its cosine and sine. Shape (3, 1), m."""
+    axle, cosine_part, sine_part = corner_circle(rig, target)
+    return axle + rig.goose_neck * (c * cosine_part + s * sine_part)
+
+
+def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression, Expression]:
+    """Circle on which roll moves P_G: its centre (m, in world), and the axes e_c, e_s of cosine and sine. (3, 1)."""
+    c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
+    c_pitch, s_pitch = ca.cos(target[4]), ca.sin(target[4])
+    axle = target[:3] - rig.sting * ca.vertcat(c_yaw * c_pitch, s_yaw * c_pitch, -s_pitch)
+    zero = target[0] * 0
+    return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
+
+
+def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> Posture:
+    """Joint angles but for their arcs, for a roll given by its cosine and sine: (23), (25), (27)."""
+    corner = corner_at(rig, target, c, s)
+    c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
+    sin4 = -corner[2] / rig.pitch_link
+    cos4 = branch.pitch * ca.sqrt(ca.fmax((1 - sin4) * (1 + sin4), FLOOR))
+    along = rig.yaw_link_2 + rig.pitch_link * cos4
+    cos2 = (corner[1] - along * s_yaw - rig.yaw_offset * c_yaw) / rig.yaw_link_1
+    sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), FLOOR))
+    q1 = corner[0] - along * c_yaw + rig.yaw_offset * s_yaw + rig.yaw_link_1 * sin2
+    return Posture(corner, sin4, cos4, sin2, cos2, q1)
+
+
+def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOME) -> tuple[Expression, Expression]:
+    """Joints that hold a target with a given roll, (23)-(27).
+
+    Args:
+        target: (x, y, z, yaw, pitch) in world. Shape (5, 1), m and rad.
+        roll: rad.
+        branch: Which of the four joint sets.
+
+    Returns:
+        The joints, shape (6, 1), and the reach left, shape (2, 1): 1 - |sin q4| and 1 - |cos q2|. Where one of them is
+        negative the pose is out of reach and the joints, though finite, do not hold it. q2 and q4 lie in (-pi, pi] and
+        q3, q5 make up the yaw and pitch of the target, unless limits ask for another turn.
+    """
+    target, roll = expression(target), expression(roll)
+    posture = posture_at(rig, target, ca.cos(roll), ca.sin(roll), branch)
+    return joints_of(rig, target, roll, posture), reach_of(posture)
+
+
+def reach_of(posture: Posture) -> Expression:
+    """1 - |sin q4| and 1 - |cos q2|, negative out of reach. Shape (2, 1)."""
+    return ca.vertcat(1 - ca.fabs(posture.sin4), 1 - ca.fabs(posture.cos2))
+
+
+def joints_of(rig: Rig, target: Expression, roll: Expression, posture: Posture) -> Expression:
+    """Joint positions of a posture, each in the turn nearest to the middle of its limits. Shape (6, 1)."""
+    q2 = ca.atan2(posture.sin2, posture.cos2)
+    q4 = ca.atan2(posture.sin4, posture.cos4)
+    angles = [q2, target[3] - q2 - HALF_PI, q4, target[4] - q4 + HALF_PI]
+    for k, angle in enumerate(angles, 1):
+        if np.isfinite(rig.lower[k]):
+            middle = (rig.lower[k] + rig.upper[k]) / 2
+            angles[k - 1] = angle - 2 * np.pi * ca.floor((angle - middle) / (2 * np.pi) + 0.5)
+    return ca.vertcat(posture.q1, *angles, roll)

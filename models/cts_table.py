@@ -1,0 +1,211 @@
+"""Grid mode: a table of poses in, a table of joints out, rows that cannot be held marked with the reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.cts import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
+from models.cts_iterations import checked_targets
+from models.cts_optimal import optimal_inverse
+from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
+from models.errors import ModelError
+from models.parts import Array, ArrayInput
+
+TURN = 2 * np.pi
+TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Joints for a table of targets.
+
+    Attributes:
+        targets: Shape (samples, 5), m and rad.
+        joints: Shape (samples, 6), m and rad; nan in the rows that are not ok.
+        cost: Index of the roll, nan in the rows that are not ok. Shape (samples,).
+        status: One of cts_roll.STATUS for each row: "ok", or why there are no joints.
+        active: One of cts_roll.ACTIVE for each row: the constraint that holds the roll, "free" where none does, ""
+            where the row is not ok.
+        branch: The branch of each row, None where the row is not ok.
+    """
+
+    targets: Array
+    joints: Array
+    cost: Array
+    status: tuple[str, ...]
+    active: tuple[str, ...]
+    branch: tuple[Branch | None, ...]
+
+    @property
+    def ok(self) -> Any:
+        """Which rows have joints. Shape (samples,), bool."""
+        return np.array([status == "ok" for status in self.status])
+
+
+def solve_table(
+    rig: Rig,
+    tunnel: Tunnel,
+    targets: ArrayInput,
+    *,
+    branches: Sequence[Branch] = (HOME,),
+    previous: ArrayInput = 0.0,
+    in_sequence: bool = False,
+    rate_weight: float = 0.0,
+) -> Table:
+    """Joints of least index for every target; a bad row is marked and does not touch the others.
+
+    Args:
+        targets: Shape (samples, 5), m and rad; rows may hold nan.
+        branches: The joint sets to choose from: of those that hold the target the one of least index, the first of
+            equals.
+        previous: Roll before each target, rad, shape (samples,) or one for all; with in_sequence before the first.
+        in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows that are not ok are
+            passed over.
+        rate_weight: w4 of I2; 0 for I1.
+
+    Raises:
+        ModelError: An empty table, another shape, no branch, an unknown branch, a previous roll that is not finite.
+    """
+    rows = checked_targets(targets, finite=False)
+    chosen = [checked_branch(branch) for branch in branches]
+    if not chosen:
+        raise ModelError("branches is empty; give at least one, for example (HOME,)")
+    count = len(rows)
+    try:
+        before = np.broadcast_to(np.asarray(previous, dtype=float), (count,))
+    except ValueError as error:
+        raise ModelError(f"previous has shape {np.shape(previous)}, expected () or ({count},)") from error
+    if not np.isfinite(before).all():
+        raise ModelError("previous holds a roll that is not finite")
+    functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
+    if in_sequence:
+        roll, steps = float(before[0]), []
+        for row in rows:
+            steps.append(_best([f(row, roll) for f in functions]))
+            if steps[-1][9] == 0:
+                roll = float(steps[-1][5])
+        found = np.array(steps)
+    else:
+        found = _best([f.map(count)(rows.T, before[None]) for f in functions])
+        found = found.reshape(count, -1)
+    status = tuple(STATUS[int(code)] for code in found[:, 9])
+    fine = found[:, 9] == 0
+    active = tuple(ACTIVE[int(code)] if good else "" for code, good in zip(found[:, 8], fine, strict=True))
+    branch = tuple(chosen[int(i)] if good else None for i, good in zip(found[:, 7], fine, strict=True))
+    return Table(rows, found[:, :6], found[:, 6], status, active, branch)
+
+
+def _best(results: list[Any]) -> Array:
+    """Of the branches' results the best, per row: joints, cost, branch number, active, status. Shape (samples, 10)."""
+    best: Array | None = None
+    for number, (joints, cost, active, status) in enumerate(results):
+        columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
+        rows = np.vstack([columns[0], columns[1], np.full_like(columns[1], number), columns[2], columns[3]]).T
+        if best is None:
+            best = rows
+            continue
+        solved, known = rows[:, 9] == 0, best[:, 9] == 0
+        better = solved & (~known | (rows[:, 6] < best[:, 6] - 1e-12))
+        nearer = ~solved & ~known & (rows[:, 9] > best[:, 9])  # the branch that came furthest names the reason
+        best = np.where((better | nearer)[:, None], rows, best)
+    assert best is not None
+    return best if len(best) > 1 else best[0]
+
+
+def checked_branch(branch: Branch) -> Branch:
+    """The branch itself; ModelError unless it is one of the four."""
+    if tuple(branch) not in [tuple(known) for known in BRANCHES]:
+        raise ModelError(f"branch {branch!r} is not one of {BRANCHES}")
+    return Branch(*branch)
+
+
+@dataclass(frozen=True)
+class Arc:
+    """A range of rolls that reach within all limits.
+
+    Attributes:
+        start, end: rad, end >= start; a whole turn is -pi .. pi.
+        holds: Constraints (of cts_roll.ACTIVE) at start and end; ("free", "free") for a whole turn.
+    """
+
+    start: float
+    end: float
+    holds: tuple[str, str]
+
+
+def reachable_arcs(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[Arc]:
+    """All rolls, modulo a turn, that hold a target within reach and joint limits, start in [-pi, pi).
+
+    Args:
+        target: Shape (5,), m and rad.
+
+    Raises:
+        ModelError: A target of another shape or not finite.
+    """
+    row = checked_targets([target])[0]
+    ends, feasible = arc_functions(rig, checked_branch(branch))
+    points = np.array(ends(row))
+    turns = np.arctan2(points[1], points[0])
+    order = np.argsort(turns)
+    turns, codes = turns[order], points[2][order].astype(int)
+    if not len(turns):
+        turns, codes = np.array([-np.pi]), np.array([0])
+    middles = (turns + np.append(turns[1:], turns[0] + TURN)) / 2
+    inside = np.array(feasible.map(len(middles))(row, middles[None])).ravel() > 0
+    if inside.all():
+        return [Arc(-np.pi, np.pi, ("free", "free"))]
+    arcs = []
+    count = len(turns)
+    for k in np.flatnonzero(inside & ~np.roll(inside, 1)):
+        last = int(k)
+        while inside[(last + 1) % count]:
+            last += 1
+        stop = (last + 1) % count
+        end = float(turns[stop] + (TURN if turns[stop] <= turns[k] else 0.0))
+        arcs.append(Arc(float(turns[k]), end, (ACTIVE[codes[k]], ACTIVE[codes[stop]])))
+    return arcs
+
+
+def arc_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
+    """Functions (target) -> points that hold all ends of arcs, rows cosine, sine, code; (target, roll) -> 1 or 0."""
+    target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
+    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in angle_ends(rig, target, branch)])
+    x = ca.MX.sym("target", 5)
+    parts = [ca.Function("angle_ends", [target], [angle])(x)]
+    for upper in (False, True):
+        if np.isfinite((rig.upper if upper else rig.lower)[0]):
+            found = slide_ends(rig, branch, upper)(x)
+            parts.append(ca.vertcat(found, ca.DM.ones(1, 8) * limit_code(1, upper)))
+    ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
+    c, s = ca.cos(roll), ca.sin(roll)
+    meets = verdict(rig, target, posture_at(rig, target, c, s, branch), c, s)
+    inside = ca.logic_and(ca.logic_and(meets.pitch, meets.yaw), ca.logic_and(meets.angles, meets.slide))
+    return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
+
+
+def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
+    """Every branch that reaches a target with a given roll, and its joints, shape (6,); joint limits are not asked.
+
+    Raises:
+        ModelError: A target or roll that is not finite; a pose that no branch reaches, naming the link.
+    """
+    row = checked_targets([target])[0]
+    if not np.isfinite(roll):
+        raise ModelError(f"roll {roll} is not finite")
+    found, short = [], []
+    for branch in BRANCHES:
+        joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
+        margin = np.array(reach).ravel()
+        short.append(margin)
+        if (margin >= 0).all():
+            found.append((branch, np.array(joints).ravel()))
+    if not found:
+        pitch, yaw = np.max(short, axis=0)
+        link, by = ("pitch", pitch * rig.pitch_link) if pitch < 0 else ("yaw", yaw * rig.yaw_link_1)
+        raise ModelError(f"target {row.tolist()} with roll {roll} rad: the {link} link is {-by:.4g} m too short")
+    return found

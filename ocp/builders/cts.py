@@ -1,0 +1,154 @@
+"""Roll of the captive trajectory rig planned over the whole trajectory: no lag behind what is to come, limits of rates.
+
+The paper resolves each target by itself, with the change of roll since the last one in the index (38): the plan lags
+behind what is to come. Here the integral of I1 and of the squared roll rate is least over all targets at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import ModelError
+from models.clearance import Radii, Surroundings, clearances, soft_minimum
+from models.cts import HOME, Branch, Rig, Tunnel, joints_of, posture_at
+from models.cts_iterations import checked_targets
+from models.cts_optimal import optimal_inverse
+from models.cts_roll import index_harmonics
+from ocp.errors import ProblemError
+from ocp.guess import Samples
+from ocp.problem import Problem
+
+__all__ = ["roll_plan", "spline_targets"]
+
+Targets = Callable[[Any], Any]
+REACH = 1 - 1e-9
+
+
+def spline_targets(times: Any, targets: Any) -> Targets:
+    """Cubic spline through a table of targets, as a function of time for a problem with MX symbols.
+
+    Args:
+        times: Increasing, shape (samples,), s; at least 4.
+        targets: Shape (samples, 5), m and rad.
+
+    Raises:
+        ProblemError: Fewer than 4 samples, times that do not increase, or targets of another shape or not finite.
+    """
+    t = np.asarray(times, dtype=float)
+    try:
+        rows = checked_targets(targets)
+    except ModelError as error:
+        raise ProblemError(str(error)) from error
+    if t.shape != (len(rows),) or len(t) < 4 or not (np.diff(t) > 0).all():
+        raise ProblemError(
+            f"times of shape {t.shape} must increase, one for each of the {len(rows)} targets, 4 at least"
+        )
+    curve = ca.interpolant("targets", "bspline", [t], rows.ravel())
+    return lambda time: curve(time)
+
+
+def roll_plan(
+    rig: Rig,
+    tunnel: Tunnel,
+    targets: Targets,
+    horizon: float,
+    *,
+    branch: Branch = HOME,
+    rate_weight: float = 0.05,
+    acceleration_weight: float = 1e-4,
+    rate_limit: float = np.inf,
+    acceleration_limit: float = np.inf,
+    start_roll: float | None = None,
+    start_rate: float | None = None,
+    surroundings: Surroundings | None = None,
+    clearance: float = 0.0,
+    softness: float = 2e-3,
+    radii: Radii | None = None,
+    symbols: Any = ca.MX,
+) -> Problem:
+    """Roll over a whole trajectory of targets, of least integral of I1 + w rate^2 + v acceleration^2.
+
+    States "roll" (rad) and "rate" (rad/s), control "acceleration" (rad/s^2). The path constraints "reach" (sin q4 and
+    cos q2) and "limits" keep the rig within its reach and joint limits, "clearance" a distance from its surroundings.
+
+    Args:
+        targets: Function of `problem.time` (s) that returns the target, shape (5, 1): expressions, or spline_targets.
+        horizon: s.
+        branch: Which of the four joint sets.
+        rate_weight, acceleration_weight: w in s^2 and v in s^4; v keeps the control smooth.
+        rate_limit, acceleration_limit: rad/s and rad/s^2.
+        start_roll, start_rate: At time 0; free where None.
+        surroundings: What to keep away from; None for nothing.
+        clearance: Least distance from it, m.
+        softness: Width of the smooth minimum of all distances, m, see clearance.soft_minimum.
+        radii: Of the rig's capsules.
+        symbols: casadi.MX, or casadi.SX where the targets are plain expressions.
+
+    Returns:
+        The problem; its guess is the global optimum of I1 of each target by itself, unwound.
+
+    Raises:
+        ProblemError: Weights or limits that are negative, a horizon that is not positive, a target on the way that
+            no roll reaches, a start outside the limits.
+    """
+    for name, value in (
+        ("rate_weight", rate_weight),
+        ("acceleration_weight", acceleration_weight),
+        ("rate_limit", rate_limit),
+        ("acceleration_limit", acceleration_limit),
+    ):
+        if not value >= 0:
+            raise ProblemError(f"roll_plan: {name} {value} must not be negative")
+    if not (np.isfinite(horizon) and horizon > 0):
+        raise ProblemError(f"roll_plan: horizon {horizon} s must be positive and finite")
+    guess = _guess(rig, tunnel, targets, horizon, branch, start_roll, symbols)
+
+    problem = Problem("roll plan", symbols=symbols)
+    roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=guess)
+    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=0.0)
+    pull = problem.control("acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0)
+    problem.horizon(horizon)
+    problem.dynamics(roll, rate)
+    problem.dynamics(rate, pull)
+    target = targets(problem.time)
+    target = ca.vertcat(*target) if isinstance(target, list | tuple) else target
+    x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
+    c, s = ca.cos(phi), ca.sin(phi)
+    posture = posture_at(rig, x, c, s, branch)
+    joints = joints_of(rig, x, phi, posture)
+    index = ca.Function("index", [x, phi], [index_harmonics(rig, tunnel, x).value(c, s)])
+    reach = ca.Function("reach", [x, phi], [ca.vertcat(posture.sin4, posture.cos2)])
+    problem.path("reach", reach(target, roll), -REACH, REACH)
+    held = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
+    if held:
+        limited = ca.Function("joints", [x, phi], [ca.vertcat(*[joints[k] for k in held])])
+        problem.path("limits", limited(target, roll), rig.lower[held], rig.upper[held])
+    if surroundings is not None:
+        least = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
+        problem.path("clearance", ca.Function("gap", [x, phi], [least])(target, roll), clearance)
+    problem.minimize(running=index(target, roll) + rate_weight * rate**2 + acceleration_weight * pull**2)
+    return problem
+
+
+def _guess(
+    rig: Rig, tunnel: Tunnel, targets: Targets, horizon: float, branch: Branch, start: float | None, symbols: Any
+) -> Samples:
+    """Roll of least I1 at each time by itself, each in the turn nearest to the one before."""
+    time = symbols.sym("time")
+    target = targets(time)
+    target = ca.vertcat(*target) if isinstance(target, list | tuple) else target
+    function = ca.Function("target", [time], [target])
+    best = optimal_inverse(rig, tunnel, branch)
+    t = np.linspace(0, horizon, 101)
+    rolls, last = [], 0.0 if start is None else float(start)
+    for at in t:
+        joints, _, _, status = best(function(at), last)
+        if int(status):
+            raise ProblemError(f"roll_plan: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
+        last = float(joints[5])
+        rolls.append(last)
+    return Samples(t, np.array(rolls)[:, None])

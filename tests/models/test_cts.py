@@ -1,0 +1,277 @@
+"""The captive trajectory rig: forward against the D-H product, inverse against forward, and the paper's misprints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.cts import (
+    BRANCHES,
+    HOME,
+    INCH,
+    Branch,
+    Rig,
+    Tunnel,
+    dh_frames,
+    forward,
+    goose_neck_corner,
+    inverse,
+    reference_rig,
+    reference_tunnel,
+    task_jacobian,
+    tool_frame,
+)
+from models.cts_roll import index_harmonics
+from models.errors import ModelError
+from tests.models.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
+
+lengths = st.lists(st.floats(0.02, 3.0), min_size=6, max_size=6)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_joints(seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.uniform(-2, 2, 1), rng.uniform(-np.pi, np.pi, 5)])
+
+
+def numeric(value: Any) -> Array:
+    return np.array(ca.DM(value), dtype=float)
+
+
+def pose_of(rig: Rig, q: Array) -> Array:
+    return numeric(forward(rig, ca.DM(q))).ravel()
+
+
+@given(lengths, seeds)
+def test_closed_forward_is_the_dh_product(sizes: list[float], seed: int) -> None:
+    rig, q = Rig(*sizes), random_joints(seed)
+    product, closed = dh_frames(rig, q)[-1], tool_frame(rig, q)
+    np.testing.assert_allclose(numeric(closed.rotation), numeric(product.rotation), atol=1e-12)
+    np.testing.assert_allclose(numeric(closed.position), numeric(product.position), atol=1e-12)
+
+
+@given(lengths, seeds)
+def test_tool_rotation_is_yaw_pitch_roll_of_the_pose(sizes: list[float], seed: int) -> None:
+    rig, q = Rig(*sizes), random_joints(seed)
+    yaw, pitch, roll = pose_of(rig, q)[3:]
+    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    turn_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    turn_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    turn_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    np.testing.assert_allclose(numeric(tool_frame(rig, q).rotation), turn_z @ turn_y @ turn_x, atol=1e-12)
+
+
+def test_inverse_of_forward_holds_the_joints_among_its_branches() -> None:
+    rig, count = reference_rig(), 100_000
+    q = np.random.default_rng(6).uniform(-np.pi, np.pi, (6, count))
+    # a stretched link amplifies the rounding of the pose itself by 1 / |cos q4 sin q2|
+    bent = np.abs(np.cos(q[3]) * np.sin(q[1]))
+    joints, x, roll = ca.SX.sym("q", 6), ca.SX.sym("x", 5), ca.SX.sym("roll")
+    pose = np.array(ca.Function("f", [joints], [forward(rig, joints)]).map(count)(q))
+    nearest = np.full(count, np.inf)
+    for branch in BRANCHES:
+        found = ca.Function("i", [x, roll], [inverse(rig, x, roll, branch)[0]]).map(count)(pose[:5], pose[5:])
+        nearest = np.minimum(nearest, np.abs(np.array(found) - q).max(axis=0))
+    assert (nearest * bent).max() < 1e-14
+    assert nearest[bent > 1e-4].max() < 1e-10
+    assert np.mean(bent > 1e-4) > 0.998
+
+
+@given(lengths, seeds)
+def test_forward_of_every_branch_is_the_target(sizes: list[float], seed: int) -> None:
+    rig, q = Rig(*sizes), random_joints(seed)
+    pose = pose_of(rig, q)
+    for branch in BRANCHES:
+        joints, reach = inverse(rig, ca.DM(pose[:5]), ca.DM(pose[5]), branch)
+        if float(ca.mmin(reach)) >= 0:
+            np.testing.assert_allclose(pose_of(rig, numeric(joints).ravel()), pose, atol=1e-10)
+            assert np.sign(np.sin(float(joints[1]))) in (0, branch.yaw)
+            assert np.sign(np.round(np.cos(float(joints[3])), 12)) in (0, branch.pitch)
+
+
+@given(seeds, st.sampled_from(BRANCHES))
+def test_inverse_is_that_of_plain_geometry(seed: int, branch: Branch) -> None:
+    rig = reference_rig()
+    rng = np.random.default_rng(seed)
+    target, roll = random_targets(rng, 1), float(rng.uniform(-3, 3))
+    joints, reach = inverse(rig, ca.DM(target), ca.DM(roll), branch)
+    expected, reaches = joints_by_geometry(rig, target, roll, branch)
+    assert (float(ca.mmin(reach)) >= 0) == bool(reaches[0])
+    if reaches[0] and float(ca.mmin(reach)) > 1e-9:
+        np.testing.assert_allclose(numeric(joints).ravel(), expected[:, 0], atol=1e-7)
+
+
+@given(lengths, seeds)
+def test_corner_is_the_end_of_the_pitch_link_in_the_dh_product(sizes: list[float], seed: int) -> None:
+    rig, q = Rig(*sizes), random_joints(seed)
+    pose = pose_of(rig, q)
+    corner = numeric(goose_neck_corner(rig, ca.DM(pose[:5]), ca.DM(pose[5]))).ravel()
+    np.testing.assert_allclose(corner, numeric(dh_frames(rig, q)[4].position).ravel(), atol=1e-12)
+    np.testing.assert_allclose(corner, corner_by_rotation(rig, pose[:5, None], pose[5])[:, 0], atol=1e-12)
+
+
+@given(lengths, seeds)
+def test_index_has_two_harmonics(sizes: list[float], seed: int) -> None:
+    rig = Rig(*sizes)
+    rng = np.random.default_rng(seed)
+    tunnel = Tunnel(rng.normal(size=3), rng.uniform(0.5, 2, 3), rng.uniform(0, 2, 3))
+    target, roll = random_targets(rng, 1), rng.uniform(-3, 3)
+    value = float(index_harmonics(rig, tunnel, ca.DM(target)).value(np.cos(roll), np.sin(roll)))
+    assert value == pytest.approx(float(index_by_geometry(rig, tunnel, target, roll)[0]), rel=1e-11, abs=1e-12)
+
+
+@given(seeds)
+def test_jacobian_is_the_slope_of_forward(seed: int) -> None:
+    rig, q, step = reference_rig(), random_joints(seed), 1e-6
+    jacobian = numeric(task_jacobian(rig, ca.DM(q)))
+    assert jacobian.shape == (5, 6)
+    for k, direction in enumerate(np.eye(6)):
+        slope = (pose_of(rig, q + step * direction) - pose_of(rig, q - step * direction))[:5] / (2 * step)
+        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-8)
+
+
+def test_limits_choose_the_turn_of_an_angle() -> None:
+    rig = reference_rig(lower=(-9, -7.0, -9, -9, -9, -9), upper=(9, -4.0, 9, 9, 9, 9))
+    target = ca.DM([100 * INCH, 6 * INCH, 0, 0, 0])
+    free = numeric(inverse(reference_rig(), target, ca.DM(np.pi / 2), Branch(1, 1))[0]).ravel()
+    turned = numeric(inverse(rig, target, ca.DM(np.pi / 2), Branch(1, 1))[0]).ravel()
+    assert turned[1] == pytest.approx(free[1] - 2 * np.pi, abs=1e-12)
+    np.testing.assert_allclose(pose_of(rig, turned)[:3], pose_of(rig, free)[:3], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck"])
+@pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
+def test_a_length_that_is_not_positive_is_named(name: str, value: float) -> None:
+    sizes = {"yaw_link_1": 1, "yaw_link_2": 1, "yaw_offset": 1, "pitch_link": 1, "sting": 1, "goose_neck": 1}
+    with pytest.raises(ModelError, match=name):
+        Rig(**{**sizes, name: value})
+
+
+def test_limits_that_cannot_be_are_named() -> None:
+    with pytest.raises(ModelError, match="joint 3"):
+        reference_rig(lower=(0, 0, 1, 0, 0, 0), upper=(1, 1, 0, 1, 1, 1))
+    with pytest.raises(ModelError, match="joint 2"):
+        reference_rig(lower=(0, -np.inf, 0, 0, 0, 0), upper=(1,) * 6)
+    with pytest.raises(ModelError, match="ranges"):
+        Tunnel((0, 0, 0), (1, 0, 1))
+    with pytest.raises(ModelError, match="weights"):
+        Tunnel((0, 0, 0), (1, 1, 1), (1, -1, 1))
+
+
+# ---- the paper's misprints: each printed form fails, the corrected one holds -----------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sample() -> list[tuple[Array, Array, Array]]:
+    """Joints, pose and tool rotation of random configurations."""
+    rig, rng = reference_rig(), np.random.default_rng(17)
+    home = np.array([0, -np.pi / 2, 0, 0, np.pi / 2, 0])
+    made = []
+    for _ in range(200):
+        q = home + rng.uniform(-1.0, 1.0, 6)
+        made.append((q, pose_of(rig, q), numeric(dh_frames(rig, q)[-1].rotation)))
+    return made
+
+
+def test_home_values_of_table_1_are_not_offsets(sample: list[Any]) -> None:
+    rig = reference_rig()
+    offset = np.array([0, -np.pi / 2, 0, 0, np.pi / 2, 0])
+    for q, pose, _ in sample[:20]:
+        taken = numeric(dh_frames(rig, q)[-1].position).ravel()
+        added = numeric(dh_frames(rig, q + offset)[-1].position).ravel()
+        np.testing.assert_allclose(taken, pose[:3], atol=1e-12)
+        assert np.abs(added - pose[:3]).max() > 1e-2
+
+
+def test_equation_8_lacks_a_cosine(sample: list[Any]) -> None:
+    wrong = []
+    for q, _, turn in sample:
+        q23, c45 = q[1] + q[2], np.cos(q[3] + q[4])
+        right = np.cos(q23) * np.sin(q[5]) + c45 * np.sin(q23) * np.cos(q[5])
+        printed = q23 * np.sin(q[5]) + c45 * np.sin(q23) * np.cos(q[5])
+        assert right == pytest.approx(turn[0, 2], abs=1e-12)
+        wrong.append(abs(printed - turn[0, 2]))
+    assert np.median(wrong) > 0.1
+
+
+def test_equation_15_has_wrong_entries(sample: list[Any]) -> None:
+    wrong = []
+    for _, pose, turn in sample:
+        (cy, cp, cr), (sy, sp, sr) = np.cos(pose[3:]), np.sin(pose[3:])
+        right = [
+            -sy * cr + cy * sp * sr,
+            sy * sr + cy * sp * cr,
+            cy * cr + sy * sp * sr,
+            -cy * sr + sy * sp * cr,
+        ]
+        printed = [
+            -sy * cp + cy * sp * sr,
+            sy * sp * cr + cy * sp * cr,
+            cy * cp + sy * sp * sr,
+            -cy * sp * cr + sy * sp * cr,
+        ]
+        found = turn[[0, 0, 1, 1], [1, 2, 1, 2]]
+        np.testing.assert_allclose(right, found, atol=1e-12)
+        wrong.append(np.abs(np.array(printed) - found))
+    assert (np.median(wrong, axis=0) > 0.01).all()
+
+
+def test_equation_25_has_two_wrong_signs(sample: list[Any]) -> None:
+    rig, wrong = reference_rig(), []
+    for q, pose, _ in sample:
+        cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
+        c4, c6, s6 = np.cos(q[3]), np.cos(q[5]), np.sin(q[5])
+        common = pose[1] - rig.yaw_link_2 * sy - rig.sting * sy * cp - rig.pitch_link * sy * c4
+        common += rig.goose_neck * sy * sp * c6
+        odd = rig.yaw_offset * cy + rig.goose_neck * cy * s6
+        assert (common - odd) / rig.yaw_link_1 == pytest.approx(np.cos(q[1]), abs=1e-12)
+        wrong.append(abs((common + odd) / rig.yaw_link_1 - np.cos(q[1])))
+    assert np.median(wrong) > 0.1
+
+
+def test_equation_25_needs_the_branch_of_the_home_position() -> None:
+    rig = reference_rig()
+    home = np.array([2.0, -np.pi / 2, 0, 0, np.pi / 2, 0])
+    pose = pose_of(rig, home)
+    minus = numeric(inverse(rig, ca.DM(pose[:5]), ca.DM(0), HOME)[0]).ravel()
+    plus = numeric(inverse(rig, ca.DM(pose[:5]), ca.DM(0), Branch(1, 1))[0]).ravel()
+    np.testing.assert_allclose(minus, home, atol=1e-12)
+    assert plus[1] == pytest.approx(np.pi / 2, abs=1e-12)
+
+
+def test_equation_27_misses_the_tool_by_26_inches(sample: list[Any]) -> None:
+    rig, wrong = reference_rig(), []
+    for q, pose, _ in sample:
+        cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
+        c4, c6, s6 = np.cos(q[3]), np.cos(q[5]), np.sin(q[5])
+        base = pose[0] + rig.yaw_offset * sy + rig.yaw_link_1 * np.sin(q[1]) + rig.goose_neck * sy * s6
+        odd = rig.yaw_link_2 * cy + rig.sting * cy * cp + rig.pitch_link * cy * c4 - rig.goose_neck * sp * cy * c6
+        assert base - odd == pytest.approx(q[0], abs=1e-12)
+        wrong.append(abs(base + odd - q[0]) / INCH)
+    assert np.median(wrong) > 20
+
+
+def test_equation_35_as_printed_does_not_depend_on_the_roll() -> None:
+    rig, tunnel = reference_rig(), reference_tunnel()
+    roll = ca.SX.sym("roll")
+    target = ca.DM([100 * INCH, 6 * INCH, 3 * INCH, 0.1, 0.1])
+    corner = goose_neck_corner(rig, target, roll)
+    right = ca.dot(tunnel.scale, (corner - tunnel.center) ** 2)
+    printed = ca.SX(ca.dot(tunnel.scale, (ca.DM(tunnel.center) - ca.DM(tunnel.center)) ** 2))
+    slopes = [float(ca.Function("g", [roll], [ca.gradient(f, roll)])(0.3)) for f in (right, printed)]
+    assert abs(slopes[0]) > 1e-3
+    assert slopes[1] == 0.0
+
+
+def test_five_joints_would_not_do() -> None:
+    """The text's P-R-R-R-R is a slip: without the sixth joint not every pose can be approached."""
+    rig, q = reference_rig(), random_joints(3)
+    joints = ca.SX.sym("q", 6)
+    full = numeric(ca.Function("j", [joints], [ca.jacobian(forward(rig, joints), joints)])(q))
+    assert np.linalg.matrix_rank(full) == 6
+    assert np.linalg.matrix_rank(full[:, :5]) == 5

@@ -1,0 +1,200 @@
+"""A free body under gravity and ejectors, and distances between capsules, boxes and walls."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.clearance import (
+    Box,
+    Capsule,
+    Surroundings,
+    box_distance,
+    capsule_in_box,
+    capsule_to_box,
+    capsule_to_capsule,
+    clearances,
+    rig_capsules,
+    soft_minimum,
+)
+from models.cts import dh_frames, reference_rig
+from models.errors import ModelError
+from models.parts import Link
+from models.rigid_body import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
+
+seeds = st.integers(0, 2**32 - 1)
+BODY = Link("store", 240.0, inertia=np.diag([6.0, 75.0, 80.0]))
+REST = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
+
+
+def number(value: Any) -> float:
+    return float(ca.DM(value))
+
+
+def turns(quaternions: Any) -> Any:
+    w, x, y, z = np.asarray(quaternions).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def test_a_body_in_a_vacuum_falls_by_the_closed_form() -> None:
+    start = REST.copy()
+    start[7:10] = (3.0, -1.0, 2.0)
+    t = np.linspace(0, 2, 21)
+    states = release(Store(BODY), start, t)
+    np.testing.assert_allclose(states[:, 2], 2 * t - GRAVITY * t**2 / 2, atol=1e-12)
+    np.testing.assert_allclose(states[:, :2], np.outer(t, [3.0, -1.0]), atol=1e-12)
+
+
+def test_a_tumbling_body_keeps_its_angular_momentum_and_energy() -> None:
+    start = REST.copy()
+    start[10:13] = (4.0, 2.0, -3.0)
+    states = release(Store(BODY), start, np.linspace(0, 2, 201), steps=10)
+    momentum = np.einsum("nij,nj->ni", turns(states[:, 3:7]), states[:, 10:13] @ BODY.inertia)
+    energy = np.einsum("ni,ij,nj->n", states[:, 10:13], BODY.inertia, states[:, 10:13]) / 2
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), rtol=1e-8, atol=1e-5)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+
+
+def test_ejectors_give_their_impulse_and_its_moment() -> None:
+    force, duration, arm = 5000.0, 0.05, 0.4
+    store = Store(BODY, (Ejector(force, duration, (arm, 0, 0)),), gravity=0.0)
+    last = release(store, REST, [0, 0.025, 0.05, 0.06], steps=200)[-1]
+    impulse = force * duration / 2  # integral of sin^2
+    assert last[9] == pytest.approx(-impulse / BODY.mass, rel=1e-9)
+    assert last[11] == pytest.approx(arm * impulse / BODY.inertia[1, 1], rel=1e-4)  # it turns a little meanwhile
+
+
+def test_air_turns_a_stable_store_into_the_wind_and_slows_it() -> None:
+    air = SlenderAir(wind=(-100.0, 0, 0))
+    start = REST.copy()
+    start[3:7] = (np.cos(0.05), 0, np.sin(0.05), 0)
+    moment, force = air(ca.DM(3, 1), ca.DM(turns(start[None, 3:7])[0]), ca.DM(3, 1), ca.DM(3, 1))
+    assert number(moment[1]) < 0  # nose down by 0.1 rad: the moment lifts it
+    assert number(force[0]) < 0
+    pitch = yaw_pitch(release(Store(BODY, air=air, gravity=0.0), start, np.linspace(0, 3, 301))[:, 3:7])[:, 1]
+    assert np.abs(pitch[200:]).max() < 0.7 * pitch[0]
+
+
+def test_yaw_and_pitch_are_those_of_the_rig() -> None:
+    assert yaw_pitch([np.cos(0.1), 0, np.sin(0.1), 0])[0] == pytest.approx([0, 0.2])
+    assert yaw_pitch([np.cos(0.15), 0, 0, np.sin(0.15)])[0] == pytest.approx([0.3, 0])
+
+
+def test_a_release_that_cannot_be_is_named() -> None:
+    with pytest.raises(ModelError, match="mass"):
+        Store(Link("nothing"))
+    with pytest.raises(ModelError, match="duration"):
+        Ejector(1.0, 0.0, (0, 0, 0))
+    with pytest.raises(ModelError, match="times"):
+        release(Store(BODY), REST, [0, 1, 1])
+    with pytest.raises(ModelError, match="quaternion"):
+        release(Store(BODY), np.zeros(13), [0, 1])
+    with pytest.raises(ModelError, match="start"):
+        release(Store(BODY), np.full(13, np.nan), [0, 1])
+
+
+# ---- distances -------------------------------------------------------------------------------------------------
+
+
+def random_capsule(rng: np.random.Generator) -> Capsule:
+    return Capsule(rng.normal(size=3), rng.normal(size=3), float(rng.uniform(0.01, 0.2)))
+
+
+def along(capsule: Capsule, count: int = 2001) -> Any:
+    s = np.linspace(0, 1, count)[:, None]
+    return capsule.a + s * (capsule.b - capsule.a)
+
+
+@settings(max_examples=50)
+@given(seeds)
+def test_distance_of_capsules_is_that_of_their_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    one, other = random_capsule(rng), random_capsule(rng)
+    if seed % 5 == 0:
+        other = Capsule(other.a, other.a + 0.5 * (one.b - one.a), other.radius)  # parallel
+    found = number(capsule_to_capsule(one, other)) + one.radius + other.radius
+    p, q = along(one, 400), along(other, 400)
+    sampled = np.linalg.norm(p[:, None] - q[None], axis=2).min()
+    assert found <= sampled + 1e-9
+    assert found >= sampled - 0.02
+
+
+@settings(max_examples=50)
+@given(seeds)
+def test_distance_of_a_capsule_to_a_box_is_that_of_its_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = turns((lambda q: q / np.linalg.norm(q))(rng.normal(size=(1, 4))))[0]
+    box, capsule = Box(rng.normal(size=3), rng.uniform(0.1, 1, 3), turn), random_capsule(rng)
+    found = number(capsule_to_box(capsule, box)) + capsule.radius
+    over = np.abs((along(capsule) - box.center) @ turn) - box.half
+    sampled = (np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)).min()
+    assert found == pytest.approx(sampled, abs=2e-3)
+    assert found <= sampled + 1e-7
+
+
+def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
+    rng = np.random.default_rng(3)
+    box, shift = Box((0, 0, 0), (0.4, 0.3, 0.2)), ca.SX.sym("shift", 3)
+    for _ in range(20):
+        capsule = random_capsule(rng)
+        moved = capsule_to_box(Capsule(ca.DM(capsule.a) + shift, ca.DM(capsule.b) + shift, capsule.radius), box)
+        value = ca.Function("d", [shift], [moved, ca.gradient(moved, shift)])
+        slope = np.array(value(np.zeros(3))[1]).ravel()
+        if number(value(np.zeros(3))[0]) < 0.02:
+            continue
+        step = 1e-5
+        numeric = [(number(value(step * e)[0]) - number(value(-step * e)[0])) / (2 * step) for e in np.eye(3)]
+        np.testing.assert_allclose(slope, numeric, atol=1e-3)
+
+
+def test_a_box_without_ends_has_walls_only() -> None:
+    walls = Box((0, 0, 0), (np.inf, 1.0, 2.0))
+    capsule = Capsule((-50, 0.3, 0), (50, 0, -1.5), 0.1)
+    assert number(capsule_in_box(capsule, walls)) == pytest.approx(0.4)
+    assert number(box_distance((100, 3.0, 0), walls)) == pytest.approx(2.0)
+    assert number(box_distance((100, 0.0, 0), walls)) == pytest.approx(-1.0)
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=20), st.floats(1e-3, 1.0))
+def test_soft_minimum_is_a_lower_bound_and_near(values: list[float], width: float) -> None:
+    soft = number(soft_minimum([ca.DM(v) for v in values], width))
+    assert min(values) - width * np.log(len(values)) - 1e-9 <= soft <= min(values) + 1e-9
+
+
+def test_the_capsules_join_the_frames_of_the_rig() -> None:
+    rig = reference_rig()
+    q = ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9])
+    links, frames = rig_capsules(rig, q), dh_frames(rig, q)
+    chain = list(links.values())
+    for one, other in pairwise(chain):
+        np.testing.assert_allclose(np.array(one.b), np.array(other.a), atol=1e-12)
+    np.testing.assert_allclose(np.array(chain[-1].b), np.array(frames[-1].position), atol=1e-12)
+    lengths = [float(ca.norm_2(link.b - link.a)) for link in chain]
+    known = [rig.yaw_link_1, rig.yaw_link_2, rig.yaw_offset, rig.pitch_link, rig.goose_neck, rig.sting]
+    assert lengths == pytest.approx(known, abs=1e-12)
+
+
+def test_every_link_is_held_against_everything_around() -> None:
+    around = Surroundings(
+        Box((0, 0, 0), (np.inf, 1, 1)), (Box((2, 0, 1), (1, 1, 0.1)),), (Capsule((0, 0, 2), (3, 0, 2), 0.2),)
+    )
+    found = clearances(reference_rig(), ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9]), around)
+    assert len(found) == 6 * 3
+    assert all(np.isfinite(number(gap)) for gap in found.values())
+    with pytest.raises(ModelError, match="empty"):
+        clearances(reference_rig(), ca.DM.zeros(6), Surroundings())
+    with pytest.raises(ModelError, match="half"):
+        Box((0, 0, 0), (1, 0, 1))
+    with pytest.raises(ModelError, match="width"):
+        soft_minimum([ca.DM(1)], 0.0)

@@ -1,0 +1,109 @@
+"""Roll planned over a whole trajectory: limits, reach, clearance, and what planning ahead is worth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models.clearance import Box, Surroundings, clearances
+from models.cts import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
+from models.cts_optimal import optimal_inverse
+from ocp import Collocation, ProblemError, Solution, solve
+from ocp.builders.cts import roll_plan, spline_targets
+from tests.models.cts_oracle import index_by_geometry
+
+RIG, TUNNEL = reference_rig(), reference_tunnel()
+HORIZON = 10.0
+SMOOTH = Collocation(intervals=25, degree=3)
+HELD = Collocation(intervals=50, degree=3, control="held")  # its double integrator is exact
+
+
+def falling(time: Any) -> list[Any]:
+    """The paper's sweep, z from -15 to 15 in at 3 in/s."""
+    return [100 * INCH, 6 * INCH, (-15 + 3 * time) * INCH, 0.0, 0.0]
+
+
+def targets_at(t: Any) -> Any:
+    return np.array([np.broadcast_to(part, len(t)) for part in falling(np.asarray(t))])
+
+
+def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Solution:
+    return solve(roll_plan(rig, TUNNEL, falling, HORIZON, symbols=ca.SX, **options), method)
+
+
+def test_without_weights_on_motion_the_plan_is_the_best_roll_of_each_target() -> None:
+    found = plan(rate_weight=0.0, acceleration_weight=1e-9)
+    inner = (found.t > 1) & (found.t < 9)
+    best = np.array(optimal_inverse(RIG, TUNNEL).map(int(inner.sum()))(targets_at(found.t[inner]), 1.0)[0])[5]
+    np.testing.assert_allclose(found["roll"][inner, 0], best, atol=2e-3)
+
+
+def test_rate_and_acceleration_limits_hold_and_bind() -> None:
+    found = plan(method=HELD, rate_limit=0.35, acceleration_limit=0.2, rate_weight=0.0)
+    assert np.abs(found["rate"]).max() == pytest.approx(0.35, abs=1e-6)
+    assert np.abs(found["acceleration"]).max() <= 0.2 + 1e-6
+    assert found.audit().integration_error < 1e-6
+
+
+def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
+    """The step-by-step minimum of I2 on the same targets, with the weight that makes both indices one."""
+    step, weight = 0.05, 0.05
+    rate_weight = weight * 2 * np.pi / step**2  # I2 dt then sums to I1 + weight rate^2
+    times = np.arange(0, HORIZON + step / 2, step)
+    function, rolls = optimal_inverse(RIG, TUNNEL, rate_weight=rate_weight), []
+    roll = float(optimal_inverse(RIG, TUNNEL)(targets_at([0.0]), 0.0)[0][5])
+    for k in range(len(times)):
+        roll = float(function(targets_at(times[k : k + 1]), roll)[0][5])
+        rolls.append(roll)
+    index = index_by_geometry(RIG, TUNNEL, targets_at(times), np.array(rolls))
+    greedy = float(np.sum(index[1:] + weight * (np.diff(rolls) / step) ** 2) * step)
+    found = plan(rate_weight=weight, acceleration_weight=1e-9)
+    assert found.cost < 0.95 * greedy
+
+
+def test_clearance_is_kept_where_the_free_plan_would_not() -> None:
+    around = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))
+    q = ca.SX.sym("q", 6)
+    gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
+
+    def least(found: Solution) -> float:
+        x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+        joints = ca.Function("j", [x, phi], [inverse(RIG, x, phi, HOME)[0]])
+        rows = joints.map(len(found.t))(targets_at(found.t), found["roll"].T)
+        return float(np.min(np.array(gaps.map(len(found.t))(rows))))
+
+    free = least(plan())
+    kept = plan(surroundings=around, clearance=free + 0.01)
+    assert least(kept) >= free + 0.01 - 1e-6
+
+
+def test_joint_limits_hold_along_the_plan() -> None:
+    rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 0.3, 3, 3, 9))
+    found = plan(rig)
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]])
+    q = np.array(joints.map(len(found.t))(targets_at(found.t), found["roll"].T))
+    assert q[2].max() == pytest.approx(0.3, abs=1e-5)
+
+
+def test_a_table_of_targets_is_followed_through_its_spline() -> None:
+    times = np.linspace(0, HORIZON, 41)
+    problem = roll_plan(RIG, TUNNEL, spline_targets(times, targets_at(times).T), HORIZON)
+    table = solve(problem, Collocation(intervals=25, degree=3))
+    assert table.cost == pytest.approx(plan().cost, rel=1e-6)
+
+
+def test_what_cannot_be_planned_is_named() -> None:
+    with pytest.raises(ProblemError, match="no roll reaches the target at 0 s"):
+        roll_plan(RIG, TUNNEL, lambda time: [9.0, 9.0, 9.0, 0.0, 0.0], HORIZON, symbols=ca.SX)
+    with pytest.raises(ProblemError, match="horizon"):
+        roll_plan(RIG, TUNNEL, falling, 0.0)
+    with pytest.raises(ProblemError, match="rate_limit"):
+        roll_plan(RIG, TUNNEL, falling, HORIZON, rate_limit=-1.0)
+    with pytest.raises(ProblemError, match="times"):
+        spline_targets([0, 1, 1, 2], np.zeros((4, 5)))
+    with pytest.raises(ProblemError, match="row 1"):
+        spline_targets([0, 1, 2, 3], [[0] * 5, [np.nan] * 5, [0] * 5, [0] * 5])

@@ -1,0 +1,133 @@
+"""The captive trajectory script: its numbers against the reference ones, its files, and the exported C."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from models.cts import reference_rig, reference_tunnel
+from models.cts_export import export, rig_functions
+from models.cts_optimal import optimal_inverse
+from models.errors import ModelError
+from scripts import cts
+from scripts.cts_compiled import compiled
+from tests.models.cts_oracle import random_targets
+
+ROOT = Path(__file__).resolve().parents[2]
+PICTURES = ("fig06_rig.png", "fig07_joints_i1.png", "fig08_iterations.png", "fig09_joints_i2.png", "release.png")
+TABLES = ("table6_time.csv", "iterations.csv", "reference_rolls.csv", "sweep.csv")
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler named cc")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results")
+    assert cts.main(["--out", str(out)]) == 0
+    return out / "cts"
+
+
+@pytest.fixture(scope="module")
+def summary(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return content
+
+
+def test_reference_rolls(summary: dict[str, Any]) -> None:
+    assert summary["phi_reference"] == pytest.approx([0.331364, 0.682290, math.pi / 2, 2.459303, 2.810229], abs=1e-6)
+
+
+def test_iterations_are_those_of_the_reference(summary: dict[str, Any]) -> None:
+    assert summary["i1"]["combined"]["iterations_mean"] == pytest.approx(3.0, abs=0.05)
+    assert summary["i1"]["jacobian"]["iterations_mean"] == pytest.approx(11.9, abs=1.0)
+    assert summary["i1"]["jacobian_gain_1"]["iterations_mean"] == pytest.approx(98.7, abs=1.0)
+    assert summary["i2"]["combined"]["iterations_mean"] == pytest.approx(2.74, abs=0.02)
+    assert summary["i2"]["jacobian"]["converged"] == 0
+
+
+def test_divergence_is_told_by_the_stability_bound(summary: dict[str, Any]) -> None:
+    for index, method, stable in (
+        ("i1", "jacobian", True),
+        ("i1", "jacobian_gain_1", True),
+        ("i2", "jacobian", False),
+        ("i2", "jacobian_gain_1", True),
+    ):
+        assert (summary[index][method]["gain_n6_squared_bend_max"] < 2) == stable
+
+
+def test_no_global_minimum_is_missed_and_newton_often_ends_in_a_maximum(summary: dict[str, Any]) -> None:
+    assert summary["global_missed"] == 0
+    assert 0.5 < summary["newton_maximum_share"] < 0.7
+
+
+def test_the_iterations_cost_time(summary: dict[str, Any]) -> None:
+    assert summary["time_ratio_jacobian_over_combined"] > 2
+    assert summary["time_ratio_jacobian_over_combined_gain_1"] > 10
+
+
+@needs_compiler
+def test_200_targets_compiled_are_a_hundred_times_faster_than_the_paper(summary: dict[str, Any]) -> None:
+    fast = compiled(optimal_inverse(reference_rig(), reference_tunnel()), cts_targets(), np.zeros(1), repeats=9)
+    assert 200e-9 * fast.nanoseconds * 100 < 0.0281
+    assert summary["compiled_ns_per_target"] > 0
+
+
+def cts_targets() -> Any:
+    from scripts.cts_results import sweep_targets
+
+    return sweep_targets()
+
+
+def test_the_release_is_tracked_and_keeps_clear(summary: dict[str, Any]) -> None:
+    release = summary["release"]
+    assert release["tracking_m"] < 1e-12
+    assert release["tracking_rad"] < 1e-12
+    assert release["least_clearance_m"] > 0.05
+
+
+def test_all_files_are_written(folder: Path) -> None:
+    for name in PICTURES:
+        with Image.open(folder / name) as picture:
+            assert picture.width > 900
+    with Image.open(folder / "release.gif") as animation:
+        assert getattr(animation, "n_frames", 1) > 20
+    for name in TABLES:
+        with (folder / name).open(newline="", encoding="utf-8") as stream:
+            assert list(csv.DictReader(stream))
+
+
+@needs_compiler
+def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path) -> None:
+    example = tmp_path / "example"
+    shutil.copytree(ROOT / "examples" / "c_export", example, ignore=shutil.ignore_patterns("build"))
+    functions = rig_functions(reference_rig(), reference_tunnel())
+    export(functions, example / "build" / "cts_inverse.c")
+    subprocess.run(["make", f"PYTHON={sys.executable}"], cwd=example, check=True, capture_output=True, text=True)
+    targets = random_targets(np.random.default_rng(9), 500)
+    targets[:, 7] = np.nan
+    previous = np.random.default_rng(10).uniform(-3, 3, 500)
+    lines = [" ".join(f"{value:.17g}" for value in (*row, roll)) for row, roll in zip(targets.T, previous, strict=True)]
+    command = [str(example / "build" / "cts")]
+    told = subprocess.run(command, input="\n".join(lines) + "\n", check=True, capture_output=True, text=True).stdout
+    found = np.array([[float(word) for word in line.split()] for line in told.splitlines()])
+    joints, _, active, status = functions["optimal_inverse_i1"].map(500)(targets, previous[None])
+    np.testing.assert_array_equal(found[:, 0], np.array(status)[0])
+    np.testing.assert_array_equal(found[:, 1], np.array(active)[0])
+    np.testing.assert_allclose(found[:, 2:], np.array(joints).T, rtol=0, atol=1e-12, equal_nan=True)
+    assert {0, 1, 2, 3} <= set(found[:, 0].astype(int))
+
+
+def test_export_refuses_what_is_no_c_file(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"must end in \.c"):
+        export(rig_functions(reference_rig(), reference_tunnel()), tmp_path / "rig.cpp")
+    with pytest.raises(ModelError, match="no function"):
+        export([], tmp_path / "rig.c")
