@@ -1,5 +1,6 @@
 """What a machine is: symbolic kinematics, geometry and momentum. Knows nothing of problems or solvers."""
 
+from models.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.errors import ModelError
 from models.free_floating import FreeFloating, paper_example
 from models.kinematics import (
@@ -14,9 +15,12 @@ from models.kinematics import (
     tip_pose,
 )
 from models.machine import FixedBase, Machine
+from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from models.parts import Joint, Link
 from models.robot import Robot, planar_chain
 from models.spatial import Frame
+from models.standing import Standing
+from models.support import Support, rectangle
 
 __all__ = [
     "FixedBase",
@@ -27,14 +31,24 @@ __all__ = [
     "Machine",
     "ModelError",
     "Robot",
+    "Standing",
+    "Support",
+    "Wrench",
+    "base_reaction",
     "center_of_mass",
     "center_of_mass_jacobian",
+    "center_of_mass_motion",
     "centers_of_mass",
     "frame_jacobian",
+    "inverse_dynamics",
     "link_frames",
+    "link_motions",
+    "momentum",
     "momentum_matrix",
+    "momentum_rate",
     "paper_example",
     "planar_chain",
+    "rectangle",
     "robot_inertia",
     "tip_jacobian",
     "tip_pose",

@@ -17,7 +17,7 @@ from ocp.hamiltonian import Hamiltonian
 __all__ = ["not_least"]
 
 NEAR = 1e-9  # a bound nearer than this, relative to its range, holds the control
-SLOPE = 1e-6  # largest slope of H against what holds the control, relative to its parts
+SLOPE = 1e-6  # largest slope of H against what holds the control, relative to its parts and to its curvature
 CURVED = 1e-8  # most negative curvature of H in the free controls, relative to its largest entry
 
 
@@ -40,7 +40,9 @@ def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.
         return "the Hamiltonian is not finite along the plan"
 
     wrong = np.where(at_low, np.maximum(-slope, 0.0), np.where(at_high, np.maximum(slope, 0.0), np.abs(slope)))
-    wrong = np.where(at_low & at_high, 0.0, wrong) / max(float(np.max(parts)), np.finfo(float).tiny)
+    # all parts may vanish at the optimum; then the slope is judged by what a change of the control's own size makes
+    scale = float(np.max(parts)) + float(np.max(np.abs(curvature))) * max(NEAR, float(np.max(np.abs(u))))
+    wrong = np.where(at_low & at_high, 0.0, wrong) / max(scale, np.finfo(float).tiny)
     k, i = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
     if wrong[k, i] > SLOPE:
         label, time = form.control_labels[i], path.t.ravel()[k]

@@ -484,14 +484,47 @@ def test_a_saddle_of_the_hamiltonian_is_no_extremal() -> None:
         solve(problem, Indirect(), guess=seed)
 
 
+def compass() -> Problem:
+    """x' = sin a, min int cos a: H = cos a, for lambda = 0, is stationary at 0 too, where it is greatest."""
+    problem = Problem("compass")
+    x = problem.state("x", initial=0.0)
+    angle = problem.control("angle")
+    problem.horizon(1.0)
+    problem.dynamics(x, ca.sin(angle))
+    problem.minimize(running=ca.cos(angle))
+    return problem
+
+
 def test_the_wrong_branch_of_a_heading_is_no_extremal() -> None:
-    """Both directions along the costate make H stationary; the one that goes uphill is a maximum."""
+    seed = solve(compass(), Collocation(10), guess={"angle": 3.0})
+    right = solve(compass(), Indirect(), guess=seed)
+    assert right.cost == pytest.approx(-1, abs=1e-10)
+    np.testing.assert_allclose(right["angle"], np.pi, atol=1e-9)
+    curve = seed.control_interpolant
+    turned = replace(
+        seed,
+        controls={"angle": 0 * seed["angle"]},
+        control_interpolant=replace(curve, values=0 * curve.values),
+    )
+    with pytest.raises(SolveError, match="stationary but not least in control 'angle' at 0 s"):
+        solve(compass(), Indirect(), guess=turned)
+
+
+def test_costates_of_the_wrong_sign_are_mended_or_fail_with_words() -> None:
     case = EXTREMA["heading"]
     seed = solve(case.build(), case.direct, parameters=case.parameters)
     turned = replace(seed, costates={"x": -seed.costates["x"]})
-    solution = solve(case.build(), Indirect(), parameters=case.parameters, guess=turned, check=False)
-    right = solve(case.build(), Indirect(), parameters=case.parameters, guess=seed)
-    assert (not solution.success) or abs(solution.cost - right.cost) < 1e-9
+    mended = solve(case.build(), Indirect(), parameters=case.parameters, guess=turned)
+    assert mended.cost == pytest.approx(seed.cost, abs=1e-9)
+    curve = seed.control_interpolant
+    uphill = replace(
+        turned,
+        controls={"angle": seed["angle"] + np.pi},
+        control_interpolant=replace(curve, values=curve.values + np.pi),
+    )
+    with pytest.raises(SolveError, match="the indirect method failed"):
+        solve(case.build(), Indirect(), parameters=case.parameters, guess=uphill)
+    assert not solve(case.build(), Indirect(), parameters=case.parameters, guess=uphill, check=False).success
 
 
 def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:

@@ -1,0 +1,182 @@
+"""What a motion takes: torques of the joints and the reaction of the ground, with forces from outside.
+
+Recursive Newton-Euler (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) written in world axes. The base stands
+still; joint positions, velocities and accelerations are of shape (dof, 1) in the order of `robot.joint_names`, as SX,
+MX, DM or numbers. Any algebra of one kind: a wrench of SX entries goes with SX positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.kinematics import Placement, checked_vector, frames_and_axes
+from models.motion import LinkMotion, momentum_rates, motions_of
+from models.robot import Robot
+from models.spatial import Expression, Frame, cross, on_scalars
+
+GRAVITY = (0.0, 0.0, -9.81)
+"""Acceleration of free fall in the world, z upwards, m/s^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wrench:
+    """A force and a moment that act on a link from outside.
+
+    Attributes:
+        link: Name of the link.
+        force: In world axes. Shape (3,), N.
+        moment: In world axes, besides that of the force. Shape (3,), N m.
+        point: Where the force acts, in the link's frame. Shape (3,), m.
+
+    Each part is a casadi vector, numbers, or a list of either; stored as a casadi column.
+
+    Raises:
+        ModelError: A part that is not of three entries, or not finite.
+    """
+
+    link: str
+    force: Expression = (0.0, 0.0, 0.0)
+    moment: Expression = (0.0, 0.0, 0.0)
+    point: Expression = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for part in ("force", "moment", "point"):
+            given = getattr(self, part)
+            if isinstance(given, list | tuple) and any(isinstance(entry, ca.SX | ca.MX | ca.DM) for entry in given):
+                given = ca.vertcat(*given)
+            owner = f"wrench on link {self.link!r}"
+            value = checked_vector(given, 3, f"{owner}: {part}", "x, y and z")
+            if isinstance(value, ca.DM) and not np.isfinite(np.array(value)).all():
+                raise ModelError(f"{owner}: {part} {np.array(value).ravel().tolist()} is not finite")
+            object.__setattr__(self, part, value)
+
+
+def inverse_dynamics(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    qdd: Expression,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Expression = GRAVITY,
+    world_from_base: Placement | None = None,
+) -> Expression:
+    """Torques (forces of prismatic joints) that the joints must give. Shape (dof, 1), N m or N.
+
+    Raises:
+        ModelError: Wrong sizes, a wrench on a link that does not exist.
+    """
+    stacked = stacked_wrenches(robot, wrenches)
+    return _inverse_dynamics(robot, q, qd, qdd, stacked, tuple(w.link for w in wrenches), gravity, world_from_base)
+
+
+def base_reaction(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    qdd: Expression,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Expression = GRAVITY,
+    world_from_base: Placement | None = None,
+) -> Expression:
+    """What the ground must do to the root link: (moment about the world's origin, force). Shape (6, 1), N m and N.
+
+    The rate of momentum less the weight of all links, the root link included, and less the wrenches.
+
+    Raises:
+        ModelError: Wrong sizes, a wrench on a link that does not exist.
+    """
+    stacked = stacked_wrenches(robot, wrenches)
+    return _base_reaction(robot, q, qd, qdd, stacked, tuple(w.link for w in wrenches), gravity, world_from_base)
+
+
+def external_wrench(
+    robot: Robot, q: Expression, wrenches: Sequence[Wrench], world_from_base: Placement | None = None
+) -> Expression:
+    """Sum of wrenches: (moment about the world's origin, force). Shape (6, 1).
+
+    Raises:
+        ModelError: Wrong sizes, a wrench on a link that does not exist.
+    """
+    frames, _ = frames_and_axes(robot, q, world_from_base)
+    links = tuple(w.link for w in wrenches)
+    given = _given_wrenches(frames, stacked_wrenches(robot, wrenches), links)
+    return ca.densify(sum((wrench for _, wrench in given), start=ca.DM(6, 1)))
+
+
+def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
+    """Moment, force and point of every wrench in a column of its own. Shape (9, k).
+
+    Raises:
+        ModelError: An unknown link.
+    """
+    columns = []
+    for wrench in wrenches:
+        robot.link(wrench.link)
+        columns.append(ca.vertcat(wrench.moment, wrench.force, wrench.point))
+    return ca.horzcat(ca.DM(9, 0), *columns)
+
+
+@on_scalars
+def _inverse_dynamics(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    qdd: Expression,
+    stacked: Expression,
+    links: tuple[str, ...],
+    gravity: Expression,
+    world_from_base: Placement | None,
+) -> Expression:
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    needed = _needed_wrenches(robot, frames, motions_of(robot, frames, axes, qd, qdd), gravity)
+    for link, wrench in _given_wrenches(frames, stacked, links):
+        needed[link] = needed[link] - wrench
+    for joint in reversed(robot.joints):
+        needed[joint.parent] = needed[joint.parent] + needed[joint.child]
+    torques = [ca.dot(ca.vertcat(*axes[joint.name]), needed[joint.child]) for joint in robot.moving_joints]
+    return ca.densify(ca.vertcat(ca.DM(0, 1), *torques))
+
+
+@on_scalars
+def _base_reaction(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    qdd: Expression,
+    stacked: Expression,
+    links: tuple[str, ...],
+    gravity: Expression,
+    world_from_base: Placement | None,
+) -> Expression:
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    needed = _needed_wrenches(robot, frames, motions_of(robot, frames, axes, qd, qdd), gravity)
+    total: Expression = sum(needed.values(), start=ca.DM(6, 1))
+    return total - sum((wrench for _, wrench in _given_wrenches(frames, stacked, links)), start=ca.DM(6, 1))
+
+
+def _needed_wrenches(
+    robot: Robot, frames: dict[str, Frame], motions: dict[str, LinkMotion], gravity: Expression
+) -> dict[str, Expression]:
+    """Rate of momentum less weight of each link, about the world's origin, by link name. Shape (6, 1) each."""
+    fall = checked_vector(gravity, 3, "gravity", "x, y and z")
+    needed = momentum_rates(robot, frames, motions)
+    for link in robot.links:
+        weight = link.mass * fall
+        needed[link.name] = needed[link.name] - ca.vertcat(cross(motions[link.name].center, weight), weight)
+    return needed
+
+
+def _given_wrenches(
+    frames: dict[str, Frame], stacked: Expression, links: tuple[str, ...]
+) -> list[tuple[str, Expression]]:
+    """Link and wrench about the world's origin, shape (6, 1), of every column of `stacked`."""
+    given = []
+    for column, link in enumerate(links):
+        moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
+        given.append((link, ca.vertcat(moment + cross(frames[link].point(point), force), force)))
+    return given

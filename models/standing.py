@@ -1,0 +1,211 @@
+"""Arms that stand unfastened on level ground: zero moment point, ground reaction, stability (Yoo et al. 2004).
+
+The ground is the plane z = 0 of the world, z upwards. As long as the foot stays flat on it the machine is one on a
+fixed base; whether it stays is read from the reaction that the ground would have to give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from models.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
+from models.errors import ModelError
+from models.kinematics import checked_vector
+from models.machine import FixedBase
+from models.parts import Array, ArrayInput, checked_array
+from models.robot import planar_chain
+from models.spatial import Expression, expression
+from models.support import Support, rectangle
+
+External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
+"""Wrenches from outside as a function of time (s) and the tip's position in the world (3, 1)."""
+
+PAPER_START = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
+"""Joint angles at the start of the tasks of Tables 1 and 2, rad."""
+
+
+class ZmpRows(NamedTuple):
+    """The equation (18) that keeps the zero moment point at a given place: J_m q'' + q'^T H_m q' = C.
+
+    Row 0 says where its x is, row 1 where its y is; both are moments over the place, in N m.
+
+    Attributes:
+        jacobian: J_m. Shape (2, n).
+        hessians: The two planes of H_m, symmetric. Shape (n, n) each.
+        right: C, with gravity and the wrenches. Shape (2, 1).
+    """
+
+    jacobian: Expression
+    hessians: tuple[Expression, Expression]
+    right: Expression
+
+    def needed(self, qd: Expression) -> Expression:
+        """C - q'^T H_m q': what J_m q'' has to be. Shape (2, 1), N m."""
+        qd = expression(qd)
+        return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Standing(FixedBase):
+    """A robot whose root link, the foot, stands on the ground and is not fastened to it.
+
+    Besides what a FixedBase has (`robot`, `translation`, `rotation` of the foot's frame in the world):
+
+    Attributes:
+        support: Region of the ground under the foot.
+        gravity: m/s^2, downwards.
+        most_stable_point: (x, y) at which the stability index is 1; the middle of the support's bounding box if
+            None. Shape (2,), m.
+        half_widths: Distances in x and y at which the index falls to 0; those of the bounding box if None. Shape
+            (2,), m.
+
+    Raises:
+        ModelError: No moving joint, no mass, wrong sizes, a gravity or a half-width that is not positive.
+    """
+
+    support: Support
+    gravity: float = 9.81
+    most_stable_point: ArrayInput = None
+    half_widths: ArrayInput = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        owner = "standing machine"
+        if self.robot.total_mass == 0:
+            raise ModelError(f"{owner}: the robot has no mass, nothing presses it on the ground; give its links masses")
+        gravity = checked_array(self.gravity, (), owner, "gravity").item()
+        if gravity <= 0:
+            raise ModelError(f"{owner}: gravity {gravity} m/s^2 is not positive; nothing would hold the foot down")
+        object.__setattr__(self, "gravity", gravity)
+        for what, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
+            value = default if getattr(self, what) is None else getattr(self, what)
+            object.__setattr__(self, what, checked_array(value, (2,), owner, what))
+        if not (self.half_widths > 0).all():
+            raise ModelError(f"{owner}: half_widths {self.half_widths.tolist()} m are not positive")
+
+    @property
+    def weight(self) -> float:
+        """N."""
+        return self.robot.total_mass * self.gravity
+
+    @property
+    def gravity_in_world(self) -> Array:
+        """Shape (3,), m/s^2."""
+        return np.array([0.0, 0.0, -self.gravity])
+
+    def ground_reaction(
+        self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
+    ) -> Expression:
+        """What the ground does to the foot: (moment about the world's origin, force). Shape (6, 1), N m and N."""
+        return base_reaction(self.robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+
+    def zero_moment_point(
+        self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
+    ) -> Expression:
+        """Point (x, y) of the ground about which its reaction has no horizontal moment, (2)-(3), (35)-(36) corrected.
+
+        Shape (2, 1), m. Of use only while the vertical force is positive.
+        """
+        return center_of_pressure(self.ground_reaction(q, qd, qdd, wrenches))
+
+    def joint_torques(
+        self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
+    ) -> Expression:
+        """Torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
+        return inverse_dynamics(self.robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+
+    def stability_index(self, point: Expression) -> Expression:
+        """1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
+        offset = checked_vector(point, 2, "point", "x and y on the ground") - ca.DM(self.most_stable_point)
+        return 1 - (offset / ca.DM(self.half_widths)) ** 2
+
+    def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
+        """The rows of (18) for the zero moment point at `point`, by differentiating its equation.
+
+        Args:
+            q, qd: Shape (n, 1) each.
+            point: (x, y) on the ground. Shape (2,), m.
+            wrenches: From outside; they enter C.
+        """
+        outside = external_wrench(self.robot, q, wrenches, self.world_from_base())
+        point = checked_vector(point, 2, "point", "x and y on the ground")
+        jacobian, first, second, right = self._zmp_rows(q, qd, point, outside)
+        return ZmpRows(jacobian, (first, second), right)
+
+    @cached_property
+    def _zmp_rows(self) -> Any:
+        n = self.joint_size
+        q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
+        point, outside = ca.SX.sym("point", 2), ca.SX.sym("outside", 6)
+        x, y = ca.vertsplit(point)
+
+        def moments(velocity: Expression, acceleration: Expression) -> Expression:
+            """Over the point, in the order and with the signs of (11)-(12). Shape (2, 1)."""
+            reaction = self.ground_reaction(q, velocity, acceleration) - outside
+            return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
+
+        rest = ca.DM.zeros(n)
+        jacobian = ca.jacobian(moments(qd, qdd), qdd)
+        moving, at_rest = moments(qd, rest), moments(rest, rest)
+        planes = [ca.hessian(moving[i], qd)[0] / 2 for i in (0, 1)]
+        outputs = [ca.densify(part) for part in (jacobian, *planes, -at_rest)]
+        return ca.Function("zmp_rows", [q, qd, point, outside], outputs, {"cse": True})
+
+    @cached_property
+    def moving_axes(self) -> tuple[int, ...]:
+        """Which coordinates of the zero moment point motion can change: (0, 1), or one of them if planar."""
+        rng = np.random.default_rng(0)
+        points = [ca.DM(self.zero_moment_point(*rng.normal(size=(3, self.joint_size)))) for _ in range(5)]
+        spread = np.ptp(np.array([np.array(point).ravel() for point in points]), axis=0)
+        return tuple(axis for axis in (0, 1) if spread[axis] > 1e-9)
+
+    def tip_wrench(self, force: Expression, moment: Expression = (0.0, 0.0, 0.0)) -> Wrench:
+        """A force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""
+        return Wrench(str(self.robot.tip), force, moment, self.robot.tip_translation)
+
+
+def center_of_pressure(reaction: Expression) -> Expression:
+    """Zero moment point (x, y) of a ground reaction (moment about the world's origin, force). Shape (2, 1), m."""
+    reaction = checked_vector(reaction, 6, "reaction", "moment about the world's origin and force")
+    return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
+
+
+def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
+    """A spring at the tip: force -stiffness (tip - rest), axis by axis.
+
+    Args:
+        stiffness: Along world x, y, z. Shape (3,), N/m.
+        rest: Position of the tip where the spring is relaxed. Shape (3,), m.
+    """
+    k = checked_array(stiffness, (3,), "tip spring", "stiffness")
+    relaxed = checked_array(rest, (3,), "tip spring", "rest")
+    return lambda time, tip: [machine.tip_wrench(-ca.DM(k) * (tip - ca.DM(relaxed)))]
+
+
+def paper_example() -> Standing:
+    """The five-link machine of Tables 1 and 2, which moves in the y-z plane of the world.
+
+    Joint angles are relative to the link before, the first to +y, counter-clockwise seen from +x.
+
+    Not printed and therefore assumed: centres of mass at mid-link, slender rods, a massless foot with the ankle at
+    the world's origin and 0.1 m wide in x (of no effect), the foot from y = -0.1 to 0.2 m (from the text) with an
+    index about y = 0 of half-width 0.1 m (from the tables), the joint limits.
+    """
+    robot = planar_chain((0.44, 0.44, 0.52, 0.26, 0.18), (6.02, 14.0, 35.0, 3.92, 2.38))
+    limits = np.deg2rad([(30, 120), (0, 165), (190, 360), (135, 360), (0, 150)])
+    joints = tuple(
+        replace(joint, lower=lower, upper=upper) for joint, (lower, upper) in zip(robot.joints, limits, strict=True)
+    )
+    return Standing(
+        replace(robot, joints=joints),
+        rotation=[(0, 0, 1), (1, 0, 0), (0, 1, 0)],  # the chain's x, y, z become the world's y, z, x
+        support=rectangle((-0.05, 0.05), (-0.1, 0.2)),
+        most_stable_point=(0.0, 0.0),
+        half_widths=(0.05, 0.1),
+    )

@@ -1,0 +1,117 @@
+"""The region of the ground that a foot rests on: a convex polygon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.kinematics import checked_vector
+from models.parts import Array, ArrayInput, checked_array
+from models.spatial import Expression
+
+FLAT = 1e-9
+"""Sine of an angle, and area relative to the squared size, below which a corner or a polygon counts as flat."""
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Convex polygon on the ground, in world axes.
+
+    Attributes:
+        vertices: Corners in order, either way round; stored counter-clockwise, without those on a straight edge.
+            Shape (k, 2), m.
+
+    Raises:
+        ModelError: Fewer than three corners, a polygon without area, one that is not convex or crosses itself.
+    """
+
+    vertices: ArrayInput
+
+    def __post_init__(self) -> None:
+        count = np.shape(self.vertices)[0] if np.ndim(self.vertices) == 2 else 0
+        if count < 3:
+            raise ModelError(f"support: vertices must be at least three points (k, 2), not {self.vertices!r}")
+        corners = np.array(checked_array(self.vertices, (count, 2), "support", "vertices"))
+        size = float(np.ptp(corners, axis=0).max())
+        area = _area(corners)
+        if abs(area) <= FLAT * size**2:
+            raise ModelError(f"support: the polygon {corners.tolist()} has no area; give corners that are not in line")
+        if area < 0:
+            corners = corners[::-1]
+        edges = np.roll(corners, -1, axis=0) - corners
+        lengths = np.linalg.norm(edges, axis=1)
+        if lengths.min() <= FLAT * size:
+            twice = corners[lengths.argmin()].tolist()
+            raise ModelError(f"support: corner {twice} occurs twice in a row; give it once")
+        ahead = np.roll(edges, -1, axis=0)
+        turns = np.arctan2(_cross(edges, ahead), (edges * ahead).sum(axis=1))
+        worst = int(turns.argmin())
+        if turns[worst] < -FLAT:
+            corner = np.roll(corners, -1, axis=0)[worst]
+            raise ModelError(
+                f"support: the polygon {corners.tolist()} is not convex at {corner.tolist()}; "
+                "the ground carries a foot on the convex hull of its contact points: give that"
+            )
+        if turns.sum() > 3 * np.pi:
+            raise ModelError(f"support: the polygon {corners.tolist()} crosses itself; give its corners in order")
+        kept = np.roll(turns, 1) > FLAT
+        object.__setattr__(self, "vertices", checked_array(corners[kept], (int(kept.sum()), 2), "support", "vertices"))
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return _area(self.vertices)
+
+    @property
+    def center(self) -> Array:
+        """Middle of the bounding box. Shape (2,), m."""
+        return np.asarray(self.vertices.max(axis=0) + self.vertices.min(axis=0)) / 2
+
+    @property
+    def half_widths(self) -> Array:
+        """Half the sides of the bounding box. Shape (2,), m."""
+        return np.asarray(np.ptp(self.vertices, axis=0)) / 2
+
+    @cached_property
+    def normals(self) -> Array:
+        """Inward unit normals of the edges, edge i from corner i to the next. Shape (k, 2)."""
+        edges = np.roll(self.vertices, -1, axis=0) - self.vertices
+        return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
+
+    def distances(self, point: Expression) -> Expression:
+        """Signed distance of a point from every edge's line, positive inside. Shape (k, 1), m."""
+        point = checked_vector(point, 2, "point", "x and y on the ground")
+        offsets = (self.normals * self.vertices).sum(axis=1)
+        return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
+
+    def margin(self, point: Expression) -> Expression:
+        """Least of :meth:`distances`: how far a point may move before it leaves the polygon. Shape (1, 1), m.
+
+        Negative outside; there its size is the distance from the farthest line, at most that from the polygon.
+        """
+        return ca.mmin(ca.densify(self.distances(point)))
+
+
+def rectangle(x: ArrayInput, y: ArrayInput) -> Support:
+    """Rectangular support from (least, greatest) x and y, m.
+
+    Raises:
+        ModelError: Not two numbers each, a side without length.
+    """
+    x, y = checked_array(x, (2,), "rectangle", "x"), checked_array(y, (2,), "rectangle", "y")
+    for what, (least, greatest) in (("x", x), ("y", y)):
+        if not least < greatest:
+            raise ModelError(f"rectangle: {what} from {least:g} to {greatest:g} m has no length; least first")
+    return Support([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _area(corners: Array) -> float:
+    return float(_cross(corners, np.roll(corners, -1, axis=0)).sum() / 2)

@@ -1,0 +1,200 @@
+"""Laws that give the joint accelerations of a standing machine at an instant (Yoo et al. 2004), blind to the future.
+
+Each builds q'' task by task: what a task needs is done with the least accelerations that leave the earlier tasks
+alone, (20), (22), (26), (33)-(34) corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias, get_args
+
+import casadi as ca
+import numpy as np
+
+from models.machine import jacobian_manipulability
+from models.motion import center_of_mass_motion, momentum
+from models.posture import joint_limit_index
+from models.standing import External, Standing
+from ocp.builders.tip_path import Path, path_derivatives
+from ocp.errors import ProblemError
+from ocp.local import least_rates
+
+__all__ = ["Law", "Layer", "Stabiliser", "accelerations", "checked_law"]
+
+Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A posture index that spare freedom drives, below the task and the zero moment point.
+
+    Attributes:
+        index: ``joint_limits``, p1 (23), to be kept small; ``manipulability`` of the task's rows, p2 (27), to be kept
+            large.
+        demand: What is asked: negative makes p1 fall, positive makes p2 grow.
+        form: ``assigned``: the second derivative of the index is the demand, (25)-(26), (29)-(33); takes one degree of
+            freedom, and accelerations without bound where the index cannot be changed. ``gradient``: demand times the
+            projected gradient; bounded, takes all that is left.
+    """
+
+    index: Literal["joint_limits", "manipulability"]
+    demand: float
+    form: Literal["assigned", "gradient"] = "assigned"
+
+    def __post_init__(self) -> None:
+        if self.index not in ("joint_limits", "manipulability"):
+            raise ProblemError(f"layer: unknown index {self.index!r}; use 'joint_limits' or 'manipulability'")
+        if self.form not in ("assigned", "gradient"):
+            raise ProblemError(f"layer: unknown form {self.form!r}; use 'assigned' or 'gradient'")
+        if not np.isfinite(self.demand):
+            raise ProblemError(f"layer {self.index!r}: demand must be a number, not {self.demand!r}")
+
+
+@dataclass(frozen=True)
+class Stabiliser:
+    """Gains of the law that keeps the inverted pendulum over a pinned zero moment point upright.
+
+    The centre of mass is commanded y'' = -k2 y' - k1 (y - y*) + k0 L, with L the moment of momentum about the point,
+    which obeys dL/dt = -M g (y - y*): the characteristic polynomial is s^3 + k2 s^2 + k1 s + k0 M g.
+
+    Attributes:
+        poles: Minus its roots, three positive numbers, 1/s.
+        damping: Of the joint velocities in the freedom that is left, 1/s.
+        gradient: Of the joint-limit index p1 in the freedom that is left, 1/s^2.
+    """
+
+    poles: tuple[float, float, float] = (4.0, 4.0, 4.0)
+    damping: float = 2.0
+    gradient: float = 0.0
+
+    def __post_init__(self) -> None:
+        if len(self.poles) != 3 or not all(np.isfinite(pole) and pole > 0 for pole in self.poles):
+            raise ProblemError(f"stabiliser: poles must be three positive numbers, not {self.poles!r}")
+        for what in ("damping", "gradient"):
+            if not (np.isfinite(getattr(self, what)) and getattr(self, what) >= 0):
+                raise ProblemError(f"stabiliser: {what} must not be negative, it is {getattr(self, what)!r}")
+
+
+class _Stack:
+    """Joint accelerations built task by task, each in the null space of those before."""
+
+    def __init__(self, size: int) -> None:
+        self.accelerations: Any = ca.DM.zeros(size)
+        self.free: Any = ca.DM.eye(size)
+
+    def do(self, rows: Any, wanted: Any) -> None:
+        """Make rows q'' = wanted with the least change."""
+        within = ca.mtimes(rows, self.free)
+        inverse = least_rates(within, ca.DM.eye(rows.shape[0]))
+        self.accelerations = self.accelerations + ca.mtimes(inverse, wanted - ca.mtimes(rows, self.accelerations))
+        self.free = self.free - ca.mtimes(inverse, within)
+
+    def push(self, direction: Any) -> None:
+        """Add a vector in the freedom that is left."""
+        self.accelerations = self.accelerations + ca.mtimes(self.free, direction)
+
+
+def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequence[Layer], damping: float) -> None:
+    """Raise ProblemError for an unknown law, or one that asks for more than the machine has joints."""
+    if law not in get_args(Law):
+        raise ProblemError(f"unknown law {law!r}; use one of {', '.join(get_args(Law))}")
+    if not (np.isfinite(damping) and damping >= 0):
+        raise ProblemError(f"null_damping must be a finite number, zero or above, not {damping!r}")
+    axes = len(machine.moving_axes)
+    tasks = {"the tip": len(rows), "the zero moment point": 0 if law == "pseudo_inverse" else axes}
+    tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
+    tasks |= {"the assigned layers": sum(layer.form == "assigned" for layer in layers)}
+    if sum(tasks.values()) > machine.joint_size:
+        asked = ", ".join(f"{count} for {what}" for what, count in tasks.items() if count)
+        raise ProblemError(f"law {law!r} needs {sum(tasks.values())} joints ({asked}), there are {machine.joint_size}")
+
+
+def accelerations(
+    machine: Standing,
+    tip_path: Path,
+    rows: Sequence[int],
+    law: Law,
+    time: Any,
+    q: Any,
+    qd: Any,
+    *,
+    zmp: Callable[[Any], Any],
+    external: External | None = None,
+    layers: Sequence[Layer] = (),
+    stabiliser: Stabiliser | None = None,
+    null_damping: float = 0.0,
+) -> Any:
+    """Joint accelerations of a law. Shape (n, 1).
+
+    Args:
+        tip_path: Position of the tip in the task's rows as a function of time, m.
+        rows: Linear rows of the tip's twist that the task fixes, 3..5.
+        law: ``pseudo_inverse``: the task alone. ``augmented``: task and zero moment point together, (20).
+            ``null_space``: the zero moment point in the null space of the task, (21)-(22). ``stabilised``: as
+            augmented, with the centre of mass commanded in their null space.
+        time, q, qd: Symbols of one kind.
+        zmp: Where the zero moment point is to be, (x, y) of the time, m.
+        layers: Applied in this order after the law.
+        null_damping: Of the joint velocities in the freedom that is left at last, 1/s.
+    """
+    chosen, axes = list(rows), list(machine.moving_axes)
+    tip = machine.tip_pose((), q).position
+    wrenches = tuple(external(time, tip)) if external is not None else ()
+    jacobian = ca.densify(machine.tip_jacobian((), q))[chosen, :]
+    bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
+    task = path_derivatives(tip_path, time, len(chosen))[2] - bias
+    place = zmp(time)
+    zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
+    balance, needed = zmp_rows.jacobian[axes, :], zmp_rows.needed(qd)[axes]
+
+    stack = _Stack(machine.joint_size)
+    if law in ("pseudo_inverse", "null_space"):
+        stack.do(jacobian, task)
+    if law == "null_space":
+        stack.do(balance, needed)
+    if law in ("augmented", "stabilised"):
+        stack.do(ca.vertcat(jacobian, balance), ca.vertcat(task, needed))
+    for layer in layers:
+        _apply(layer, stack, _index(layer, machine, jacobian, q), q, qd)
+    if law == "stabilised":
+        gains = stabiliser or Stabiliser()
+        stack.do(*_upright(machine, gains, q, qd, place, zmp_rows.right))
+        stack.push(-gains.damping * qd - gains.gradient * ca.gradient(joint_limit_index(machine.robot, q), q))
+    if null_damping:
+        stack.push(-null_damping * qd)
+    return stack.accelerations
+
+
+def _index(layer: Layer, machine: Standing, jacobian: Any, q: Any) -> Any:
+    if layer.index == "joint_limits":
+        return joint_limit_index(machine.robot, q)
+    return jacobian_manipulability(jacobian, range(jacobian.shape[0]))
+
+
+def _apply(layer: Layer, stack: _Stack, index: Any, q: Any, qd: Any) -> None:
+    slope = ca.jacobian(index, q)
+    if layer.form == "gradient":
+        stack.push(layer.demand * slope.T)
+    else:
+        stack.do(slope, layer.demand - ca.jtimes(ca.mtimes(slope, qd), q, qd))
+
+
+def _upright(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
+    """Rows and values of the commanded acceleration of the centre of mass.
+
+    `right` is C of (18), minus the moment of weight and wrenches over the place: it vanishes for a centre of mass
+    at y*, and C / (M g) is how far the centre of mass is beyond y*, with its sign turned.
+    """
+    axes = list(machine.moving_axes)
+    a, b, c = gains.poles
+    k2, k1, k0 = a + b + c, a * b + b * c + c * a, a * b * c / machine.weight
+    rest = ca.DM.zeros(machine.joint_size)
+    motion = center_of_mass_motion(machine.robot, q, qd, rest, machine.world_from_base())
+    rows = ca.jacobian(motion.position, q)[:2, :]
+    about = ca.vertcat(place, 0)
+    spin = momentum(machine.robot, q, qd, about, machine.world_from_base())
+    lean = ca.vertcat(-spin[1], spin[0])  # grows with the fall towards -x, -y
+    wanted = -k2 * motion.velocity[:2] + k1 * right / machine.weight + k0 * lean - motion.acceleration[:2]
+    return rows[axes, :], wanted[axes]

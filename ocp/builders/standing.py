@@ -1,0 +1,281 @@
+"""Whole motions of a machine that stands on the ground: do a task of the tip, do not tip over, spend the freedom well.
+
+The global counterpart of ocp.local_acceleration (Yoo et al. 2004), for any Standing machine, planar or spatial.
+
+Joint accelerations (or jerks) are the control. Two ways to keep the tip on its path:
+
+tip_level "position": for controls held over intervals, `MultipleShooting(..., control="held")` or `Collocation(...,
+    control="held")`. The tip is on its path at the nodes; what the ground and the joints bear is constrained at both
+    ends of every interval; a pinned zero moment point is where it should be at the start of every interval. Converges
+    with the first order of the interval where a constraint of the ground is active, and the multipliers of that
+    constraint then belong to one end of an interval: the audit's stationarity, taken inside it, does not fit.
+tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
+    tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
+    nearer to the optimum for the same number of intervals, and certified by the audit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from models.dynamics import Wrench
+from models.posture import joint_limit_index
+from models.standing import External, Standing, center_of_pressure
+from models.standing_motion import StandingMotion
+from ocp.builders.standing_guess import local_guess
+from ocp.builders.standing_options import (
+    Anywhere,
+    Following,
+    FreeTime,
+    IndexAtLeast,
+    InFoot,
+    Limits,
+    Pinned,
+    Weights,
+    ZmpRule,
+)
+from ocp.builders.task import Array, checked_start
+from ocp.builders.tip_path import Path, check_path, check_rest, linear_rows, path_derivatives
+from ocp.errors import ProblemError
+from ocp.problem import Problem
+
+__all__ = [
+    "Anywhere",
+    "Following",
+    "FreeTime",
+    "InFoot",
+    "IndexAtLeast",
+    "Limits",
+    "Pinned",
+    "Weights",
+    "motion_cost",
+    "standing_plan",
+]
+
+
+def standing_plan(
+    machine: Standing,
+    tip_path: Path,
+    rows: Sequence[int],
+    start_joints: Any,
+    horizon: float | FreeTime,
+    *,
+    zmp: ZmpRule | None = None,
+    external: External | None = None,
+    weights: Weights | None = None,
+    limits: Limits | None = None,
+    control: Literal["acceleration", "jerk"] = "acceleration",
+    along: Literal["time", "parameter"] = "time",
+    tip_level: Literal["position", "acceleration"] = "position",
+    start: Literal["rest", "free"] = "rest",
+    end: Literal["rest", "free"] = "rest",
+    end_joints: Any = None,
+    symbols: Any = ca.SX,
+) -> Problem:
+    """Move the tip along its path while the machine stands, at the least cost.
+
+    States "joints", "velocities" (and "accelerations" where the jerk is the control); controls "accelerations" or
+    "jerks". Where the path is a function of a parameter, states "path" 0..1 and "path_rate" >= 0, control
+    "path_acceleration". Path constraints "tip"; "zero moment point" (m; inside a foot the distance from its edges, less
+    the margin); "vertical force", N; "friction", the square of the force the ground holds less that it gives, over the
+    squared weight; "torques".
+
+    Args:
+        machine: What stands.
+        tip_path: Position of the tip in the task's rows, m, world axes: a function of the time, s, or of the path
+            parameter.
+        rows: Linear rows of the tip's twist that the task fixes, 3..5.
+        start_joints: Shape (n,), rad or m.
+        horizon: Final time, s, or FreeTime(...).
+        zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
+            Pinned(point), Following(reference) or Anywhere().
+        external: Wrenches from outside as a function of time and tip position, for example models.standing.tip_spring.
+        weights: Of the parts of the cost. limits: Of joints and ground.
+        control: What is held over an interval of the plan.
+        along: What tip_path is a function of. A free final time needs "parameter", or a path that suits any horizon.
+        tip_level: Whether the path constraint "tip" is the position of the tip, m, or its acceleration, m/s^2.
+        start, end: Whether the joints are at rest there, or free to move.
+        end_joints: Joint positions at the end, nan where free; all free if None. Shape (n,).
+        symbols: casadi.SX, or casadi.MX when tip_path, external or a reference calls an interpolant.
+
+    Returns:
+        The problem, with a local motion as its guess.
+
+    Raises:
+        ProblemError: Sizes, rows or options that do not fit, a start outside the limits, a path that does not begin at
+            the tip, is longer than the arm, or moves where the joints are to rest.
+    """
+    zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
+    _check_options(control=control, along=along, tip_level=tip_level, start=start, end=end)
+    if tip_level == "acceleration" and control == "jerk":
+        raise ProblemError("tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'")
+    duration = horizon.guess if isinstance(horizon, FreeTime) else horizon
+    begin = checked_start(machine, rows, start_joints, duration, None)
+    bounds = limits.bounds(machine)
+    for name, value, low, high in zip(machine.robot.joint_names, begin.joints, *bounds["joints"], strict=True):
+        if not low <= value <= high:
+            raise ProblemError(f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}")
+    last = 1.0 if along == "parameter" else begin.horizon
+    check_path(machine, tip_path, rows, begin.joints, begin.base, last)
+    if along == "time":
+        check_rest(tip_path, len(begin.rows), 0.0 if start == "rest" else None, last if end == "rest" else None)
+    guess = local_guess(machine, tip_path, rows, begin.joints, begin.horizon, along == "parameter", external)
+
+    problem = Problem("standing plan", symbols=symbols)
+    final = _horizon(problem, horizon)
+    at_rest = {"initial": 0.0 if start == "rest" else None, "terminal": 0.0 if end == "rest" else None}
+    joints = problem.state(
+        "joints",
+        machine.joint_size,
+        initial=begin.joints,
+        terminal=end_joints,
+        lower=bounds["joints"][0],
+        upper=bounds["joints"][1],
+        guess=guess["joints"],
+    )
+    speed = bounds["velocities"]
+    velocities = problem.state(
+        "velocities",
+        machine.joint_size,
+        initial=at_rest["initial"],
+        terminal=_rest(machine, begin.rows, guess["joints"].values[-1], end, tip_level),
+        lower=-speed,
+        upper=speed,
+        guess=guess["velocities"],
+    )
+    push, rough = bounds["accelerations"], bounds["jerks"]
+    jerks: Any = ca.DM(1, 1)
+    if control == "jerk":
+        accelerations = problem.state(
+            "accelerations", machine.joint_size, lower=-push, upper=push, guess=guess["accelerations"]
+        )
+        jerks = problem.control("jerks", machine.joint_size, lower=-rough, upper=rough)
+        problem.dynamics(accelerations, jerks)
+    else:
+        accelerations = problem.control(
+            "accelerations", machine.joint_size, lower=-push, upper=push, guess=guess["accelerations"]
+        )
+    problem.dynamics(joints, velocities)
+    problem.dynamics(velocities, accelerations)
+
+    states, rates, progress = [joints, velocities], [velocities, accelerations], problem.time
+    if along == "parameter":
+        progress = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
+        rate = problem.state(
+            "path_rate", lower=0.0, guess=guess["path_rate"], initial=at_rest["initial"], terminal=at_rest["terminal"]
+        )
+        push_along = problem.control("path_acceleration", guess=guess["path_acceleration"])
+        problem.dynamics(progress, rate)
+        problem.dynamics(rate, push_along)
+        states, rates = [*states, progress, rate], [*rates, rate, push_along]
+    else:
+        states, rates = [*states, progress], [*rates, 1]
+    position = machine.tip_pose((), joints).position
+    gap = position[linear_rows(rows)] - path_derivatives(tip_path, progress, len(begin.rows))[0]
+    if tip_level == "acceleration":
+        moving = ca.jtimes(gap, ca.vertcat(*states), ca.vertcat(*rates))
+        if start == "free":
+            problem.start("tip velocity", moving, lower=0, upper=0)
+        gap = ca.jtimes(moving, ca.vertcat(*states), ca.vertcat(*rates))
+    problem.path("tip", gap, lower=0, upper=0)
+
+    wrenches = tuple(external(problem.time, position)) if external is not None else ()
+    _ground(problem, machine, (joints, velocities, accelerations), wrenches, zmp, limits)
+    effort = bounds["torques"]
+    if np.isfinite(effort).any():
+        limited = np.flatnonzero(np.isfinite(effort)).tolist()
+        torques = machine.joint_torques(joints, velocities, accelerations, wrenches)[limited]
+        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited])
+
+    running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
+    if weights.joint_limits:
+        running += weights.joint_limits * joint_limit_index(machine.robot, joints)
+    if weights.manipulability:
+        running -= weights.manipulability * machine.manipulability((), joints, rows)
+    running += weights.jerk * ca.sumsqr(jerks)
+    problem.minimize(running=running, terminal=weights.time * final)
+    return problem
+
+
+def _check_options(**options: str) -> None:
+    known = {
+        "control": ("acceleration", "jerk"),
+        "along": ("time", "parameter"),
+        "tip_level": ("position", "acceleration"),
+        "start": ("rest", "free"),
+        "end": ("rest", "free"),
+    }
+    for what, value in options.items():
+        if value not in known[what]:
+            raise ProblemError(f"{what} must be one of {', '.join(known[what])}, not {value!r}")
+
+
+def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+    if isinstance(horizon, FreeTime):
+        return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
+    return problem.horizon(float(horizon))
+
+
+def _rest(machine: Standing, rows: list[int], joints: Array, end: str, tip_level: str) -> Array | None:
+    """Joint velocities at the end, nan where free. Shape (n,).
+
+    A tip whose acceleration is prescribed comes to rest by itself: as many joints as the task has rows then follow the
+    others, and demanding rest of them too would be redundant. Those that move the tip best are left out.
+    """
+    if end == "free":
+        return None
+    rest = np.zeros(machine.joint_size)
+    if tip_level == "acceleration":
+        jacobian = np.array(ca.DM(machine.tip_jacobian((), joints)))[rows]
+        for _ in rows:
+            best = int((jacobian**2).sum(axis=0).argmax())
+            direction = jacobian[:, best] / np.linalg.norm(jacobian[:, best])
+            jacobian = jacobian - np.outer(direction, direction @ jacobian)
+            rest[best] = np.nan
+    return rest
+
+
+def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
+    """The cost of standing_plan for a sampled motion, by the trapezoidal rule; without the weight of jerks."""
+    w = weights or Weights()
+    running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
+    running += w.velocity * (motion.joint_velocities**2).sum(axis=1)
+    running += w.joint_limits * motion.joint_limit_index - w.manipulability * motion.manipulability
+    return float(np.trapezoid(running, motion.t) + w.time * motion.t[-1])
+
+
+def _ground(
+    problem: Problem,
+    machine: Standing,
+    motion: tuple[Any, Any, Any],
+    wrenches: Sequence[Wrench],
+    zmp: ZmpRule,
+    limits: Limits,
+) -> None:
+    """The path constraints on what the ground bears."""
+    reaction = machine.ground_reaction(*motion, wrenches)
+    force = reaction[3:6]
+    least = 0.1 * machine.weight if limits.vertical_force is None else limits.vertical_force
+    problem.path("vertical force", force[2], lower=least)
+    if np.isfinite(limits.friction):
+        room = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
+        problem.path("friction", room, lower=0)
+    point, axes = center_of_pressure(reaction), list(machine.moving_axes)
+    if isinstance(zmp, InFoot):
+        # edges along which the point cannot be moved away or near are no constraint
+        edges = np.flatnonzero(np.abs(machine.support.normals[:, axes]).max(axis=1) > 1e-12).tolist()
+        zmp.check(machine)
+        problem.path("zero moment point", machine.support.distances(point)[edges] - zmp.margin, lower=0)
+    elif isinstance(zmp, IndexAtLeast):
+        radius = machine.half_widths * np.sqrt(1 - zmp.value)
+        low, high = machine.most_stable_point - radius, machine.most_stable_point + radius
+        problem.path("zero moment point", point[axes], lower=low[axes], upper=high[axes])
+    elif isinstance(zmp, Pinned | Following):
+        place = zmp.place(machine, problem.time)
+        problem.path("zero moment point", (point - place)[axes], lower=0, upper=0)
+    elif not isinstance(zmp, Anywhere):
+        raise ProblemError(f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}")

@@ -1,0 +1,59 @@
+"""First guess of a standing plan: the task done locally, with the spare freedom damped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from models.standing import External, Standing
+from ocp.builders.task import Array
+from ocp.builders.tip_path import Path
+from ocp.guess import Samples
+from ocp.local_acceleration import resolve_accelerations
+
+__all__ = ["local_guess"]
+
+DAMPING = 2.0  # 1/s, of the joint velocities in the null space
+STEPS = 400
+
+
+def local_guess(
+    machine: Standing,
+    tip_path: Path,
+    rows: Sequence[int],
+    joints: Array,
+    horizon: float,
+    by_parameter: bool,
+    external: External | None,
+) -> dict[str, Any]:
+    """Guesses by name; where the local motion breaks down its last posture is kept."""
+
+    def timed(time: Any) -> Any:
+        return tip_path(smooth(time / horizon)) if by_parameter else tip_path(time)
+
+    found = resolve_accelerations(
+        machine,
+        timed,
+        rows,
+        joints,
+        horizon,
+        null_damping=DAMPING,
+        external=external,
+        step=horizon / STEPS,
+        stop_at_lift_off=False,
+        speed_limit=1e3,
+    ).motion
+    names = {"joints": found.joints, "velocities": found.joint_velocities, "accelerations": found.joint_accelerations}
+    guess: dict[str, Any] = {name: Samples(found.t, values) for name, values in names.items()}
+    at = np.linspace(0.0, 1.0, STEPS + 1)
+    along = (smooth(at), 30 * (at * (1 - at)) ** 2 / horizon, (60 * at - 180 * at**2 + 120 * at**3) / horizon**2)
+    for name, values in zip(("path", "path_rate", "path_acceleration"), along, strict=True):
+        guess[name] = Samples(at * horizon, values[:, None])
+    return guess
+
+
+def smooth(fraction: Any) -> Any:
+    """From 0 to 1, at rest and without acceleration at both ends."""
+    return fraction**3 * (10 - 15 * fraction + 6 * fraction**2)

@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models import ModelError, center_of_mass, frame_jacobian, link_frames, momentum_matrix, planar_chain
+from models.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
+from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
+from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
+from tests.models.trees import (
+    Array,
+    directional,
+    few,
+    momentum_by_differentiation,
+    numeric,
+    random_frame,
+    random_robot,
+    seeds,
+    twist_by_differentiation,
+)
+
+bases = st.sampled_from(["planar", "spatial"])
+LIBRARY = 1e-9
+
+
+def random_motion(rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
+    return rng.normal(size=size), rng.normal(size=size), rng.normal(scale=3.0, size=size)
+
+
+def hand_wrench(rng: np.random.Generator, link: str) -> Wrench:
+    return Wrench(link, rng.normal(scale=20, size=3), rng.normal(scale=5, size=3), rng.normal(scale=0.3, size=3))
+
+
+def along(value: Any, q: Any, qd: Any, qdd: Any) -> Any:
+    """d/dt of an expression of q and q'."""
+    return directional(value, ca.vertcat(q, qd), ca.vertcat(qd, qdd))
+
+
+@pytest.mark.parametrize("library", [pinocchio_dynamics, mujoco_dynamics])
+@given(seeds, st.integers(1, 8), bases)
+@few
+def test_torques_and_reaction_equal_those_of_an_independent_library(
+    library: Any, seed: int, size: int, base: Any
+) -> None:
+    rng = np.random.default_rng(seed)
+    robot = with_masses(random_robot(rng, size, base), rng)
+    q, qd, qdd = random_motion(rng, robot.dof)
+    gravity = rng.normal(scale=9.0, size=3)
+    wrenches = [hand_wrench(rng, str(robot.tip)), hand_wrench(rng, robot.links[rng.integers(size + 1)].name)]
+    torques, reaction = library(robot, q, qd, qdd, wrenches, gravity)
+    np.testing.assert_allclose(
+        numeric(inverse_dynamics(robot, q, qd, qdd, wrenches, gravity)).ravel(), torques, rtol=0, atol=LIBRARY
+    )
+    found = numeric(base_reaction(robot, q, qd, qdd, wrenches, gravity)).ravel()
+    np.testing.assert_allclose(found, reaction, rtol=0, atol=LIBRARY)
+
+
+@given(seeds, st.integers(1, 6), bases)
+@few
+def test_power_of_the_torques_and_wrenches_is_the_rate_of_energy(seed: int, size: int, base: Any) -> None:
+    """q' tau + wrench power = d/dt (sum m v^2 / 2 + w I w / 2 - m g c), by differentiation of link frames."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size, base)
+    placement = random_frame(rng)
+    gravity = rng.normal(scale=9.0, size=3)
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    energy: Any = 0
+    frames = link_frames(robot, q, placement)
+    for link in robot.links:
+        turn, position = frames[link.name]
+        center = position + ca.mtimes(turn, ca.DM(link.center_of_mass))
+        twist = twist_by_differentiation(turn, center, q, qd)
+        inertia = ca.mtimes([turn, ca.DM(link.inertia), turn.T])
+        energy += link.mass * ca.sumsqr(twist[3:6]) / 2 + ca.dot(twist[0:3], ca.mtimes(inertia, twist[0:3])) / 2
+        energy -= link.mass * ca.dot(ca.DM(gravity), center)
+    wrench = hand_wrench(rng, str(robot.tip))
+    torques = inverse_dynamics(robot, q, qd, qdd, [wrench], gravity, placement)
+    jacobian = frame_jacobian(robot, q, wrench.link, wrench.point, placement)
+    given = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
+    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + given])
+    rate, power = (float(value) for value in balance(*random_motion(rng, robot.dof)))
+    assert rate == pytest.approx(power, rel=1e-9, abs=1e-8)
+
+
+@given(seeds, st.integers(1, 6), bases)
+@few
+def test_momentum_its_rate_and_the_centre_of_mass_follow_from_the_frames(seed: int, size: int, base: Any) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size, base)
+    placement, about = random_frame(rng), rng.normal(size=3)
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    truth = momentum_by_differentiation(robot, link_frames(robot, q, placement), q, qd)
+    truth = ca.vertcat(truth[0:3] - ca.cross(ca.DM(about), truth[3:6]), truth[3:6])
+    center = center_of_mass(robot, q, placement)
+    expected = [truth, along(truth, q, qd, qdd), center, directional(center, q, qd)]
+    expected.append(along(expected[3], q, qd, qdd))
+    found = [momentum(robot, q, qd, about, placement), momentum_rate(robot, q, qd, qdd, about, placement)]
+    found += center_of_mass_motion(robot, q, qd, qdd, placement)
+    function = ca.Function("both", [q, qd, qdd], [*expected, *found])
+    values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
+    for truth_value, value in zip(values[:5], values[5:], strict=True):
+        np.testing.assert_allclose(value, truth_value, rtol=1e-9, atol=1e-9)
+    point = random_motion(rng, robot.dof)
+    at_origin = numeric(momentum(robot, point[0], point[1], world_from_base=placement))
+    np.testing.assert_allclose(
+        at_origin.ravel(), numeric(momentum_matrix(robot, point[0], placement)) @ point[1], atol=1e-9
+    )
+
+
+@given(seeds, st.integers(1, 6), bases)
+@few
+def test_link_motions_are_the_derivatives_of_the_link_frames(seed: int, size: int, base: Any) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size, base)
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    motions, frames = link_motions(robot, q, qd, qdd), link_frames(robot, q)
+    pairs = []
+    for link in robot.links:
+        center = frames[link.name].point(link.center_of_mass)
+        twist = twist_by_differentiation(frames[link.name].rotation, center, q, qd)
+        motion = motions[link.name]
+        pairs.append((ca.vertcat(motion.angular_velocity, motion.velocity), twist))
+        pairs.append((ca.vertcat(motion.angular_acceleration, motion.acceleration), along(twist, q, qd, qdd)))
+        pairs.append((motion.center, center))
+    function = ca.Function("pairs", [q, qd, qdd], [ca.densify(part) for pair in pairs for part in pair])
+    values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
+    for found, expected in zip(values[::2], values[1::2], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@given(seeds, st.integers(1, 6))
+@few
+def test_the_reaction_is_the_rate_of_momentum_less_weight_and_wrenches(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size)
+    motion, placement = random_motion(rng, robot.dof), random_frame(rng)
+    wrench, gravity = hand_wrench(rng, str(robot.tip)), rng.normal(size=3)
+    center = numeric(center_of_mass(robot, motion[0], placement)).ravel()
+    weight = robot.total_mass * np.concatenate([np.cross(center, gravity), gravity])
+    outside = numeric(external_wrench(robot, motion[0], [wrench], placement)).ravel()
+    expected = numeric(momentum_rate(robot, *motion, world_from_base=placement)).ravel() - weight - outside
+    found = numeric(base_reaction(robot, *motion, [wrench], gravity, placement)).ravel()
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_mx_and_sx_symbols_give_the_same(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, 4)
+    motion, push = random_motion(rng, robot.dof), rng.normal(size=3)
+    results = []
+    for symbols in (ca.SX, ca.MX):
+        q, qd, qdd, force = (symbols.sym(name, size) for name, size in zip("abcd", (*[robot.dof] * 3, 3), strict=True))
+        wrenches = [Wrench(str(robot.tip), force)]
+        outputs = [inverse_dynamics(robot, q, qd, qdd, wrenches), base_reaction(robot, q, qd, qdd, wrenches)]
+        outputs += [momentum(robot, q, qd), momentum_rate(robot, q, qd, qdd), *center_of_mass_motion(robot, q, qd, qdd)]
+        values = ca.Function("all", [q, qd, qdd, force], outputs)(*motion, push)
+        results.append(np.concatenate([numeric(value).ravel() for value in values]))
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
+
+
+def test_a_planar_machine_keeps_its_structural_zeros() -> None:
+    robot = planar_chain([1.0, 1.0], [1.0, 1.0])
+    q, qd, qdd = (ca.SX.sym(name, 2) for name in ("q", "qd", "qdd"))
+    reaction = base_reaction(robot, q, qd, qdd, gravity=(0.0, -9.81, 0.0))
+    assert reaction.sparsity().row() == [2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q": np.zeros(3)}, "q has shape"),
+        ({"qd": np.zeros(1)}, "qd has shape"),
+        ({"qdd": np.zeros(5)}, "qdd has shape"),
+        ({"wrenches": [Wrench("hand")]}, "link 'hand' does not exist"),
+        ({"gravity": (0.0, -9.81)}, "gravity has shape"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"q": np.zeros(2), "qd": np.zeros(2), "qdd": np.zeros(2), **changes}
+    with pytest.raises(ModelError, match=message):
+        inverse_dynamics(planar_chain([1.0, 1.0], [1.0, 1.0]), **arguments)
+
+
+def test_a_robot_without_mass_has_no_centre_of_mass_motion() -> None:
+    with pytest.raises(ModelError, match="no mass"):
+        center_of_mass_motion(planar_chain([1.0], [0.0]), [0.0], [0.0], [0.0])
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"force": (1.0, 2.0)}, "wrench on link 'hand': force has shape"),
+        ({"moment": (0.0, np.nan, 0.0)}, "wrench on link 'hand': moment .* not finite"),
+    ],
+)
+def test_a_wrench_that_is_none_is_refused(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        Wrench("hand", **parts)
+
+
+def test_a_wrench_takes_a_list_of_expressions() -> None:
+    time = ca.SX.sym("time")
+    force = Wrench("hand", (0, 2 * time, 1)).force
+    assert numeric(ca.Function("force", [time], [force])(3.0)).ravel().tolist() == [0, 6, 1]

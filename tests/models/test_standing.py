@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
+from models.dynamics import Wrench
+from models.motion import link_motions
+from models.standing import PAPER_START, Standing, center_of_pressure, paper_example, tip_spring
+from models.standing_motion import standing_motion
+from models.support import rectangle
+from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
+from tests.models.standing_machines import random_motion, random_standing, standing_arm
+from tests.models.trees import Array, few, numeric, random_robot, seeds
+
+FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
+sizes = st.integers(1, 6)
+
+
+def hand(rng: np.random.Generator, machine: Standing) -> Wrench:
+    return machine.tip_wrench(rng.normal(scale=5, size=3), rng.normal(size=3))
+
+
+@pytest.mark.parametrize(("table", "ahead"), [(1, 0.0073), (2, 0.0090)])
+def test_the_papers_machine_starts_with_its_centre_of_mass_over_the_foot(table: int, ahead: float) -> None:
+    machine, q = paper_example(), PAPER_START[table]
+    center = numeric(center_of_mass(machine.robot, q, machine.world_from_base())).ravel()
+    assert center[0] == 0
+    assert center[1] == pytest.approx(ahead, abs=5e-5)
+    assert machine.robot.total_mass == pytest.approx(61.32)
+    assert ((machine.robot.lower < q) & (q < machine.robot.upper)).all()
+    assert machine.moving_axes == (1,)
+
+
+def test_the_papers_machine_moves_in_its_plane_counter_clockwise_from_y() -> None:
+    machine = paper_example()
+    frames = link_frames(machine.robot, PAPER_START[1], machine.world_from_base())
+    angle = 0.0
+    for i, joint in enumerate(PAPER_START[1]):
+        angle += joint
+        heading = numeric(frames[f"link{i + 1}"].rotation)[:, 0]
+        np.testing.assert_allclose(heading, [0, np.cos(angle), np.sin(angle)], atol=1e-12)
+
+
+@given(seeds, sizes)
+@few
+def test_a_machine_at_rest_presses_below_its_centre_of_mass(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    q, rest = rng.normal(size=machine.joint_size), np.zeros(machine.joint_size)
+    center = numeric(center_of_mass(machine.robot, q, machine.world_from_base())).ravel()
+    np.testing.assert_allclose(numeric(machine.zero_moment_point(q, rest, rest)).ravel(), center[:2], atol=1e-10)
+    force = numeric(machine.ground_reaction(q, rest, rest)).ravel()[3:]
+    np.testing.assert_allclose(force, [0, 0, machine.weight], atol=1e-9)
+
+
+@given(seeds, sizes)
+@few
+def test_the_zero_moment_point_is_that_of_the_sums_over_links(seed: int, size: int) -> None:
+    """(2)-(3), with the force of (35)-(36) corrected: it enters as a moment, and the vertical one below the line."""
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    q, qd, qdd = random_motion(rng, machine)
+    wrench = hand(rng, machine)
+    motions = link_motions(machine.robot, q, qd, qdd, machine.world_from_base())
+    numerator, denominator = np.zeros(2), 0.0
+    for link in machine.robot.links:
+        center, _, acceleration, spin, turning = (numeric(part).ravel() for part in motions[link.name])
+        turn = numeric(link_frames(machine.robot, q, machine.world_from_base())[link.name].rotation)
+        inertia = turn @ link.inertia @ turn.T
+        moment = inertia @ turning + np.cross(spin, inertia @ spin)
+        push = link.mass * (acceleration[2] + machine.gravity)
+        numerator += push * center[:2] - link.mass * acceleration[:2] * center[2] + [-moment[1], moment[0]]
+        denominator += push
+    (x, y, z), force = numeric(machine.tip_pose((), q).position).ravel(), numeric(wrench.force).ravel()
+    moment = numeric(wrench.moment).ravel()
+    numerator += [z * force[0] - x * force[2] + moment[1], z * force[1] - y * force[2] - moment[0]]
+    expected = numerator / (denominator - force[2])
+    found = numeric(machine.zero_moment_point(q, qd, qdd, [wrench])).ravel()
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("library", [pinocchio_dynamics, mujoco_dynamics])
+@given(seeds, st.integers(2, 8), st.sampled_from(["planar", "spatial"]))
+@few
+def test_zmp_ground_force_and_torque_equal_an_independent_library(
+    library: Any, seed: int, size: int, base: Any
+) -> None:
+    rng = np.random.default_rng(seed)
+    machine = Standing(with_masses(random_robot(rng, size, base), rng), support=FOOT)
+    q, qd, qdd = rng.normal(size=machine.joint_size), *rng.normal(scale=0.5, size=(2, machine.joint_size))
+    wrench = hand(rng, machine)
+    torques, reaction = library(machine.robot, q, qd, qdd, [wrench], machine.gravity_in_world)
+    expected = np.array([-reaction[1], reaction[0]]) / reaction[5]
+    motion = (q, qd, qdd, [wrench])
+    np.testing.assert_allclose(numeric(machine.zero_moment_point(*motion)).ravel(), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(numeric(machine.ground_reaction(*motion)).ravel(), reaction, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(numeric(machine.joint_torques(*motion)).ravel(), torques, rtol=0, atol=1e-9)
+
+
+@given(seeds, sizes)
+@few
+def test_the_reaction_has_no_horizontal_moment_about_the_zero_moment_point(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    motion, wrench = random_motion(rng, machine), hand(rng, machine)
+    reaction = numeric(machine.ground_reaction(*motion, [wrench])).ravel()
+    point = np.append(numeric(machine.zero_moment_point(*motion, [wrench])).ravel(), 0.0)
+    moment = reaction[:3] - np.cross(point, reaction[3:])
+    np.testing.assert_allclose(moment[:2], 0, atol=1e-9 * np.abs(reaction).max())
+
+
+def hand_form(machine: Standing, q: Array, qd: Array, point: Array) -> tuple[Array, Array, Array]:
+    """J_m, H_m, C of (18), summed over links as printed and corrected, from derivatives of positions alone."""
+    robot, n = machine.robot, machine.joint_size
+    at = ca.SX.sym("q", n)
+    frames = link_frames(robot, at, machine.world_from_base())
+    J_m, H_m, C = np.zeros((2, n)), np.zeros((2, n, n)), np.zeros(2)
+    for link in robot.links:
+        center = frames[link.name].point(link.center_of_mass)
+        J = ca.jacobian(center, at)
+        spin = frame_jacobian(robot, at, link.name, world_from_base=machine.world_from_base())[0:3, :]
+        turn = frames[link.name].rotation
+        inertia = ca.mtimes([turn, ca.DM(link.inertia), turn.T])
+        # tau = I (A q'' + q'^T dA q') + (A q') x (I A q'): its rows I[k] and planes P[k]
+        rows = ca.mtimes(inertia, spin)
+        rates = ca.SX.sym("rates", n)
+        omega = ca.mtimes(spin, rates)
+        twisting = ca.mtimes(inertia, ca.jtimes(omega, at, rates)) + ca.cross(omega, ca.mtimes(inertia, omega))
+        P = [ca.hessian(twisting[k], rates)[0] / 2 for k in range(3)]
+        H = [ca.hessian(center[k], at)[0] for k in range(3)]
+        outputs = [ca.densify(part) for part in (center, J, rows, *H, *P)]
+        values = [numeric(value) for value in ca.Function("link", [at, rates], outputs)(q, qd)]
+        (x, y, z), J, spun, H, P = values[0].ravel(), values[1], values[2], values[3:6], values[6:9]
+        m = link.mass
+        J_m[0] += m * (x - point[0]) * J[2] - m * z * J[0] - spun[1]
+        J_m[1] += m * (y - point[1]) * J[2] - m * z * J[1] + spun[0]
+        H_m[0] += m * (x - point[0]) * H[2] - m * z * H[0] - P[1]
+        H_m[1] += m * (y - point[1]) * H[2] - m * z * H[1] + P[0]
+        C -= machine.gravity * m * (np.array([x, y]) - point)
+    return J_m, H_m, C
+
+
+@given(seeds, st.integers(1, 4))
+@few
+def test_the_rows_of_the_zmp_equation_equal_the_hand_form(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    (q, qd, _), point = random_motion(rng, machine), rng.normal(size=2)
+    J_m, H_m, C = hand_form(machine, q, qd, point)
+    rows = machine.zmp_rows(q, qd, point)
+    np.testing.assert_allclose(numeric(rows.jacobian), J_m, atol=1e-9)
+    np.testing.assert_allclose(numeric(rows.right).ravel(), C, atol=1e-9)
+    for found, plane in zip(rows.hessians, H_m, strict=True):
+        np.testing.assert_allclose(numeric(found), (plane + plane.T) / 2, atol=1e-9)
+
+
+@given(seeds, sizes)
+@few
+def test_accelerations_that_meet_the_rows_put_the_zero_moment_point_there(seed: int, size: int) -> None:
+    """J_m q'' - (C - q' H_m q') = F_z (zmp - point), for any acceleration and wrench."""
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    (q, qd, qdd), point = random_motion(rng, machine), rng.normal(size=2)
+    wrench = hand(rng, machine)
+    rows = machine.zmp_rows(q, qd, point, [wrench])
+    left = numeric(rows.jacobian).dot(qdd) - numeric(rows.needed(qd)).ravel()
+    vertical = numeric(machine.ground_reaction(q, qd, qdd, [wrench])).ravel()[5]
+    off = numeric(machine.zero_moment_point(q, qd, qdd, [wrench])).ravel() - point
+    np.testing.assert_allclose(left, vertical * off, rtol=1e-8, atol=1e-8)
+
+
+def test_the_index_is_1_at_the_most_stable_point_and_0_at_the_half_widths() -> None:
+    machine = paper_example()
+    for point, index in (((0, 0), (1, 1)), ((0.05, -0.1), (0, 0)), ((0, 0.05), (1, 0.75)), ((0, 0.2), (1, -3))):
+        np.testing.assert_allclose(numeric(machine.stability_index(point)).ravel(), index, atol=1e-12)
+    arm = standing_arm()  # by default that of the bounding box: positive exactly inside a rectangle
+    np.testing.assert_allclose(numeric(arm.stability_index((0.15, -0.2))).ravel(), 0, atol=1e-12)
+
+
+def test_a_spring_pulls_back_to_its_rest() -> None:
+    machine = paper_example()
+    (wrench,) = tip_spring(machine, (0, 150, 0), (0, 0.3, 1.0))(0.0, ca.DM([0.1, 0.5, 0.9]))
+    np.testing.assert_allclose(numeric(wrench.force).ravel(), [0, -30, 0])
+    assert wrench.link == machine.robot.tip
+
+
+@given(seeds, sizes)
+@few
+def test_a_sampled_motion_is_evaluated_point_by_point(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    q, qd, qdd = rng.normal(size=(3, 4, machine.joint_size))
+    t = np.array([0.0, 0.1, 0.3, 0.7])
+    pull = rng.normal(size=3)
+
+    def external(time: Any, tip: Any) -> list[Wrench]:
+        return [machine.tip_wrench(time * ca.DM(pull) - 2 * tip)]
+
+    found = standing_motion(machine, t, q, qd, qdd, external)
+    for k in range(4):
+        tip = numeric(machine.tip_pose((), q[k]).position).ravel()
+        wrenches = [machine.tip_wrench(t[k] * pull - 2 * tip)]
+        reaction = numeric(machine.ground_reaction(q[k], qd[k], qdd[k], wrenches)).ravel()
+        point = numeric(center_of_pressure(reaction)).ravel()
+        np.testing.assert_allclose(found.ground_force[k], reaction[3:], atol=1e-9)
+        np.testing.assert_allclose(found.zero_moment_point[k], point, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found.index[k], numeric(machine.stability_index(point)).ravel(), rtol=1e-9)
+        np.testing.assert_allclose(
+            found.joint_torques[k], numeric(machine.joint_torques(q[k], qd[k], qdd[k], wrenches)).ravel(), atol=1e-9
+        )
+        np.testing.assert_allclose(found.external_force[k], t[k] * pull - 2 * tip, atol=1e-12)
+        inside = bool((point > 0).all() and point.sum() < 1)
+        assert (found.foot_margin[k] > 0) == inside
+    lifted = found.ground_force[:, 2] <= 0
+    assert found.stays_on_ground == (not lifted.any())
+    assert np.isinf(found.friction[lifted]).all()
+    level = np.linalg.norm(found.ground_force[~lifted, :2], axis=1)
+    np.testing.assert_allclose(found.friction[~lifted] * found.ground_force[~lifted, 2], level, rtol=1e-12)
+    assert found.summary()["stands"] == found.stands
+    assert ("DOES NOT STAND" in str(found)) == (not found.stands)
+
+
+def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
+    machine = paper_example()
+    q = np.array([machine.robot.lower, machine.robot.upper, (machine.robot.lower + machine.robot.upper) / 2])
+    q = np.vstack([q, q[1] + [0, 0, 0.2, 0, 0]])
+    found = standing_motion(machine, np.arange(4.0), q, 0 * q, 0 * q)
+    np.testing.assert_allclose(found.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
+    np.testing.assert_allclose(found.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
+    assert found.joint_excess[2] < 0
+    assert not found.stays_in_limits
+    assert standing_motion(machine, np.arange(3.0), q[:3], 0 * q[:3], 0 * q[:3]).stays_in_limits
+
+
+def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
+    free = Standing(planar_chain([1.0, 1.0], [1.0, 1.0]), support=FOOT)
+    found = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], [[0.0, 0.0]])
+    assert found.joint_limit_index.tolist() == [0.0]
+    assert found.joint_excess.tolist() == [-np.inf]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gravity": 0.0}, "gravity 0.0 m/s.2 is not positive"),
+        ({"half_widths": (0.1, 0.0)}, "half_widths .* not positive"),
+        ({"most_stable_point": (0.1,)}, "most_stable_point has shape"),
+        ({"robot": planar_chain([1.0], [0.0])}, "has no mass"),
+        ({"robot": Robot((Link("stone", 1.0),))}, "no moving joint"),
+    ],
+)
+def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        replace(paper_example(), **changes)
+
+
+def test_a_motion_of_a_wrong_shape_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"joint_velocities has shape \(2, 4\), expected \(2, 5\)"):
+        standing_motion(paper_example(), [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))

@@ -1,0 +1,73 @@
+"""A motion of a standing machine replayed in MuJoCo: a loose foot on a floor, joints on stiff servos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from models.standing import Standing
+from models.standing_motion import StandingMotion
+from tests.models.oracles import mujoco_model
+from tests.models.trees import Array
+
+FOOT_MASS = 1.0  # kg; the simulator takes no body without mass
+SERVO = 1e4  # N m/rad at the ankle
+THICKNESS = 1e-3  # half of it, m
+STEP = 2.5e-4  # s
+CONTACT = 'friction="2 0.01 0.001" solref="0.004 1" solimp="0.99 0.999 0.0001" condim="4"'
+
+
+def replay(machine: Standing, motion: StandingMotion, fallen: float = 0.3) -> tuple[Array, Array]:
+    """Times (K,) and tilts of the foot (K,), rad, until the end or until the foot is tilted by `fallen`.
+
+    The foot is a plate as long as the support and 0.6 m wide, for a machine that moves in the y-z plane. The joints get
+    the torques of the motion and are held to it by servos, softer towards the tip.
+    """
+    robot = machine.robot
+    links = [
+        replace(link, mass=FOOT_MASS, inertia=0.02 * FOOT_MASS * np.eye(3)) if link.name == robot.root else link
+        for link in robot.links
+    ]
+    turn = np.asarray(machine.rotation)
+    center = turn.T @ [0.0, machine.support.center[1], -THICKNESS]
+    model = mujoco_model(
+        replace(robot, links=tuple(links)),
+        ground=f'<geom type="plane" size="5 5 1" pos="0 0 {-2 * THICKNESS}" {CONTACT}/>',
+        foot=f'<geom type="box" size="0.3 {machine.support.half_widths[1]} {THICKNESS}" '
+        f'pos="{_text(center)}" quat="{_text(_quaternion(turn.T))}" {CONTACT}/>',
+        options=f'timestep="{STEP}" integrator="implicitfast"',
+    )
+    stiffness = SERVO * np.geomspace(1.0, 0.05, machine.joint_size)
+    model.dof_damping[6:] = stiffness / 20  # integrated implicitly, unlike a force of our own
+    data = mujoco.MjData(model)
+    data.qpos[3:7] = _quaternion(turn)
+    data.qpos[7:], data.qvel[6:] = motion.joints[0], motion.joint_velocities[0]
+    times: Array = np.arange(int(motion.t[-1] / STEP), dtype=float) * STEP
+    planned = [
+        np.column_stack([np.interp(times, motion.t, column) for column in values.T])
+        for values in (motion.joints, motion.joint_velocities, motion.joint_torques)
+    ]
+    tilts: Array = np.zeros(len(times))
+    found = np.zeros(9)
+    for k in range(len(times)):
+        joints, velocities, torques = (values[k] for values in planned)
+        data.qfrc_applied[6:] = torques + stiffness * (joints - data.qpos[7:]) + stiffness / 20 * velocities
+        mujoco.mj_step(model, data)
+        mujoco.mju_quat2Mat(found, data.qpos[3:7])
+        upright = found.reshape(3, 3)[2] @ turn.T[:, 2]
+        tilts[k] = np.arccos(np.clip(upright, -1.0, 1.0))
+        if tilts[k] > fallen:
+            return times[: k + 1], tilts[: k + 1]
+    return times, tilts
+
+
+def _quaternion(matrix: Array) -> Array:
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
+    return found
+
+
+def _text(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,103 @@
+"""The tasks of Tables 1 and 2, and a spatial one, for local and optimal plans alike."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.dynamics import Wrench
+from models.standing import PAPER_START, External, Standing, paper_example, tip_spring
+from models.standing_motion import StandingMotion, standing_motion
+from ocp import Problem, Solution
+from ocp.builders.standing import FreeTime, Limits, Weights, standing_plan
+from tests.models.standing_machines import standing_arm
+from tests.models.trees import Array
+
+HORIZON = 2 * np.pi
+ROWS = (4, 5)
+LIMITS = Limits(velocity=6.0, acceleration=60.0, vertical_force=60.0)
+LIFT_LIMITS = Limits(velocity=3.0, acceleration=20.0, torque=(200, 350, 250, 60, 30), vertical_force=60.0, friction=0.6)
+LIFT_WEIGHTS = Weights(acceleration=1e-5, velocity=0.0, joint_limits=0.0, manipulability=0.0, time=1.0)
+
+ARM_START = np.array([0.3, -0.5, 0.2, 1.6, -0.2, 0.9, 0.1])
+ARM_HORIZON = 1.2
+
+
+@cache
+def machine() -> Standing:
+    return paper_example()
+
+
+@cache
+def arm() -> Standing:
+    return standing_arm()
+
+
+def tip_at(standing: Standing, joints: Array) -> Array:
+    return np.array(ca.DM(standing.tip_pose((), joints).position)).ravel()
+
+
+def table_path(table: int) -> Any:
+    """zdot = 0.4 sin t (Table 1) or ydot = 0.2 sin t (Table 2); the other coordinate is held."""
+    _, y, z = tip_at(machine(), PAPER_START[table])
+    if table == 1:
+        return lambda t: [y, z + 0.4 * (1 - ca.cos(t))]
+    return lambda t: [y + 0.2 * (1 - ca.cos(t)), z]
+
+
+def spring() -> External:
+    """k = 150 N/m along y, relaxed where the tip of Table 2 starts."""
+    return tip_spring(machine(), (0, 150, 0), tip_at(machine(), PAPER_START[2]))
+
+
+def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
+    settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
+    return standing_plan(machine(), table_path(table), ROWS, PAPER_START[table], HORIZON, **settings)
+
+
+def lift_plan(zmp: Any, **changes: Any) -> Problem:
+    """The tip 0.8 m straight up in the least time."""
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}
+    return standing_plan(
+        machine(), lambda s: [y, z + 0.8 * s], ROWS, PAPER_START[1], FreeTime(0.2, 3.0, 1.0), zmp=zmp, **settings
+    )
+
+
+def arm_path(t: Any) -> list[Any]:
+    """0.25 m forward and aside and 0.1 m down, from rest to rest."""
+    x, y, z = tip_at(arm(), ARM_START)
+    s = t / ARM_HORIZON
+    share = s**3 * (10 - 15 * s + 6 * s**2)
+    return [x + 0.25 * share, y + 0.25 * share, z - 0.1 * share]
+
+
+def tool(time: Any, tip: Any) -> list[Wrench]:
+    """A load that grows, and a constant moment, at the arm's tip."""
+    return [arm().tip_wrench((0, 0, -25 - 20 * time), (1.0, 2.0, 0.5))]
+
+
+def sampled(
+    standing: Standing,
+    solution: Solution,
+    external: External | None = None,
+    rows: Any = ROWS,
+    finer: int = 10,
+) -> StandingMotion:
+    """A plan on a grid `finer` times its own, at the middles of the parts, where held controls are plain."""
+    count = solution.method["intervals"] * finer
+    values = solution.at_fraction((np.arange(count) + 0.5) / count)
+    times = (np.arange(count) + 0.5) / count * solution.horizon
+    return standing_motion(
+        standing, times, values["joints"], values["velocities"], values["accelerations"], external, rows
+    )
+
+
+def tip_error(motion: StandingMotion, path: Any, rows: Any = ROWS) -> float:
+    """Greatest distance from the path, m."""
+    axes = [row - 3 for row in rows]
+    wanted = np.array([np.array(ca.DM(ca.vertcat(*path(float(t))))).ravel() for t in motion.t])
+    return float(np.linalg.norm(motion.tip_in_world[:, axes] - wanted, axis=1).max())

@@ -1,0 +1,311 @@
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models.machine import jacobian_manipulability
+from models.motion import momentum
+from models.posture import joint_limit_index
+from models.standing import PAPER_START, Standing
+from ocp.acceleration_laws import accelerations
+from ocp.errors import ProblemError
+from ocp.local_acceleration import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
+from tests.models.trees import Array, numeric
+from tests.ocp.standing_tasks import (
+    ARM_HORIZON,
+    ARM_START,
+    HORIZON,
+    ROWS,
+    arm,
+    arm_path,
+    machine,
+    spring,
+    table_path,
+    tip_at,
+    tip_error,
+    tool,
+)
+
+
+def table(number: int, **settings: Any) -> AccelerationSolution:
+    external = spring() if number == 2 else None
+    return resolve_accelerations(
+        machine(), table_path(number), ROWS, PAPER_START[number], HORIZON, external=external, **settings
+    )
+
+
+def law(standing: Standing, path: Any, rows: Any, **settings: Any) -> Any:
+    """(time, q, q') -> q'' of a law, the zero moment point at the most stable point."""
+    n = standing.joint_size
+    time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
+    place = ca.DM(standing.most_stable_point)
+    return ca.Function(
+        "law",
+        [time, q, qd],
+        [accelerations(standing, path, rows, time=time, q=q, qd=qd, zmp=lambda _: place, **settings)],
+    )
+
+
+def near(rng: np.random.Generator, start: Array) -> tuple[float, Array, Array]:
+    return float(rng.uniform(0, 1)), start + rng.normal(scale=0.2, size=len(start)), rng.normal(size=len(start))
+
+
+def test_the_plain_pseudo_inverse_tips_over() -> None:
+    found = table(1)
+    zmp = found.motion.zero_moment_point[:, 1]
+    assert found.stopped is None
+    assert zmp.min() == pytest.approx(-0.066, abs=5e-4)
+    assert zmp.max() == pytest.approx(0.250, abs=5e-4)
+    assert found.motion.index.min() == pytest.approx(-5.3, abs=0.05)
+    assert not found.motion.stands
+    assert not found.succeeded
+    assert found.tip_error.max() < 1e-9
+    assert tip_error(found.motion, table_path(1)) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["augmented", "null_space"])
+def test_pinning_the_zero_moment_point_lifts_off_although_its_index_is_1(name: Any) -> None:
+    found = table(1, law=name)
+    assert found.stopped is not None
+    assert found.stopped.reason == "lift_off"
+    assert found.stopped.time == pytest.approx(1.13, abs=5e-3)
+    assert found.motion.t[-1] == found.stopped.time
+    assert found.motion.ground_force[-1, 2] < 0 < found.motion.ground_force[:-1, 2].min()
+    assert found.motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert not found.succeeded
+    assert "lifts off at 1.13" in str(found)
+
+
+def test_carried_on_past_the_lift_off_it_diverges() -> None:
+    found = table(1, law="augmented", stop_at_lift_off=False)
+    assert found.stopped is not None
+    assert found.stopped.reason == "divergence"
+    assert found.stopped.time == pytest.approx(1.26, abs=5e-3)
+    assert np.abs(found.motion.joint_velocities[-1]).max() > 20
+    assert "diverges" in found.stopped.message
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
+    both = [table(number, law=name, stop_at_lift_off=False, speed_limit=5.0) for name in ("augmented", "null_space")]
+    for what in ("joints", "joint_velocities", "joint_accelerations"):
+        found = [getattr(solution.motion, what) for solution in both]
+        np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-9)
+    laws = [law(arm(), arm_path, (3, 4, 5), external=tool, law=name) for name in ("augmented", "null_space")]
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        at = near(rng, ARM_START)
+        np.testing.assert_allclose(numeric(laws[0](*at)), numeric(laws[1](*at)), rtol=1e-9, atol=1e-9)
+
+
+def test_the_augmented_law_is_the_least_acceleration_that_does_both() -> None:
+    """(20) by numpy's pseudo-inverse of the stacked rows, on a spatial arm with a wrench at the tool."""
+    standing, rng = arm(), np.random.default_rng(2)
+    found = law(standing, arm_path, (3, 4, 5), external=tool, law="augmented")
+    n = standing.joint_size
+    q, qd, t = ca.SX.sym("q", n), ca.SX.sym("qd", n), ca.SX.sym("t")
+    jacobian = standing.tip_jacobian((), q)[3:6, :]
+    bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
+    wanted = ca.jacobian(ca.jacobian(ca.vertcat(*arm_path(t)), t), t)
+    rows = standing.zmp_rows(q, qd, (0, 0), tool(t, standing.tip_pose((), q).position))
+    stack = [ca.vertcat(jacobian, rows.jacobian), ca.vertcat(wanted - bias, rows.needed(qd))]
+    stacked = ca.Function("stacked", [t, q, qd], stack)
+    for _ in range(5):
+        at = near(rng, ARM_START)
+        left, right = (numeric(part) for part in stacked(*at))
+        np.testing.assert_allclose(numeric(found(*at)), np.linalg.pinv(left) @ right, rtol=1e-8, atol=1e-8)
+
+
+def index_and_slope(q: Any, name: str) -> tuple[Any, Any]:
+    standing = machine()
+    if name == "joint_limits":
+        index = joint_limit_index(standing.robot, q)
+    else:
+        index = jacobian_manipulability(standing.tip_jacobian((), q), ROWS)
+    return index, ca.jacobian(index, q)
+
+
+def printed_sequence(time: float, q0: Array, qd0: Array, delta: tuple[float, float]) -> Array:
+    """(34) with the corrections: K1 = B1 (I - G+ G), K4 = B2 (I - G+ G)(I - K1+ K1), K5 with K1+ and D of (29)."""
+    standing = machine()
+    q, qd, t = ca.SX.sym("q", 5), ca.SX.sym("qd", 5), ca.SX.sym("t")
+    jacobian = standing.tip_jacobian((), q)[ROWS, :]
+    wanted = ca.jacobian(ca.jacobian(ca.vertcat(*table_path(1)(t)), t), t)
+    rows = standing.zmp_rows(q, qd, (0, 0))
+    parts: list[Any] = [ca.vertcat(jacobian, rows.jacobian[1, :])]
+    bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
+    parts.append(ca.vertcat(wanted - bias, rows.needed(qd)[1]))
+    p1, B1 = index_and_slope(q, "joint_limits")
+    p2, B2 = index_and_slope(q, "manipulability")
+    determinant = ca.det(ca.mtimes(jacobian, jacobian.T))
+    H2, D = ca.hessian(determinant, q)[0] / (2 * p2), -(ca.mtimes(B2, qd) ** 2) / p2
+    parts += [B1, ca.mtimes([qd.T, ca.hessian(p1, q)[0], qd]), B2, ca.mtimes([qd.T, H2, qd]) + D]
+    values = [numeric(part) for part in ca.Function("parts", [t, q, qd], parts)(time, q0, qd0)]
+    G, task, B1, bend1, B2, bend2 = values
+    plus = np.linalg.pinv
+    free = np.eye(5) - plus(G) @ G
+    K1 = B1 @ free
+    first = plus(K1) @ (delta[0] - B1 @ plus(G) @ task - bend1)
+    K4 = B2 @ free @ (np.eye(5) - plus(K1) @ K1)
+    K5 = B2 @ plus(G) @ task + B2 @ first + bend2
+    return plus(G) @ task + first + plus(K4) @ (delta[1] - K5)
+
+
+def test_layers_in_sequence_follow_the_corrected_printed_form_and_do_what_they_are_asked() -> None:
+    layers = (Layer("joint_limits", -0.3), Layer("manipulability", 0.2))
+    found = law(machine(), table_path(1), ROWS, law="augmented", layers=layers)
+    q, qd, qdd = (ca.SX.sym(name, 5) for name in ("q", "qd", "qdd"))
+    second = []
+    for name in ("joint_limits", "manipulability"):
+        rate = ca.mtimes(index_and_slope(q, name)[1], qd)
+        second.append(ca.jtimes(rate, ca.vertcat(q, qd), ca.vertcat(qd, qdd)))
+    asked = ca.Function("asked", [q, qd, qdd], second)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        time, q0, qd0 = near(rng, PAPER_START[1])
+        push = numeric(found(time, q0, qd0)).ravel()
+        expected = printed_sequence(time, q0, qd0, (-0.3, 0.2)).ravel()
+        np.testing.assert_allclose(push, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
+        np.testing.assert_allclose([float(part) for part in asked(q0, qd0, push)], [-0.3, 0.2], atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "sign"), [("joint_limits", -1.0), ("manipulability", 1.0)])
+def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tasks(name: Any, sign: float) -> None:
+    plain = law(machine(), table_path(1), ROWS, law="augmented")
+    driven = law(machine(), table_path(1), ROWS, law="augmented", layers=(Layer(name, sign, "gradient"),))
+    q, rng = ca.SX.sym("q", 5), np.random.default_rng(4)
+    slope = ca.Function("slope", [q], [index_and_slope(q, name)[1]])
+    for _ in range(5):
+        at = near(rng, PAPER_START[1])
+        added = numeric(driven(*at)) - numeric(plain(*at))
+        assert sign * (numeric(slope(at[1])) @ added).item() > 0
+        np.testing.assert_allclose(numeric(machine().tip_jacobian((), at[1]))[list(ROWS)] @ added, 0, atol=1e-9)
+        balance = numeric(machine().zmp_rows(at[1], at[2], (0, 0)).jacobian)[1] @ added
+        np.testing.assert_allclose(balance, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("layer", [Layer("joint_limits", -0.1), Layer("manipulability", 0.05)])
+def test_the_layers_do_not_stop_the_pinned_pendulum_from_falling(layer: Layer) -> None:
+    found = table(1, law="augmented", layers=(layer,))
+    assert found.stopped is not None
+    assert found.stopped.time < 2.0
+
+
+def test_the_stabilised_law_stands_on_table_1() -> None:
+    """Page: |q'| 0.99, index 1, Fz >= 589 N, no limit violation, by poles (4, 4, 4) and damping 2."""
+    found = table(1, law="stabilised")
+    assert found.succeeded
+    motion = found.motion
+    assert motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert np.abs(motion.joint_velocities).max() == pytest.approx(0.99, rel=0.05)
+    assert motion.ground_force[:, 2].min() >= 589
+    assert found.tip_error.max() < 1e-9
+
+
+def test_slower_poles_ask_less_of_the_joints() -> None:
+    """The page's 5.9 rad/s^2 is that of poles of 3.5 1/s: the peak stands at the start, where k1 alone decides."""
+    motion = table(1, law="stabilised", stabiliser=Stabiliser((3.5, 3.5, 3.5), gradient=1.0)).motion
+    assert motion.stands
+    assert motion.stays_in_limits
+    assert np.abs(motion.joint_accelerations).max() == pytest.approx(5.9, rel=0.05)
+    assert np.abs(motion.joint_velocities).max() == pytest.approx(0.99, rel=0.05)
+    assert motion.ground_force[:, 2].min() >= 589
+
+
+def test_the_stabilised_law_fails_on_table_2() -> None:
+    assert not table(2, law="stabilised").succeeded
+
+
+def test_the_pinned_pendulum_obeys_its_equation() -> None:
+    """dL/dt = -M g (y_c - p), along the augmented and the stabilised motion alike."""
+    for name in ("augmented", "stabilised"):
+        found = table(1, law=name).motion
+        standing, inner = machine(), slice(0, 1000)
+        q, qd = ca.SX.sym("q", 5), ca.SX.sym("qd", 5)
+        total = momentum(standing.robot, q, qd, world_from_base=standing.world_from_base())
+        function = ca.Function("spin", [q, qd], [total[0]]).map(1000)
+        spin = numeric(function(found.joints[inner].T, found.joint_velocities[inner].T)).ravel()
+        rate = np.gradient(spin, found.t[inner])
+        expected = -standing.weight * found.center_of_mass[inner, 1]
+        np.testing.assert_allclose(rate[1:-1], expected[1:-1], atol=2e-2)
+
+
+def test_null_space_damping_keeps_the_pseudo_inverse_inside_the_foot() -> None:
+    assert table(1, null_damping=2.0).motion.stands
+
+
+def test_a_moving_reference_is_followed() -> None:
+    found = table(1, law="augmented", zmp=lambda t: [0.0, 0.05 * ca.sin(3 * t)])
+    t = found.motion.t[:500]
+    np.testing.assert_allclose(found.motion.zero_moment_point[:500, 1], 0.05 * np.sin(3 * t), atol=1e-9)
+
+
+def test_both_integrators_agree_and_rk4_is_of_fourth_order() -> None:
+    reference = table(1, integrator="cvodes", step=0.05, tolerance=1e-12).motion.joints[-1]
+    errors = [np.abs(table(1, step=step).motion.joints[-1] - reference).max() for step in (0.2, 0.1)]
+    assert errors[1] < 1e-5
+    assert 3.3 < np.log2(errors[0] / errors[1]) < 4.7
+
+
+def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
+    found = resolve_accelerations(arm(), arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
+    assert found.stopped is None
+    assert found.tip_error.max() < 1e-9
+    assert found.motion.index.min() < -0.3
+    np.testing.assert_allclose(found.motion.external_force[:, 2], -25 - 20 * found.motion.t, atol=1e-9)
+
+
+def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
+    """The tip of Table 1 moved on beyond the stretched arm."""
+    _, y, z = tip_at(machine(), PAPER_START[1])
+
+    def path(t: Any) -> list[Any]:
+        return [y + (1.8 - y) * t**2, z * (1 - t**2)]
+
+    found = resolve_accelerations(machine(), path, ROWS, PAPER_START[1], 1.0, stop_at_lift_off=False)
+    assert found.stopped is not None
+    assert found.stopped.reason in ("divergence", "breakdown")
+    assert np.isfinite(found.motion.joint_accelerations).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"law": "magic"}, "unknown law 'magic'"),
+        ({"integrator": "euler"}, "unknown integrator 'euler'"),
+        ({"step": 0.0}, "step must be a positive number"),
+        ({"speed_limit": -1.0}, "speed_limit must be a positive number"),
+        ({"null_damping": -1.0}, "null_damping must be"),
+        ({"rows": (0, 4)}, r"gives positions, rows 3, 4, 5; leave out \[0\]"),
+        ({"start_velocities": (1.0,)}, "start_velocities must be 5 numbers"),
+        ({"zmp": (0.0,)}, "zmp must be two numbers"),
+        ({"tip_path": lambda t: [0.0, 0.5]}, "tip_path starts at .* from the tip"),
+        ({"tip_path": lambda t: [0.0]}, r"tip_path has shape \(1, 1\), expected \(2, 1\)"),
+        (
+            {"law": "stabilised", "layers": (Layer("joint_limits", -1.0), Layer("manipulability", 1.0))},
+            "needs 6 joints .* there are 5",
+        ),
+    ],
+)
+def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
+    arguments = {"tip_path": table_path(1), "rows": ROWS, "start_joints": PAPER_START[1], "horizon": 1.0, **changes}
+    with pytest.raises(ProblemError, match=message):
+        resolve_accelerations(machine(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Layer("reach", 1.0), "unknown index 'reach'"),  # type: ignore[arg-type]
+        (lambda: Layer("joint_limits", 1.0, "soft"), "unknown form 'soft'"),  # type: ignore[arg-type]
+        (lambda: Layer("joint_limits", np.nan), "demand must be a number"),
+        (lambda: Stabiliser((4.0, 4.0, -1.0)), "three positive numbers"),
+        (lambda: Stabiliser(damping=-1.0), "damping must not be negative"),
+    ],
+)
+def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        make()

@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models.standing import PAPER_START, center_of_pressure
+from models.standing_motion import standing_motion
+from ocp import Collocation, MultipleShooting, Solution, solve
+from ocp.builders.standing import (
+    Anywhere,
+    Following,
+    FreeTime,
+    IndexAtLeast,
+    InFoot,
+    Limits,
+    Pinned,
+    Weights,
+    motion_cost,
+    standing_plan,
+)
+from ocp.errors import ProblemError, SolveError
+from ocp.local_acceleration import Stabiliser, resolve_accelerations
+from tests.models.trees import numeric
+from tests.ocp.standing_replay import replay
+from tests.ocp.standing_tasks import (
+    ARM_HORIZON,
+    ARM_START,
+    HORIZON,
+    LIFT_LIMITS,
+    LIMITS,
+    ROWS,
+    arm,
+    arm_path,
+    lift_plan,
+    machine,
+    sampled,
+    spring,
+    table_path,
+    table_plan,
+    tip_at,
+    tip_error,
+    tool,
+)
+
+IN_RANGE = InFoot(0.02)  # -0.08 .. 0.18 m
+MILLIMETRE = 1e-3
+
+
+def held(problem: Any, intervals: int = 80, **settings: Any) -> Solution:
+    return solve(problem, MultipleShooting(intervals, control="held"), **settings)
+
+
+def points(problem: Any, intervals: int) -> Solution:
+    return solve(problem, Collocation(intervals, degree=3, scheme="legendre"))
+
+
+@pytest.mark.parametrize(
+    ("zmp", "cost", "index", "speed", "push"),
+    [
+        (IN_RANGE, -0.7078, 0.359, 1.02, 3.4),
+        (IndexAtLeast(0.5), -0.653, 0.499, 1.03, 3.4),
+        (IndexAtLeast(0.9), -0.379, 0.900, 1.08, 3.5),
+        (Pinned(), -0.1104, 0.998, 1.26, 4.2),
+        (Anywhere(), -1.022, -2.9, 1.09, 3.6),
+    ],
+    ids=["in_range", "index_half", "index_nine_tenths", "pinned", "none"],
+)
+def test_plans_of_table_1_cost_what_they_should(zmp: Any, cost: float, index: float, speed: float, push: float) -> None:
+    """Costs, least index on the dense grid and peak rates: reference computed independently, 80 intervals."""
+    solution = held(table_plan(1, zmp))
+    assert solution.cost == pytest.approx(cost, rel=2e-3)
+    motion = sampled(machine(), solution)
+    assert motion.index.min() == pytest.approx(index, abs=0.01)
+    assert np.abs(solution["velocities"]).max() == pytest.approx(speed, abs=0.01)
+    assert np.abs(solution["accelerations"]).max() == pytest.approx(push, abs=0.05)
+    assert tip_error(motion, table_path(1)) < 1e-5
+    assert motion.joint_excess.max() < 1e-6
+    assert np.abs(motion.joint_velocities).max() <= 6 + 1e-6
+    assert motion.ground_force[:, 2].min() > 60
+    assert motion.stands == (not isinstance(zmp, Anywhere))
+    np.testing.assert_allclose(solution["velocities"][[0, -1]], 0, atol=1e-9)
+    if zmp is IN_RANGE:
+        point = motion.zero_moment_point[:, 1]
+        assert point.min() > -0.08 - MILLIMETRE
+        assert point.max() < 0.18 + MILLIMETRE
+
+
+@pytest.mark.parametrize(
+    ("zmp", "cost"), [(IN_RANGE, -2.316), (IndexAtLeast(0.9), -2.235), (Pinned(), -2.000)], ids=str
+)
+def test_plans_of_table_2_against_the_spring_cost_what_they_should(zmp: Any, cost: float) -> None:
+    solution = held(table_plan(2, zmp))
+    assert solution.cost == pytest.approx(cost, rel=1e-3)
+    motion = sampled(machine(), solution, spring())
+    assert motion.stands
+    assert tip_error(motion, table_path(2)) < 1e-5
+    stretch = motion.tip_in_world[:, 1] - tip_at(machine(), PAPER_START[2])[1]
+    np.testing.assert_allclose(motion.external_force[:, 1], -150 * stretch, atol=1e-9)
+
+
+def test_held_plans_converge_to_the_one_of_collocation_points() -> None:
+    """Two transcriptions and two ways to hold the tip on its path; of first order, for the region binds at nodes."""
+    best = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 20).cost
+    errors = [held(table_plan(1, IN_RANGE), n).cost - best for n in (20, 40, 80)]
+    assert errors[0] > 2 * errors[1] > 4 * errors[2] > 0
+    assert errors[2] < 2e-3
+
+
+@pytest.mark.parametrize("zmp", [IN_RANGE, Pinned()], ids=["in_range", "pinned"])
+def test_a_plan_at_collocation_points_passes_its_audit(zmp: Any) -> None:
+    problem = table_plan(1, zmp, tip_level="acceleration")
+    coarse, fine = points(problem, 20), points(problem, 40)
+    assert coarse.cost == pytest.approx(fine.cost, rel=1e-3)
+    audit = fine.audit(tolerances={"zero moment point": MILLIMETRE, "joints": 1e-6, "velocities": 1e-6, "tip": 0.02})
+    assert audit.passed, str(audit)
+    assert tip_error(sampled(machine(), fine), table_path(1)) < 1e-5
+
+
+def test_the_audit_of_a_held_plan_finds_its_motion_sound() -> None:
+    solution = held(table_plan(1, IN_RANGE))
+    audit = solution.audit(tolerances={"zero moment point": MILLIMETRE, "joints": 1e-6, "tip": 1e-5})
+    # an inequality with a held control is active at one end of an interval, its multiplier is not inside it
+    assert {finding.name for finding in audit.failures} <= {"stationarity, relative"}
+
+
+def test_collocation_with_held_controls_gives_the_same_plan_as_shooting() -> None:
+    problem = table_plan(1, IndexAtLeast(0.5))
+    other = solve(problem, Collocation(40, degree=3, scheme="legendre", control="held"))
+    assert other.cost == pytest.approx(held(problem, 40).cost, abs=1e-4)
+
+
+def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_more() -> None:
+    """The same cost on local laws, from the reference: pseudo-inverse 2.49, damped 0.57, stabilised 0.17."""
+    solution = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 20)
+    times = np.linspace(0, HORIZON, 2001)
+    values = solution.at_fraction(times / HORIZON)
+    motion = standing_motion(
+        machine(), times, values["joints"], values["velocities"], values["accelerations"], rows=ROWS
+    )
+    assert motion_cost(motion) == pytest.approx(solution.cost, abs=1e-5)
+    costs = {}
+    laws: dict[str, dict[str, Any]] = {
+        "plain": {},
+        "damped": {"null_damping": 2.0},
+        "stabilised": {"law": "stabilised", "stabiliser": Stabiliser((3.5, 3.5, 3.5), gradient=1.8)},
+    }
+    for name, law in laws.items():
+        found = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], HORIZON, step=1e-2, **law)
+        costs[name] = motion_cost(found.motion)
+        assert costs[name] > solution.cost
+    assert costs["plain"] == pytest.approx(2.49, rel=0.01)
+    assert costs["damped"] == pytest.approx(0.57, rel=0.01)
+    assert costs["stabilised"] == pytest.approx(0.17, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("zmp", "seconds"), [(Anywhere(), 0.457), (IN_RANGE, 0.503), (IndexAtLeast(0.9), 0.539)], ids=str
+)
+def test_the_fastest_lift_takes_longer_the_less_the_zero_moment_point_may_move(zmp: Any, seconds: float) -> None:
+    solution = held(lift_plan(zmp), 50)
+    assert solution.horizon == pytest.approx(seconds, rel=2e-3)
+    assert solution["path"][-1, 0] == pytest.approx(1.0)
+    motion = sampled(machine(), solution)
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    assert np.abs(motion.tip_in_world[:, 1] - y).max() < 1e-4  # straight up
+    end = numeric(machine().tip_pose((), solution["joints"][-1]).position).ravel()
+    np.testing.assert_allclose(end, [0, y, z + 0.8], atol=1e-8)
+    assert (np.abs(motion.joint_torques).max(axis=0) <= np.array(LIFT_LIMITS.torque) * 1.01).all()
+    assert motion.friction.max() < 0.6 * 1.02
+    assert np.abs(solution["accelerations"]).max() <= 20 + 1e-6
+    assert motion.ground_force[:, 2].min() > 59
+
+
+def test_the_fastest_lift_does_not_depend_on_the_first_guess() -> None:
+    problem = lift_plan(IN_RANGE)
+    slow = held(replace_horizon(2.0), 50)
+    assert held(problem, 50, guess=slow).horizon == pytest.approx(held(problem, 50).horizon, rel=1e-6)
+
+
+def replace_horizon(seconds: float) -> Any:
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    return standing_plan(
+        machine(),
+        lambda s: [y, z + 0.8 * s],
+        ROWS,
+        PAPER_START[1],
+        seconds,
+        zmp=IN_RANGE,
+        limits=LIFT_LIMITS,
+        along="parameter",
+    )
+
+
+def test_the_zero_moment_point_follows_a_reference() -> None:
+    def reference(t: Any) -> list[Any]:
+        return [0.0, 0.04 * ca.sin(t)]
+
+    solution = points(table_plan(1, Following(reference), tip_level="acceleration"), 30)
+    motion = sampled(machine(), solution)
+    np.testing.assert_allclose(motion.zero_moment_point[:, 1], 0.04 * np.sin(motion.t), atol=MILLIMETRE)
+
+
+def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
+    solution = held(table_plan(1, IN_RANGE, control="jerk"), 60)
+    assert solution.cost == pytest.approx(-0.703, abs=5e-3)
+    motion = sampled(machine(), solution)
+    assert motion.stands
+    assert tip_error(motion, table_path(1)) < 1e-5
+    steps = np.abs(np.diff(motion.joint_accelerations, axis=0)).max()
+    assert steps < 1.1 * np.abs(solution["jerks"]).max() * HORIZON / 600
+
+
+def test_free_ends_cost_less_than_rest_and_a_given_end_posture_more() -> None:
+    rest = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 12)
+    free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end="free"), 12)
+    loose = points(table_plan(1, IN_RANGE, tip_level="acceleration", start="free", end="free"), 12)
+    assert loose.cost < free.cost < rest.cost
+    posture = np.append(rest["joints"][-1, :2] + [0.05, -0.05], [np.nan] * 3)
+    given = held(table_plan(1, IN_RANGE, end_joints=posture), 30)
+    np.testing.assert_allclose(given["joints"][-1, :2], posture[:2], atol=1e-8)
+    assert given.cost > held(table_plan(1, IN_RANGE), 30).cost
+
+
+def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
+    knots = np.linspace(-0.1, HORIZON + 0.1, 61)
+    rise = ca.interpolant("rise", "bspline", [knots], 0.4 * (1 - np.cos(knots)))
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    offset = float(rise(0.0))
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "end": "free", "start": "free"}
+    problem = standing_plan(
+        machine(),
+        lambda t: ca.vertcat(y, z + rise(t) - offset),
+        ROWS,
+        PAPER_START[1],
+        HORIZON,
+        symbols=ca.MX,
+        **settings,
+    )
+    exact = table_plan(1, IN_RANGE, start="free", end="free")
+    assert held(problem, 20).cost == pytest.approx(held(exact, 20).cost, abs=1e-4)
+
+
+def test_a_spatial_arm_stands_where_the_local_method_tips() -> None:
+    local = resolve_accelerations(arm(), arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, external=tool, step=2e-3).motion
+    assert not local.stands
+    problem = standing_plan(
+        arm(),
+        arm_path,
+        (3, 4, 5),
+        ARM_START,
+        ARM_HORIZON,
+        zmp=InFoot(0.005),
+        external=tool,
+        limits=Limits(friction=0.7, acceleration=100.0),
+        tip_level="acceleration",
+    )
+    assert problem.declared.path["zero moment point"].size == 4  # both coordinates
+    solution = points(problem, 12)
+    motion = sampled(arm(), solution, tool, (3, 4, 5))
+    assert motion.stands
+    assert motion.index.min() >= 0
+    assert motion.stays_in_limits
+    assert motion.friction.max() <= 0.7
+    assert np.abs(motion.joint_torques).max() <= 300
+    assert tip_error(motion, arm_path, (3, 4, 5)) < 1e-5
+
+
+def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() -> None:
+    plan = sampled(machine(), held(table_plan(1, IN_RANGE)))
+    times, tilts = replay(machine(), plan)
+    assert times[-1] > 6.2
+    assert tilts.max() < 1e-3
+    local = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], HORIZON, step=5e-3).motion
+    times, tilts = replay(machine(), local)
+    assert tilts[-1] > 0.3
+    assert times[-1] == pytest.approx(6.17, abs=0.05)
+    leaves = local.t[local.foot_margin < 0][0]
+    assert tilts[times < leaves].max() < 2e-3
+
+
+def test_reaching_further_than_the_foot_allows_says_what_fails_when_and_by_how_much() -> None:
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    problem = standing_plan(
+        machine(),
+        lambda s: [y + 0.9 * s, z + 0.5 * s],
+        ROWS,
+        PAPER_START[1],
+        3.0,
+        zmp=IN_RANGE,
+        limits=LIMITS,
+        along="parameter",
+    )
+    with pytest.raises(SolveError, match=r"(tip|zero moment point)\[\d\] is missed by [\d.e-]+ at [\d.]+ s"):
+        held(problem, 20, options={"max_iter": 60})
+
+
+def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it() -> None:
+    def push(t: Any, tip: Any) -> Any:
+        return [machine().tip_wrench((0, 30 * ca.sin(t), -20))]
+
+    solution = held(table_plan(1, IN_RANGE, external=push), 40)
+    motion = sampled(machine(), solution, push)
+    np.testing.assert_allclose(motion.external_force[:, 1], 30 * np.sin(motion.t), atol=1e-9)
+    assert motion.stands
+    k = 123
+    reaction = machine().ground_reaction(
+        motion.joints[k],
+        motion.joint_velocities[k],
+        motion.joint_accelerations[k],
+        push(float(motion.t[k]), ca.DM(motion.tip_in_world[k])),
+    )
+    np.testing.assert_allclose(numeric(center_of_pressure(reaction)).ravel(), motion.zero_moment_point[k], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tip_path": lambda t: [0.0, 0.5]}, "tip_path starts at .* from the tip"),
+        ({"start_joints": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
+        ({"rows": (0, 4)}, r"leave out \[0\]"),
+        ({"horizon": -1.0}, "horizon must be a positive number"),
+        ({"control": "force"}, "control must be one of acceleration, jerk"),
+        ({"along": "arc"}, "along must be one of time, parameter"),
+        ({"end": "soft"}, "end must be one of rest, free"),
+        ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
+        ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
+        ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
+        ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
+        ({"zmp": Following(lambda t: [t])}, "Following: the reference gives"),
+        ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity must be positive, one number or 5"),
+        ({"horizon": 1.0}, "tip_path moves at .* 1 s, where the joints are to be at rest"),
+    ],
+)
+def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
+    arguments = {
+        "tip_path": table_path(1),
+        "rows": ROWS,
+        "start_joints": PAPER_START[1],
+        "horizon": HORIZON,
+        **changes,
+    }
+    with pytest.raises(ProblemError, match=message):
+        standing_plan(machine(), **arguments)
+
+
+def test_a_path_longer_than_the_arm_is_refused() -> None:
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    with pytest.raises(ProblemError, match=r"tip_path leads .* m away from the first joint .* at most 1.84 m long"):
+        standing_plan(machine(), lambda s: [y + 2 * s, z], ROWS, PAPER_START[1], 3.0, along="parameter", limits=LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: IndexAtLeast(1.0), "value must be below 1"),
+        (lambda: Weights(velocity=-1.0), "weights: velocity"),
+        (lambda: Limits(vertical_force=0.0), "vertical_force must be positive"),
+        (lambda: Limits(friction=0.0), "friction must be positive"),
+        (lambda: FreeTime(1.0, 0.5, 0.7), "lower <= guess <= upper"),
+    ],
+)
+def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        make()
+
+
+def test_limits_that_are_lifted_do_not_hold_the_plan() -> None:
+    loose = points(table_plan(1, Anywhere(), limits=replace(LIMITS, joints=False), tip_level="acceleration"), 12)
+    assert loose.cost <= points(table_plan(1, Anywhere(), tip_level="acceleration"), 12).cost + 1e-9
