@@ -76,12 +76,18 @@ def minimum_principle(
         ca.jacobian(rows.expression, form.u),
     ]
     function = ca.Function("gradient", symbols, [ca.densify(ca.vec(out)) for out in outputs])
-    direct, f_u, g, g_u = numbers(function, states, controls, t, horizon, p, costates)
+    direct, f_u, *here = numbers(function, states, controls, t, horizon, p, costates)
+    around = [here]
+    if len(interpolant.nodes) == 1:  # a held control answers for its whole interval: constraints at both ends hold it
+        for end in (interpolant.breaks[:-1], interpolant.breaks[1:]):
+            x_end, t_end = solution.state_interpolant(end), end * horizon
+            around.append(numbers(function, x_end, controls, t_end, horizon, p, costates)[2:])
+    g, g_u = (np.hstack([place[i] for place in around]) for i in (0, 1))
     products = f_u.reshape(len(t), form.nu, form.nx) * costates[:, None, :]
     gradient = direct + products.sum(axis=2)
 
     low, high = bounds
-    control, path = form.bounds.places["control"], rows.bounds
+    control, path = form.bounds.places["control"], np.tile(rows.bounds, len(around))
     level = np.hstack([controls, g])
     lower, upper = np.concatenate([low[control], low[path]]), np.concatenate([high[control], high[path]])
     size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
@@ -90,7 +96,8 @@ def minimum_principle(
     at_upper = (level >= upper - ACTIVE * size) | equal
     reduced = np.abs(gradient).max(axis=1)
     for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
-        directions = np.vstack([np.eye(form.nu), g_u[k].reshape(form.nu, -1).T])
+        slopes = g_u[k].reshape(len(around), form.nu, -1).transpose(0, 2, 1).reshape(-1, form.nu)
+        directions = np.vstack([np.eye(form.nu), slopes])
         reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
     parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
     return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)

@@ -467,3 +467,19 @@ def test_auditing_changes_nothing() -> None:
     first, second = solution.audit(), solution.audit()
     assert str(first) == str(second)
     np.testing.assert_array_equal(solution.variables, before)
+
+
+@pytest.mark.parametrize("method", [MultipleShooting(20), Collocation(20, control="held")])
+def test_a_held_control_is_stationary_with_the_constraints_at_both_ends_of_its_interval(method: Any) -> None:
+    problem = Problem("mixed")
+    q = problem.state("q", initial=0.0, terminal=1.0)
+    v = problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u")
+    problem.horizon(1.0)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.path("mixed", u - 4 * q, upper=3.0)
+    problem.minimize(running=u**2 / 2)
+    audit = solve(problem, method).audit()
+    assert audit.passed, str(audit)
+    assert audit[STATIONARITY].value < 1e-6
