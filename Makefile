@@ -40,7 +40,7 @@ benchmark: $(VENV)/run.stamp ## time model functions, builds and solves
 	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
 
 check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
 	$(BIN)/ruff check .

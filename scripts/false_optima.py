@@ -6,22 +6,23 @@ twice the intervals, and again while it may still be an extremal whose mesh is t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ocp import Collocation, Problem, Solution, prepare
 
-__all__ = ["GUESSES", "HORIZON", "Trial", "trials"]
+__all__ = ["GUESSES", "HORIZON", "Settled", "Trial", "first_guess", "settle", "solvers", "trials"]
 
 Array: TypeAlias = NDArray[np.float64]
 
 HORIZON = 4.0  # s
 INTERVALS = 50
 MAX_INTERVALS = 200
+MAX_ITERATIONS = 300  # most starts take 5 to 100
 SAME_COST = 1e-2  # relative change of the cost under doubling up to which a plan may be one and the same extremal
 GUESSES = ("constant", *["smooth"] * 10, *["rough"] * 10)
 KNOTS = 9  # of a smooth random guess
@@ -85,25 +86,13 @@ def trials(problem: Problem, start_base: Array, start_joints: Array) -> Iterator
         problem: The "rates" formulation over HORIZON.
         start_base: Shape (3,). start_joints: Shape (n,).
     """
-    solvers = {}
-    intervals = INTERVALS
-    while intervals <= MAX_INTERVALS:
-        solvers[intervals] = prepare(problem, Collocation(intervals))
-        intervals *= 2
+    prepared = solvers(problem, "radau")
     for number, kind in enumerate(GUESSES):
         seed = number - 1
-        guess = _guess(kind, seed, start_base, start_joints)
-        first = solvers[INTERVALS].solve(guess=guess, check=False)
+        first = prepared[INTERVALS].solve(guess=first_guess(kind, seed, start_base, start_joints), check=False)
         audit = first.audit()
-        plan, passed, intervals = first, audit.passed, INTERVALS
-        while intervals < MAX_INTERVALS:
-            intervals *= 2
-            plan = solvers[intervals].solve(guess=plan, check=False)
-            passed = plan.audit().passed
-            same = plan.success and abs(plan.cost - first.cost) < SAME_COST * abs(first.cost)
-            if passed or not same:
-                break
-        verdict = FALSE if not (passed and same) else EXTREMAL if audit.passed else COARSE
+        settled = settle(prepared, first)
+        verdict = FALSE if not settled.sound else EXTREMAL if audit.passed else COARSE
         yield Trial(
             guess=kind,
             seed=seed,
@@ -114,23 +103,86 @@ def trials(problem: Problem, start_base: Array, start_joints: Array) -> Iterator
             task_error_m_s=audit.constraints["task"],
             audit=audit.passed,
             failed=tuple(finding.name for finding in audit.failures),
-            intervals=intervals,
-            refined_cost=plan.cost,
-            refined_audit=passed,
+            intervals=settled.intervals,
+            refined_cost=settled.plan.cost,
+            refined_audit=settled.passed,
             verdict=verdict,
             t=first.t,
             joint_rates=first["rates"],
         )
 
 
-def _guess(kind: str, seed: int, base: Array, joints: Array) -> dict[str, Array]:
+class Solver(Protocol):
+    """What `ocp.prepare` returns."""
+
+    def solve(self, *, guess: Any = None, check: bool = True) -> Solution: ...
+
+
+def solvers(problem: Problem, scheme: str) -> dict[int, Solver]:
+    """Collocation of degree 3 on 50, 100 and 200 intervals, each built once."""
+    counts = [INTERVALS]
+    while counts[-1] < MAX_INTERVALS:
+        counts.append(2 * counts[-1])
+    limit = {"max_iter": MAX_ITERATIONS}
+    return {n: prepare(problem, Collocation(n, scheme=scheme), options=limit) for n in counts}
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What became of a plan on finer meshes.
+
+    Attributes:
+        plan: The last one. intervals: On which it was solved.
+        passed: Whether it passes its audit.
+        same: Whether its cost is that of the first plan.
+    """
+
+    plan: Solution
+    intervals: int
+    passed: bool
+    same: bool
+
+    @property
+    def sound(self) -> bool:
+        """Whether the first plan was an extremal."""
+        return self.passed and self.same
+
+
+def settle(prepared: Mapping[int, Solver], first: Solution) -> Settled:
+    """Solve a plan on 50 intervals again from itself on twice as many, until it passes its audit or changes its cost.
+
+    At least once: an extremal keeps its cost. `prepared` is from `solvers`.
+    """
+    settled = Settled(first, INTERVALS, passed=False, same=True)
+    while settled.intervals < MAX_INTERVALS and settled.same and not settled.passed:
+        intervals = 2 * settled.intervals
+        plan = prepared[intervals].solve(guess=settled.plan, check=False)
+        same = plan.success and abs(plan.cost - first.cost) < SAME_COST * abs(first.cost)
+        settled = Settled(plan, intervals, plan.audit().passed, same)
+    return settled
+
+
+def first_guess(
+    kind: str, seed: int, base: Array, joints: Array, horizon: float = HORIZON, spread: float = 1.0
+) -> dict[str, Array]:
+    """What the solver starts from.
+
+    Args:
+        kind: "constant" (the start, at rest), "smooth" (random values at nine times) or "rough" (at every point).
+        seed: Of the random values.
+        base, joints: The start, which the random values spread about.
+        horizon: s.
+        spread: 1 for standard deviations of 0.5 m and rad of the base, 1 rad and 1 rad/s of the joints.
+    """
     if kind == "constant":
         return {"base": base, "joints": joints, "rates": np.zeros_like(joints)}
     rng = np.random.default_rng(seed)
     points = KNOTS if kind == "smooth" else 3 * INTERVALS + 1
-    spread = {"base": (base, 0.5), "joints": (joints, 1.0), "rates": (np.zeros_like(joints), 1.0)}
-    guess = {name: middle + rng.normal(0.0, size, (points, len(middle))) for name, (middle, size) in spread.items()}
-    return {"t": np.linspace(0.0, HORIZON, points), **guess}
+    sizes = {"base": (base, 0.5), "joints": (joints, 1.0), "rates": (np.zeros_like(joints), 1.0)}
+    guess = {
+        name: middle + rng.normal(0.0, size * spread, (points, len(middle))) for name, (middle, size) in sizes.items()
+    }
+    return {"t": np.linspace(0.0, horizon, points), **guess}
 
 
 def _jump(plan: Solution) -> float:

@@ -148,6 +148,8 @@ def draw_animation(
         axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
         add_note(figure, note)  # now, not when the block ends: the frames are drawn before
+        figure.canvas.draw()
+        figure.set_layout_engine("none")  # as laid out now: nothing that moves changes it, and it takes half the time
 
         def frames() -> Iterator[Figure]:
             for time in progress(times.tolist()):

@@ -10,13 +10,15 @@ import numpy as np
 from tqdm import tqdm
 
 from models import FreeFloating, paper_example
-from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
+from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.local import resolve
-from scripts import false_optima
+from scripts import extremals, false_optima
 from scripts.drawing import Row
+from scripts.extremals import Search
 from scripts.false_optima import Trial
 from scripts.free_floating_motion import Array, Laws, Motion, laws, motion_of_local, motion_of_plan
+from scripts.free_floating_optimality import BACKWARD, Agreement, agreement
 
 __all__ = ["Results", "compute", "problem", "progress", "pseudo_inverse"]
 
@@ -28,10 +30,7 @@ START_JOINTS = np.radians([45.0, 60.0, -60.0])  # printed
 START_BASE = np.zeros(3)  # printed
 HORIZON = 5.0  # s, chosen
 STEP = 1e-3  # s, of the grids that peaks are read from
-PLAN = Collocation(100, degree=3, scheme="legendre")
-SECOND_OPINION = MultipleShooting(100, control="linear")
-BACKWARD = Indirect(20, shooting="backward", tolerance=1e-13)
-FORWARD = Indirect(20, shooting="multiple", tolerance=1e-13)
+START = np.concatenate([START_BASE, START_JOINTS])
 
 ASSUMED = (
     "Not printed in the paper: links 2 m long, arm mounted at (1, 0) m of the base, centres of mass at mid-link "
@@ -54,7 +53,8 @@ PAPER_ACCELERATIONS = {
 CAVEATS = {
     "peaks": {
         "pseudo-inverse": "converged; the rest is sensitivity to the geometry that is not printed, see sensitivity.csv",
-        "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s",
+        "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s; no extremal found at other "
+        "horizons has the paper's peaks either, see extremals.csv",
     },
     "accelerations": {
         "pseudo-inverse": "not reproducible: the velocity is smooth, so its derivative is 0 at a peak inside the "
@@ -82,30 +82,28 @@ class Results:
         machine: The paper's example.
         local: Pseudo-inverse motion, every millisecond. near_peaks: the same, every microsecond near the peaks.
         optimal: The plan, every millisecond.
-        plan: Legendre 3, 100 intervals. audit, laws: of it, re-integrated.
-        shooting: The same problem by multiple shooting of (26). principle: by backward shooting of (34).
+        agreement: The optimum by every method. audit, laws: of the plan among them, re-integrated.
         convergence, sensitivity: Rows of the tables.
         trials: False optima.
+        searches: Extremals at every horizon.
     """
 
     machine: FreeFloating
     local: Motion
     near_peaks: Motion
     optimal: Motion
-    plan: Solution
+    agreement: Agreement
     audit: Audit
     laws: Laws
-    shooting: Solution
-    principle: Solution
     convergence: list[Row]
     sensitivity: list[Row]
     trials: list[Trial]
+    searches: list[Search]
 
 
-def problem(horizon: float = HORIZON, formulation: Any = "rates") -> Problem:
-    """Problem (27) for the paper's example."""
-    machine = paper_example()
-    return minimum_velocity(machine, TIP_VELOCITY, ROWS, START_JOINTS, horizon, formulation=formulation)
+def problem(horizon: float = HORIZON, **settings: Any) -> Problem:
+    """Problem (27) for the paper's example; the settings are those of `minimum_velocity`."""
+    return minimum_velocity(paper_example(), TIP_VELOCITY, ROWS, START_JOINTS, horizon, **settings)
 
 
 def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:
@@ -124,37 +122,44 @@ def compute() -> Results:
     near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([grid(), *around]).round(9)))
 
     rates, null_space = problem(), problem(formulation="null_space")
-    plan = solve(rates, PLAN)
-    audit = plan.audit()
-    principle = solve(rates, BACKWARD, guess=plan)
+    found = agreement(rates, null_space)
+    audit = found.plan.audit()
     study = false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS)
     return Results(
         machine=machine,
         local=local,
         near_peaks=near_peaks,
-        optimal=motion_of_plan(machine, plan, grid(), ROWS, principle),
-        plan=plan,
+        optimal=motion_of_plan(machine, found.plan, grid(), ROWS, found.backward),
+        agreement=found,
         audit=audit,
         laws=laws(machine, audit, TIP_VELOCITY),
-        shooting=solve(null_space, SECOND_OPINION),
-        principle=principle,
-        convergence=convergence(rates, null_space, plan, principle),
+        convergence=convergence(rates, null_space, found),
         sensitivity=sensitivity(),
         trials=list(progress(study, "false optima", len(false_optima.GUESSES))),
+        searches=[search(horizon) for horizon in extremals.HORIZONS],
     )
 
 
-def convergence(rates: Problem, null_space: Problem, plan: Solution, principle: Solution) -> list[Row]:
+def search(horizon: float) -> Search:
+    """Multi-start at one horizon."""
+    work = extremals.search(problem, horizon, START_BASE, START_JOINTS)
+    for done in progress(work, f"extremals, {horizon:g} s", extremals.STARTS + 1):
+        if isinstance(done, Search):
+            return done
+    raise AssertionError("a search ends with its result")
+
+
+def convergence(rates: Problem, null_space: Problem, known: Agreement) -> list[Row]:
     """Cost by every method and mesh, and its difference from the minimum principle's."""
     runs = [(name, order, n, make(n)) for name, order, counts, make in METHODS for n in counts]
+    reference = known.backward.cost
     rows: list[Row] = []
     for name, order, intervals, method in progress(runs, "convergence"):
         found = solve(null_space if isinstance(method, MultipleShooting) else rates, method)
-        rows.append(_convergence_row(name, intervals, order, found, principle.cost))
-    forward = solve(rates, FORWARD, guess=plan)
-    for shooting, found in (("forward multiple", forward), ("backward", principle)):
+        rows.append(_convergence_row(name, intervals, order, found, reference))
+    for shooting, found in (("forward multiple", known.multiple), ("backward", known.backward)):
         name = f"minimum principle, {shooting} shooting"
-        rows.append(_convergence_row(name, BACKWARD.segments, 0, found, principle.cost))
+        rows.append(_convergence_row(name, BACKWARD.segments, 0, found, reference))
     return rows
 
 

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -16,15 +10,16 @@ from PIL import Image
 from models import FreeFloating, paper_example
 from ocp import Collocation, solve
 from ocp.local import LocalSolution, resolve
-from scripts import free_floating, free_floating_results
+from scripts import free_floating_results
 from scripts.false_optima import FALSE, GUESSES, Trial
 from scripts.free_floating_motion import laws, momentum, motion_of_local, total_center_of_mass
-from scripts.free_floating_results import ROWS, START_JOINTS, TIP_VELOCITY, Results
+from scripts.free_floating_results import ROWS, START_JOINTS, TIP_VELOCITY
+from tests.scripts.free_floating_run import REFERENCE, Run, column
 
-REFERENCE = 1.735114311245
-"""J at 5 s: backward shooting of the minimum principle and Legendre-3 collocation, in an implementation of its own."""
+pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once
+
 EXTREMALS = (1.36393, 1.49337)
-"""J of the two extremals that are known at 4 s, from the same."""
+"""J of the two extremals that are known at 4 s, by an implementation of its own."""
 TABLE_1 = (157.8240, 69.7189, -113.5345, 70.4688, -22.0748, -98.1823)
 TABLE_2 = (-154757.4, -14153.14, 148085.1, -811.6214, 136.2558, -296.0277)
 PICTURES = (
@@ -37,6 +32,9 @@ PICTURES = (
     "optimal_motion.png",
     "convergence.png",
     "false_optima.png",
+    "costates.png",
+    "hamiltonian.png",
+    "extremals.png",
 )
 TABLES = (
     "table1_peak_velocity.csv",
@@ -44,54 +42,14 @@ TABLES = (
     "sensitivity.csv",
     "convergence.csv",
     "false_optima.csv",
+    "certificate.csv",
+    "extremals.csv",
 )
-
-Table = list[dict[str, str]]
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run of the script: where it wrote, what it printed, its exit status and what it computed."""
-
-    folder: Path
-    printed: str
-    status: int
-    results: Results
-
-    def table(self, name: str) -> Table:
-        with (self.folder / name).open(newline="", encoding="utf-8") as stream:
-            return list(csv.DictReader(stream))
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
-        return content
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    out = tmp_path_factory.mktemp("results")
-    computed: list[Results] = []
-
-    def compute() -> Results:
-        computed.append(free_floating_results.compute())
-        return computed[-1]
-
-    with pytest.MonkeyPatch.context() as patch, pytest.MonkeyPatch.context() as printing:
-        lines: list[str] = []
-        patch.setattr(free_floating, "compute", compute)
-        printing.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
-        status = free_floating.main(["--out", str(out)])
-    return Run(out / "free_floating", "\n".join(lines), status, computed[0])
 
 
 @pytest.fixture(scope="module")
 def machine() -> FreeFloating:
     return paper_example()
-
-
-def column(table: Table, name: str, **where: str) -> np.ndarray:
-    return np.array([float(row[name]) for row in table if all(row[key] == value for key, value in where.items())])
 
 
 # ---- the pseudo-inverse
@@ -117,7 +75,7 @@ def test_pseudo_inverse_motion_does_the_task_with_the_least_joint_rates(run: Run
 
 
 def test_accelerations_of_both_motions_are_the_slopes_of_their_velocities(run: Run) -> None:
-    rates = run.results.principle.at(run.results.optimal.t)["rates"]
+    rates = run.results.agreement.backward.at(run.results.optimal.t)["rates"]
     for motion, velocities in ((run.results.local, run.results.local.joint_rates), (run.results.optimal, rates)):
         slope = np.gradient(velocities, motion.t, axis=0)[1:-1]  # its own error: 1e-3 where the curve is sharpest
         size = np.abs(motion.joint_accelerations).max()
@@ -149,7 +107,7 @@ def test_a_thousandth_of_a_link_explains_the_first_peak_and_is_not_used(run: Run
 def test_every_method_finds_the_same_optimum(run: Run) -> None:
     optimal = run.summary["optimal"]
     assert optimal["horizon_s"] == 5.0
-    assert optimal["minimum_principle"]["cost"] == pytest.approx(REFERENCE, abs=5e-12)
+    assert optimal["indirect"]["backward"]["cost"] == pytest.approx(REFERENCE, abs=5e-12)
     assert optimal["collocation"]["intervals"] == 100
     assert optimal["collocation"]["cost"] == pytest.approx(REFERENCE, abs=1e-10)
     assert optimal["multiple_shooting"]["intervals"] == 100
@@ -348,7 +306,7 @@ def test_summary_agrees_with_the_tables(run: Run) -> None:
 
 
 def test_all_files_are_there_and_nothing_else(run: Run) -> None:
-    expected = {*PICTURES, *TABLES, "motion.gif", "summary.json", "audit.txt"}
+    expected = {*PICTURES, *TABLES, "motion.gif", "summary.json", "audit.txt", "certificate.txt"}
     assert {path.name for path in run.folder.iterdir()} == expected
 
 
