@@ -1,0 +1,163 @@
+"""A task path: segments one after the other, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array, ArrayInput, checked_array
+from models.paths.orientation import rotation_vector
+from models.paths.segments import Arc, Line, Segment, constant_curvature
+
+__all__ = ["Path"]
+
+LARGEST_GAP = 1e-9
+"""m; and rad between orientations."""
+SMALLEST_ANGLE = 1e-6
+"""Interior angle (rad) below which a corner counts as a reversal: its blend would bend with 4e12 / remaining."""
+NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A chain of lines and arcs, each starting where the one before ends.
+
+    Attributes:
+        segments: At least one.
+        lengths: Of the segments. Shape (n,), m.
+        start, tangent, normal: Of each segment, at its start, in world. Shape (n, 3), m and unit vectors.
+        curvature: Of each segment; zero for a line. Shape (n,), 1/m.
+        orientation: Tool orientation at the start of each segment, unit quaternion. Shape (n, 4).
+        turn: Rotation vector of each segment in the axes of its start orientation. Shape (n, 3), rad.
+
+    Raises:
+        ModelError: No segment, something that is none, a gap in position or orientation, a corner that goes back the
+            way it came (180 deg).
+    """
+
+    segments: tuple[Segment, ...]
+    lengths: Array = field(init=False, repr=False)
+    start: Array = field(init=False, repr=False)
+    tangent: Array = field(init=False, repr=False)
+    normal: Array = field(init=False, repr=False)
+    curvature: Array = field(init=False, repr=False)
+    orientation: Array = field(init=False, repr=False)
+    turn: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        segments = tuple(self.segments)
+        if not segments:
+            raise ModelError("the path has no segment; give at least one Line or Arc")
+        for i, segment in enumerate(segments):
+            if not isinstance(segment, Line | Arc):
+                raise ModelError(f"segment {i} is {segment!r}; a path is made of Line and Arc")
+        values: dict[str, Any] = {
+            "segments": segments,
+            "lengths": np.array([segment.length for segment in segments]),
+            "start": np.array([segment.start for segment in segments]),
+            "tangent": np.array([segment.tangent for segment in segments]),
+            "normal": np.array([segment.normal for segment in segments]),
+            "curvature": np.array([segment.curvature for segment in segments]),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        self._check_gaps()
+        self._set_orientations()
+        self._check_corners()
+
+    @classmethod
+    def through(cls, points: ArrayInput, orientations: ArrayInput | None = None) -> Path:
+        """Straight lines from point to point.
+
+        Args:
+            points: In world, at least two. Shape (n, 3), m.
+            orientations: At the points, unit quaternions; none turns if None. Shape (n, 4).
+        """
+        try:
+            corners = np.array(points, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"path: points {points!r} are not numeric") from error
+        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2:
+            raise ModelError(f"path: points have the shape {corners.shape}; give at least two, of shape (n, 3)")
+        if orientations is None:
+            return cls(tuple(Line(a, b) for a, b in pairwise(corners)))
+        turns = checked_array(orientations, (len(corners), 4), "path", "orientations")
+        ends: Iterable[Any] = zip(corners[:-1], corners[1:], turns[:-1], turns[1:], strict=True)
+        return cls(tuple(Line(*each) for each in ends))
+
+    @property
+    def length(self) -> float:
+        """Sum of the segments, before any blend. m."""
+        return float(self.lengths.sum())
+
+    @property
+    def turns(self) -> bool:
+        """Whether the tool's orientation changes anywhere."""
+        return bool(np.any(self.turn != 0))
+
+    def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
+        """Position and three derivatives by the distance, at a distance (m) along segments.
+
+        Shapes: index (M,) of int, distance (M,), each result (M, 3).
+        """
+        return constant_curvature(
+            self.start[index], self.tangent[index], self.normal[index], self.curvature[index], np.asarray(distance)
+        )
+
+    def corner_angles(self) -> Array:
+        """Interior angle at each vertex, pi where the tangent goes on. Shape (n - 1,), rad."""
+        before, after = self._tangents()
+        # exact near 0 and pi, where the arc cosine is not
+        return np.asarray(
+            2 * np.arctan2(np.linalg.norm(before + after, axis=1), np.linalg.norm(before - after, axis=1))
+        )
+
+    def _tangents(self) -> tuple[Array, Array]:
+        index = np.arange(len(self.segments) - 1)
+        return self.at(index, self.lengths[:-1])[1], self.tangent[1:]
+
+    def _check_gaps(self) -> None:
+        ends = self.at(np.arange(len(self.segments)), self.lengths)[0]
+        gaps = np.linalg.norm(ends[:-1] - self.start[1:], axis=1)
+        if gaps.size and gaps.max() > LARGEST_GAP:
+            i = int(gaps.argmax())
+            raise ModelError(
+                f"segment {i} ends at {ends[i].tolist()} m, segment {i + 1} starts at {self.start[i + 1].tolist()} m: "
+                f"a gap of {gaps[i]:.3g} m; join them by a Line"
+            )
+
+    def _check_corners(self) -> None:
+        angles = self.corner_angles()
+        if angles.size and angles.min() < SMALLEST_ANGLE:
+            i = int(angles.argmin())
+            raise ModelError(
+                f"at vertex {i + 1}, {self.start[i + 1].tolist()} m, the path turns by 180 deg (interior angle "
+                f"{np.degrees(angles[i]):.3g} deg): nothing smooth rounds a reversal; make two paths, or give it width"
+            )
+
+    def _set_orientations(self) -> None:
+        current = NO_ROTATION
+        starts, turns = [], []
+        for i, segment in enumerate(self.segments):
+            begin = current if segment.start_orientation is None else np.asarray(segment.start_orientation)
+            if i and begin is not current:
+                gap = float(np.linalg.norm(rotation_vector(current, begin, f"vertex {i}")))
+                if gap > LARGEST_GAP:
+                    raise ModelError(
+                        f"at vertex {i} the tool orientation jumps by {np.degrees(gap):.4g} deg, from "
+                        f"{current.tolist()} to {begin.tolist()}; turn it along a segment"
+                    )
+            starts.append(begin)
+            if segment.end_orientation is None:
+                turns.append(np.zeros(3))
+                current = begin
+            else:
+                current = np.asarray(segment.end_orientation)
+                turns.append(rotation_vector(begin, current, f"segment {i}"))
+        object.__setattr__(self, "orientation", np.array(starts))
+        object.__setattr__(self, "turn", np.array(turns))

@@ -1,0 +1,119 @@
+"""A smooth path as one casadi Function of the distance, for expressions and for generated C."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.parts import Array
+from models.paths.arc_length import NEWTON_STEPS, NODES, WEIGHTS, speed
+from models.paths.smooth import SmoothPath
+
+__all__ = ["path_function"]
+
+# rows of the table of cells
+SEGMENT = slice(0, 10)  # start, tangent, normal, curvature
+CURVE = slice(10, 28)  # coefficients, three a power
+CELL = slice(28, 35)  # distance, length, whether on a blend; u at the start, width in u, speed at both ends
+ROWS = 35
+
+
+def path_function(path: SmoothPath) -> Any:
+    """Function distance (m) -> position (3, m), tangent (3), curvature (3, 1/m), its derivative (3, 1/m^2).
+
+    MX, with the tables of the path in it; distances outside are those of the ends. The same arithmetic as
+    `SmoothPath.at`, on a binary search for the cell, so that `generate` writes C without any library. Derivatives are
+    those of the last three outputs' own formulas: casadi differentiates inside a cell only.
+    """
+    knots, columns = _table(path)
+    s = ca.MX.sym("distance")
+    inside = ca.fmin(ca.fmax(s, 0.0), path.length)
+    cell = ca.low(ca.DM(knots), inside, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
+    outputs = _in_cell()(ca.MX(ca.DM(columns))[:, cell], inside)
+    return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
+
+
+@lru_cache(maxsize=1)
+def _in_cell() -> Any:
+    row, s = ca.SX.sym("row", ROWS), ca.SX.sym("s")
+    start, tangent, normal, k = row[0:3], row[3:6], row[6:9], row[9]
+    coefficients = ca.reshape(row[CURVE], 3, 6)
+    first_s, length, curved, first_u, width, speed0, speed1 = (row[i] for i in range(CELL.start, CELL.stop))
+    distance = s - first_s
+
+    # segment; a line has k = 0: then sin(k s)/k is s
+    safe = k + (k == 0)
+    along = ca.if_else(k == 0, distance, ca.sin(k * distance) / safe)
+    across = ca.if_else(k == 0, 0, 2 * ca.sin(k * distance / 2) ** 2 / safe)
+    cosine, sine = ca.cos(k * distance), ca.sin(k * distance)
+    on_segment = [
+        start + along * tangent + across * normal,
+        cosine * tangent + sine * normal,
+        k * (cosine * normal - sine * tangent),
+        -(k**2) * (cosine * tangent + sine * normal),
+    ]
+
+    u = ca.SX.sym("u")
+    derivative = [coefficients]
+    for _ in range(3):
+        last = derivative[-1]
+        derivative.append(ca.horzcat(*[j * last[:, j] for j in range(1, last.shape[1])]))
+    first, second, third = (_horner(c, u) for c in derivative[1:])
+    rate = ca.norm_2(first)
+    rate_of = ca.Function("rate", [row, u], [rate])
+    x = distance / length
+    slope0, slope1 = length / (width * speed0), length / (width * speed1)
+    at: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
+    for _ in range(NEWTON_STEPS - 1):
+        step = at - first_u
+        mean = sum(float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(NODES, WEIGHTS, strict=True))
+        at = at - (step * mean - distance) / rate_of(row, at)
+    rate_u = ca.dot(first, second) / rate
+    rate_uu = (ca.dot(second, second) + ca.dot(first, third) - rate_u**2) / rate
+    bend = (second - first * rate_u / rate) / rate**2
+    change = (third - 3 * second * rate_u / rate + first * (3 * rate_u**2 / rate**2 - rate_uu / rate)) / rate**3
+    curve = ca.Function("curve", [row, u], [_horner(coefficients, u), first / rate, bend, change])
+    on_blend = curve(row, at)
+    outputs = [ca.if_else(curved, b, a) for a, b in zip(on_segment, on_blend, strict=True)]
+    return ca.Function("in_cell", [row, s], ca.cse(outputs))
+
+
+def _horner(columns: Any, u: Any) -> Any:
+    value = columns[:, -1]
+    for j in reversed(range(columns.shape[1] - 1)):
+        value = columns[:, j] + u * value
+    return value
+
+
+def _table(path: SmoothPath) -> tuple[Array, Array]:
+    on_segment = np.flatnonzero(path.piece_segment >= 0)
+    count = len(on_segment) + len(path.cells.curve)
+    rows = np.zeros((count, ROWS))
+    parts = slice(0, len(on_segment))
+    segment = path.piece_segment[on_segment]
+    task = path.path
+    skipped = np.concatenate([[0.0], path.remaining])[segment]
+    position, tangent, bend, _ = task.at(segment, skipped)
+    k = task.curvature[segment][:, None]
+    normal = bend / np.where(k == 0, 1.0, k)
+    rows[parts, SEGMENT] = np.concatenate([position, tangent, normal, k], axis=1)
+    # any regular curve will do where none is used: its speed must not be zero
+    rows[parts, CURVE] = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (len(on_segment), 1))
+    ones = np.ones(len(on_segment))
+    length = path.piece_lengths[on_segment]
+    rows[parts, CELL] = np.stack([path.bounds[on_segment], length, 0 * ones, 0 * ones, ones, length, length], axis=1)
+
+    curves = slice(len(on_segment), count)
+    cells = path.cells
+    coefficients = path.coefficients[cells.curve]
+    rows[curves, 3:6] = [1.0, 0.0, 0.0]
+    rows[curves, CURVE] = coefficients.reshape(-1, 18)
+    speeds = speed(coefficients, cells.start), speed(coefficients, cells.start + cells.width)
+    flag = np.ones(len(cells.curve))
+    rows[curves, CELL] = np.stack([path.cell_bounds, cells.length, flag, cells.start, cells.width, *speeds], axis=1)
+    order = np.argsort(rows[:, CELL.start], kind="stable")
+    rows = rows[order]
+    return np.append(rows[:, CELL.start], path.length), rows.T

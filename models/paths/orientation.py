@@ -1,0 +1,89 @@
+"""Tool orientation along a path: rotation vectors in a chart, blended like positions.
+
+Along a piece the orientation is q(s) = reference exp(theta(s)), theta being a polynomial in the distance. A segment
+that turns evenly about a fixed axis is linear in this chart, seen from its start as well as from the vertex that it
+leads to; so a quintic in the chart of the vertex joins two segments with continuous rate and acceleration.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import factorial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array, ArrayInput, checked_array
+from models.spatial import angular_velocity_from_quaternion, quaternion_product
+
+__all__ = ["exponential", "orientation_function", "rotation_vector", "unit_quaternion"]
+
+LARGEST_TURN = np.pi - 1e-3
+"""Two orientations further apart (rad) have no shorter way between them that one would guess."""
+TERMS = 18
+
+
+def unit_quaternion(value: ArrayInput, what: str) -> Array:
+    """`value` as a read-only unit quaternion [w, x, y, z]; ModelError if its norm is not within 1e-6 of one."""
+    quaternion = checked_array(value, (4,), what, "quaternion")
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 1e-6:
+        raise ModelError(f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion")
+    return checked_array(quaternion / norm, (4,), what, "quaternion")
+
+
+def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
+    """Turn in the axes of `first` that leads to `second`: second = first exp(vector), the shorter way. Shape (3,), rad.
+
+    Raises:
+        ModelError: The two are (nearly) half a turn apart, where the way is ambiguous.
+    """
+    p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    scalar = p @ q
+    vector = p[0] * q[1:] - q[0] * p[1:] - np.cross(p[1:], q[1:])
+    if scalar < 0:
+        scalar, vector = -scalar, -vector
+    norm = float(np.linalg.norm(vector))
+    angle = 2 * float(np.arctan2(norm, scalar))
+    if angle > LARGEST_TURN:
+        raise ModelError(
+            f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, whose sense is ambiguous; "
+            "split the segment"
+        )
+    return np.asarray(vector * (angle / norm if norm > 0 else 2.0))
+
+
+def exponential(vector: Any) -> Any:
+    """Unit quaternion of a rotation vector (rad), a casadi expression. Shape (4, 1).
+
+    Power series in the squared angle, without a branch or a root, to rounding for angles up to 2 pi: smooth at zero.
+    """
+    square = ca.dot(vector, vector) / 4
+    cosine: Any = 0
+    sinc: Any = 0
+    for k in reversed(range(TERMS)):
+        cosine = (-1) ** k / factorial(2 * k) + square * cosine
+        sinc = (-1) ** k / factorial(2 * k + 1) + square * sinc
+    return ca.vertcat(cosine, sinc / 2 * vector)
+
+
+@lru_cache(maxsize=1)
+def orientation_function() -> Any:
+    """Orientation along a piece and its rates, for any number of samples as columns.
+
+    Inputs: reference (4), theta (3, 6) as 18 entries column by column, ascending powers of distance over length,
+    length (m), distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m),
+    its first and second derivatives by the distance (rad/m^2, rad/m^3).
+    """
+    reference, theta = ca.SX.sym("reference", 4), ca.SX.sym("theta", 18)
+    length, fraction = ca.SX.sym("length"), ca.SX.sym("fraction")
+    powers = ca.vertcat(*[fraction**k for k in range(6)])
+    quaternion = quaternion_product(reference, exponential(ca.mtimes(ca.reshape(theta, 3, 6), powers)))
+    outputs = [quaternion]
+    rate = angular_velocity_from_quaternion(quaternion, ca.jacobian(quaternion, fraction) / length)
+    for _ in range(3):
+        outputs.append(rate)
+        rate = ca.jacobian(rate, fraction) / length
+    return ca.Function("orientation", [reference, theta, length, fraction], ca.cse(outputs))
