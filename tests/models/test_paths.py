@@ -48,5 +48,5 @@ def test_the_quintic_blend_keeps_the_curvature_continuous_where_the_cubic_does_n
 
 
 def test_a_path_with_a_gap_is_a_named_error() -> None:
-    with pytest.raises(ModelError, match="gap|begins|meet|end"):
+    with pytest.raises(ModelError, match=r"gap|begins|meet|end"):
         Path((Line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), Line((1.1, 0.0, 0.0), (1.1, 1.0, 0.0))))
