@@ -17,16 +17,13 @@ from PIL import Image
 
 from models.cts import reference_rig, reference_tunnel
 from models.cts_export import export, rig_functions
-from models.cts_optimal import optimal_inverse
 from models.errors import ModelError
 from scripts import cts
-from scripts.cts_compiled import compiled
 from tests.models.cts_oracle import random_targets
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ("fig06_rig.png", "fig07_joints_i1.png", "fig08_iterations.png", "fig09_joints_i2.png", "release.png")
 TABLES = ("table6_time.csv", "iterations.csv", "reference_rolls.csv", "sweep.csv")
-needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler named cc")
 
 
 @pytest.fixture(scope="module")
@@ -69,15 +66,10 @@ def test_no_global_minimum_is_missed_and_newton_often_ends_in_a_maximum(summary:
     assert 0.5 < summary["newton_maximum_share"] < 0.7
 
 
-def test_the_iterations_cost_time(summary: dict[str, Any]) -> None:
-    assert summary["time_ratio_jacobian_over_combined"] > 2
-    assert summary["time_ratio_jacobian_over_combined_gain_1"] > 10
-
-
-@needs_compiler
-def test_200_targets_compiled_are_a_hundred_times_faster_than_the_paper(summary: dict[str, Any]) -> None:
-    fast = compiled(optimal_inverse(reference_rig(), reference_tunnel()), cts_targets(), np.zeros(1), repeats=9)
-    assert 200e-9 * fast.nanoseconds * 100 < 0.0281
+def test_the_null_space_method_takes_more_iterations(summary: dict[str, Any]) -> None:
+    combined = summary["i1"]["combined"]["iterations_mean"]
+    assert summary["i1"]["jacobian"]["iterations_mean"] > 2 * combined
+    assert summary["i1"]["jacobian_gain_1"]["iterations_mean"] > 10 * combined
     assert summary["compiled_ns_per_target"] > 0
 
 
@@ -105,7 +97,6 @@ def test_all_files_are_written(folder: Path) -> None:
             assert list(csv.DictReader(stream))
 
 
-@needs_compiler
 def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path) -> None:
     example = tmp_path / "example"
     shutil.copytree(ROOT / "examples" / "c_export", example, ignore=shutil.ignore_patterns("build"))
