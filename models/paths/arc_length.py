@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from models.errors import ModelError
 from models.parts import Array
 
-__all__ = ["Cells", "cells", "parameter", "speed"]
+__all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
 
 NODES, WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
@@ -123,3 +123,13 @@ def parameter(coefficients: Array, start: Array, width: Array, length: Array, di
         if not excess.size or np.abs(excess / length).max() < 1e-8:  # the step just made squares it
             break
     return np.asarray(u)
+
+
+def arc_length(coefficients: Array, u: Array) -> Array:
+    """Arc length from 0 to u of one curve, shape (6, 3). Shapes (M,) to (M,), m."""
+    curve = coefficients[None]
+    parts = cells(curve)
+    at = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)
+    before = np.concatenate([[0.0], np.cumsum(parts.length)])[at]
+    start = parts.start[at]
+    return np.asarray(before + _lengths(_derivative(curve[np.zeros(len(at), dtype=int)]), start, u - start))

@@ -1,0 +1,167 @@
+"""SCARA arm: two parallel links in a horizontal plane, a quill and a wrist about the same vertical direction.
+
+Joint vector (shoulder, elbow, quill, wrist): rad, rad, m, rad. In the frame of the mount
+
+    x = l1 cos q1 + l2 cos(q1 + q2),  y likewise,  z = q3,  yaw = q1 + q2 + q4.
+
+det of the planar Jacobian is l1 l2 sin q2: singular where the arm is stretched (reach l1 + l2) or folded
+(|l1 - l2|, the column about the shoulder axis when both links are equal).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, TypeAlias, get_args
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.parts import Array, ArrayInput, Joint, Link, checked_array
+from models.robot import Robot
+from models.spatial import Expression, Frame, expression, rotation
+
+__all__ = ["Elbow", "Scara"]
+
+Elbow: TypeAlias = Literal["left", "right"]
+ROUNDING = 1e-12
+"""Reaches beyond the boundary by no more than this, relative, are on it."""
+
+
+def _unbounded(value: float) -> Array:
+    return np.full(4, value)
+
+
+@dataclass(frozen=True, eq=False)
+class Scara:
+    """A SCARA arm with its shoulder axis vertical (world z).
+
+    Attributes:
+        upper_arm, forearm: Link lengths l1, l2, m.
+        mount: Point of the shoulder axis from which the quill is counted, in world. Shape (3,), m.
+        lower, upper: Joint limits. Shape (4,), rad and m.
+        names: Of the joints.
+
+    Raises:
+        ModelError: A length that is not positive, limits that are nan or out of order.
+    """
+
+    upper_arm: float
+    forearm: float
+    mount: ArrayInput = (0.0, 0.0, 0.0)
+    lower: ArrayInput = field(default_factory=lambda: _unbounded(-np.inf))
+    upper: ArrayInput = field(default_factory=lambda: _unbounded(np.inf))
+    names: tuple[str, str, str, str] = ("shoulder", "elbow", "quill", "wrist")
+
+    def __post_init__(self) -> None:
+        for what in ("upper_arm", "forearm"):
+            length = checked_array(getattr(self, what), (), "scara", what).item()
+            if length <= 0:
+                raise ModelError(f"scara: {what} {length:g} m must be positive")
+            object.__setattr__(self, what, length)
+        object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
+        for what in ("lower", "upper"):
+            object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
+        for name, low, high in zip(self.names, self.lower, self.upper, strict=True):
+            if low > high:
+                raise ModelError(f"scara: joint {name!r} has its lower limit {low:g} above its upper limit {high:g}")
+
+    @property
+    def outer(self) -> float:
+        """Greatest reach, m."""
+        return self.upper_arm + self.forearm
+
+    @property
+    def inner(self) -> float:
+        """Least reach, m."""
+        return abs(self.upper_arm - self.forearm)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The arm as a kinematic tree, massless, for whatever takes a robot."""
+        limits = [{"lower": float(a), "upper": float(b)} for a, b in zip(self.lower, self.upper, strict=True)]
+        links = tuple(Link(name) for name in ("base", "upper arm", "forearm", "quill", "tool"))
+        places = (tuple(self.mount), (self.upper_arm, 0.0, 0.0), (self.forearm, 0.0, 0.0), (0.0, 0.0, 0.0))
+        kinds: tuple[Any, ...] = ("revolute", "revolute", "prismatic", "revolute")
+        joints = tuple(
+            Joint(name, kind, links[i].name, links[i + 1].name, places[i], axis=(0.0, 0.0, 1.0), **limits[i])
+            for i, (name, kind) in enumerate(zip(self.names, kinds, strict=True))
+        )
+        return Robot(links, joints)
+
+    def forward(self, joints: Expression) -> Frame:
+        """Frame of the tool in world. `joints` of shape (4,), casadi or numbers."""
+        q = expression(joints)
+        if q.numel() != 4:
+            raise ModelError(f"scara: joints have {q.numel()} entries, expected 4: {list(self.names)}")
+        bend = q[0] + q[1]
+        x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
+        y = self.upper_arm * ca.sin(q[0]) + self.forearm * ca.sin(bend)
+        return Frame(rotation((0, 0, 1), bend + q[3]), ca.DM(self.mount) + ca.vertcat(x, y, q[2]))
+
+    def inverse(self, position: ArrayInput, yaw: float = 0.0, elbow: Elbow = "left") -> Array:
+        """Joints that put the tool at a point with a yaw, shoulder and elbow within (-pi, pi]. Shape (4,).
+
+        Args:
+            position: In world. Shape (3,), m.
+            yaw: Of the tool about the world's z, rad; wrist = yaw - shoulder - elbow.
+            elbow: "left" bends the elbow counter-clockwise (q2 >= 0), "right" clockwise.
+
+        Raises:
+            ModelError: nan, a point out of reach (the message says how far), joint limits.
+        """
+        point = checked_array(position, (3,), "scara", "position")
+        angle = checked_array(yaw, (), "scara", "yaw").item()
+        self.check_reach(float(np.hypot(*(point - self.mount)[:2])), f"point {point.tolist()} m")
+        q = np.array(ca.DM(self.inverse_expression(np.append(point, angle), elbow))).ravel()
+        for name, value, low, high in zip(self.names, q, self.lower, self.upper, strict=True):
+            if not low <= value <= high:
+                raise ModelError(
+                    f"scara: point {point.tolist()} m needs joint {name!r} at {value:g}, outside its limits {low:g} .. "
+                    f"{high:g}; take the other elbow, another yaw or another point"
+                )
+        return q
+
+    def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
+        """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).
+
+        sin q2 from the product of the distances to both ends of the reach, which keeps its digits near them.
+        """
+        if elbow not in get_args(Elbow):
+            raise ModelError(f"scara: elbow {elbow!r} is unknown; use one of {list(get_args(Elbow))}")
+        p = expression(pose)
+        x, y, z = (p[i] - float(self.mount[i]) for i in range(3))
+        a, b = self.upper_arm, self.forearm
+        square = x**2 + y**2
+        cosine = (square - a**2 - b**2) / (2 * a * b)
+        # rounding may put a point of the boundary beyond it
+        product = (self.outer**2 - square) * (square - self.inner**2)
+        sine = ca.sqrt(ca.fmax(product, 0)) / (2 * a * b) * (1 if elbow == "left" else -1)
+        along, across = a + b * cosine, b * sine
+        shoulder = ca.atan2(y * along - x * across, x * along + y * across)
+        bend = ca.atan2(sine, cosine)
+        return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
+
+    def inverse_rates(self, elbow: Elbow = "left") -> Any:
+        """casadi Function of a pose (x, y, z, yaw) and its first three derivatives by any parameter, (4) each.
+
+        Outputs: joints and their first three derivatives by the same parameter, (4) each.
+        """
+        inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
+        at = ca.SX.sym("at")
+        pose = inputs[0] + at * (inputs[1] + at * (inputs[2] / 2 + at * inputs[3] / 6))
+        joints = self.inverse_expression(pose, elbow)
+        outputs = [joints]
+        for _ in range(3):
+            outputs.append(ca.jacobian(outputs[-1], at))
+        here = ca.substitute(outputs, [at], [ca.SX(0)])
+        return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
+
+    def check_reach(self, radius: float, what: str) -> None:
+        """ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
+        if not self.inner * (1 - ROUNDING) <= radius <= self.outer * (1 + ROUNDING):
+            raise ModelError(
+                f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
+                f"{self.inner:g} to {self.outer:g} m"
+            )

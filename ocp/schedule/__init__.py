@@ -1,0 +1,26 @@
+"""Time schedules: jerk-limited line speed along a path, at the asked speed wherever the limits allow it."""
+
+from ocp.schedule.limits import JointLimits, JointPath, JointRates, Limits, PathLike
+from ocp.schedule.planner import Dip, Schedule, schedule
+from ocp.schedule.profile import Motion, SpeedProfile
+from ocp.schedule.ramps import peak_acceleration, ramp_distance, ramp_time
+from ocp.schedule.trajectory import JointTrajectory, joint_motion, joint_trajectory
+
+__all__ = [
+    "Dip",
+    "JointLimits",
+    "JointPath",
+    "JointRates",
+    "JointTrajectory",
+    "Limits",
+    "Motion",
+    "PathLike",
+    "Schedule",
+    "SpeedProfile",
+    "joint_motion",
+    "joint_trajectory",
+    "peak_acceleration",
+    "ramp_distance",
+    "ramp_time",
+    "schedule",
+]

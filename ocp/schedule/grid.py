@@ -1,0 +1,121 @@
+"""Where the limits are looked at: a grid along the path, fine where the permitted speed changes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.errors import ProblemError
+from ocp.schedule.limits import JointPath, Limits, PathLike, line_demands
+from ocp.schedule.profile import Array
+
+__all__ = ["Grid", "make_grid"]
+
+SAFETY = 2e-4
+"""Share of the permitted speed kept back for what lies between two points of the grid."""
+UNSEEN = 2e-4
+"""Largest relative error of a minimum of the permitted speed, estimated by its second difference."""
+COARSE = 0.1
+"""Largest relative change of it between two points; the lower one counts for what lies between."""
+ROUNDS = 12
+SMALLEST = 1e-12
+"""Intervals below this share of the path are not cut further."""
+JUST = 1e-9
+"""What "just before" means, over the length of the path."""
+PER_CELL, PER_SEGMENT = 8, 64
+
+
+class Grid(NamedTuple):
+    """The speed that the limits permit, line acceleration aside, at points of a path.
+
+    Attributes:
+        distance: Every bound between pieces is among them. Shape (G,), m.
+        permitted: Shape (G,), m/s; inf where nothing limits it.
+        cause: Row of `cause_names` that limits it most. Shape (G,).
+        asked: In each interval. Shape (G - 1,), m/s.
+        before: Places just before the bounds between pieces, where a third derivative may be another. Shape (B,), m.
+    """
+
+    distance: Array
+    permitted: Array
+    cause: NDArray[np.intp]
+    asked: Array
+    before: Array
+
+
+def make_grid(path: PathLike, limits: Limits, joints: JointPath | None) -> Grid:
+    """Sample the permitted speed until neighbours agree, where it matters.
+
+    Raises:
+        ProblemError: A joint limit that no speed can keep, because the path's curvature jumps.
+    """
+    asked = path.by_piece(limits.speed)
+    limited = joints is not None and limits.joints is not None
+    if not limited and not np.isfinite(limits.centripetal):
+        s = np.asarray(path.bounds, dtype=float)
+        return Grid(s, np.full(len(s), np.inf), np.zeros(len(s), dtype=np.intp), asked, s[:0])
+    if limited and joints is not None:
+        _check_smooth(path, limits, len(joints.names))
+    s = path.dense(PER_CELL, PER_SEGMENT if limited else 2)
+    s = np.unique(np.concatenate([s, path.bounds]))
+    permitted, cause = _permitted(path, limits, joints if limited else None, s)
+    inner = np.asarray(path.bounds[1:-1], dtype=float)
+    before = inner - np.minimum(JUST * path.length, np.diff(path.bounds)[:-1] / 2)
+    if before.size:
+        left, why = _permitted(path, limits, joints if limited else None, before)
+        at = np.searchsorted(s, inner)
+        cause[at] = np.where(left < permitted[at], why, cause[at])
+        permitted[at] = np.minimum(left, permitted[at])
+    for _ in range(ROUNDS):
+        cut = np.flatnonzero(_uneven(path, s, permitted, asked))
+        if not cut.size:
+            break
+        middle = (s[cut] + s[cut + 1]) / 2
+        more, why = _permitted(path, limits, joints if limited else None, middle)
+        s = np.insert(s, cut + 1, middle)
+        permitted, cause = np.insert(permitted, cut + 1, more), np.insert(cause, cut + 1, why)
+    return Grid(s, permitted * (1 - SAFETY), cause, _asked(path, s, asked), before)
+
+
+def _permitted(path: PathLike, limits: Limits, joints: JointPath | None, s: Array) -> tuple[Array, NDArray[np.intp]]:
+    curvature = path.curvature(s) if np.isfinite(limits.centripetal) else None
+    demand, power = line_demands(limits, curvature, None if joints is None else joints.at(s))
+    with np.errstate(divide="ignore"):
+        speeds = (1 / demand) ** (1 / power[:, None])
+    cause = speeds.argmin(axis=0)
+    return np.take_along_axis(speeds, cause[None], axis=0)[0], cause
+
+
+def _asked(path: PathLike, s: Array, asked: Array) -> Array:
+    piece = np.searchsorted(path.bounds, (s[:-1] + s[1:]) / 2, side="right") - 1
+    return np.asarray(asked[np.clip(piece, 0, len(asked) - 1)])
+
+
+def _uneven(path: PathLike, s: Array, permitted: Array, asked: Array) -> NDArray[np.bool_]:
+    # only where the permitted speed is near or below the asked one
+    low = np.minimum(permitted[:-1], permitted[1:])
+    matters = (low < 1.1 * _asked(path, s, asked)) & (np.diff(s) > SMALLEST * path.length)
+    value = np.log(np.minimum(permitted, 2 * asked.max()))
+    step, slope = np.diff(s), np.diff(value) / np.diff(s)
+    bend = np.zeros(len(s))
+    bend[1:-1] = 2 * np.abs(np.diff(slope)) / (step[:-1] + step[1:])
+    least = np.zeros(len(s), dtype=bool)
+    least[1:-1] = (slope[:-1] <= 0) & (slope[1:] >= 0) & (bend[1:-1] > 0)
+    error = np.where(least[:-1] | least[1:], step**2 / 8 * np.maximum(bend[:-1], bend[1:]), 0.0)
+    return np.asarray(matters & ((np.abs(np.diff(value)) > COARSE) | (error > UNSEEN)))
+
+
+def _check_smooth(path: PathLike, limits: Limits, count: int) -> None:
+    if not np.isfinite(limits.of_joints(count)[2]).any():
+        return
+    jumps = path.curvature_jumps()
+    if not jumps.size:
+        return
+    at = int(jumps.argmax())
+    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
+        raise ProblemError(
+            f"a joint jerk limit cannot be kept at {path.bounds[at + 1]:g} m, where the path's curvature jumps by "
+            f"{jumps[at]:.3g} /m and the joint accelerations with it; round the corners with kind='quintic'"
+        )

@@ -1,0 +1,156 @@
+"""What a schedule must keep to, and the line speed that it leaves at each place of a path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ocp.errors import ProblemError
+from ocp.schedule.profile import Array, Motion
+
+__all__ = [
+    "JointLimits",
+    "JointPath",
+    "JointRates",
+    "Limits",
+    "PathLike",
+    "cause_names",
+    "joint_demands",
+    "line_demands",
+]
+
+
+class PathLike(Protocol):
+    """What a schedule asks of a path: models.paths.SmoothPath has it."""
+
+    @property
+    def length(self) -> float: ...
+    @property
+    def bounds(self) -> Array: ...
+    def by_piece(self, of_segments: ArrayLike) -> Array: ...
+    def curvature(self, distance: ArrayLike) -> Array: ...
+    def curvature_jumps(self) -> Array: ...
+    def dense(self, per_cell: int = ..., per_segment: int = ...) -> Array: ...
+
+
+class JointRates(Protocol):
+    """Joint positions along a path and their first three derivatives by the distance. Shape (M, n) each."""
+
+    @property
+    def position(self) -> Array: ...
+    @property
+    def first(self) -> Array: ...
+    @property
+    def second(self) -> Array: ...
+    @property
+    def third(self) -> Array: ...
+
+
+class JointPath(Protocol):
+    """Joints as a function of the distance: models.scara_path.ScaraPath is one."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+    def at(self, distance: ArrayLike) -> JointRates: ...
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Greatest joint velocities (rad/s or m/s), accelerations and jerks, symmetric. Shape (n,) or one for all."""
+
+    velocity: ArrayLike = np.inf
+    acceleration: ArrayLike = np.inf
+    jerk: ArrayLike = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Limits of a schedule.
+
+    Attributes:
+        speed: Asked line speed, m/s: one, or one for each segment of the task.
+        acceleration: Of the line speed, peak, m/s^2. See `peak_acceleration` for a mean one.
+        jerk: Of the line speed, m/s^3.
+        centripetal: Greatest speed^2 x curvature, m/s^2.
+        joints: Of the joints, or None.
+
+    Raises:
+        ProblemError: A limit that is not positive, nan, or not finite where it must be.
+    """
+
+    speed: ArrayLike
+    acceleration: float
+    jerk: float
+    centripetal: float = np.inf
+    joints: JointLimits | None = None
+
+    def __post_init__(self) -> None:
+        for name, finite in (("speed", True), ("acceleration", True), ("jerk", True), ("centripetal", False)):
+            _check(name, getattr(self, name), finite)
+        if self.joints is not None:
+            for name in ("velocity", "acceleration", "jerk"):
+                _check(f"joint {name}", getattr(self.joints, name), False)
+
+    def of_joints(self, count: int) -> Array:
+        """Velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
+        given = self.joints or JointLimits()
+        rows = []
+        for name in ("velocity", "acceleration", "jerk"):
+            value = np.asarray(getattr(given, name), dtype=float)
+            if value.ndim and value.shape != (count,):
+                raise ProblemError(f"joint {name} limits have shape {value.shape}; the arm has {count} joints")
+            rows.append(np.broadcast_to(value, (count,)))
+        return np.array(rows)
+
+
+def _check(name: str, value: ArrayLike, finite: bool) -> None:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{name} limit {value!r} is not numeric") from error
+    wrong = ~(array > 0) | (finite & ~np.isfinite(array))
+    if array.size == 0 or wrong.any():
+        bad = float(array[wrong].flat[0]) if array.size else np.nan
+        raise ProblemError(f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}")
+
+
+def cause_names(joint_names: Sequence[str]) -> tuple[str, ...]:
+    """What may bind: the rows of line_demands and joint_demands."""
+    of_joints = [f"joint {name!r} {kind}" for kind in ("velocity", "acceleration", "jerk") for name in joint_names]
+    return ("centripetal acceleration", *of_joints)
+
+
+def line_demands(
+    limits: Limits, curvature: Array | None, rates: JointRates | None
+) -> tuple[Array, NDArray[np.float64]]:
+    """Demand over limit at unit, steady line speed, and the power of the speed it grows with.
+
+    Shape (C, M) and (C,), the rows being those of cause_names: v^p demand <= 1 is the limit of a steady line speed v.
+    """
+    count = len(curvature) if curvature is not None else len(rates.first) if rates is not None else 0
+    none = np.zeros((1, count))
+    rows = [none if curvature is None else curvature[None] / limits.centripetal]
+    powers = [2.0]
+    if rates is not None:
+        number = rates.first.shape[1]
+        bounds = limits.of_joints(number)
+        for order, derivative in enumerate((rates.first, rates.second, rates.third)):
+            rows.append(np.abs(derivative.T) / bounds[order][:, None])
+            powers += [order + 1.0] * number
+    return np.concatenate(rows), np.array(powers)
+
+
+def joint_demands(limits: Limits, rates: JointRates, motion: Motion) -> tuple[Array, Array]:
+    """Joint acceleration and jerk over their limits during a motion, and the part of it that a steady speed has.
+
+    q'' v^2 + q' a, and q''' v^3 + 3 q'' v a + q' j. Shape (2 n, M) each.
+    """
+    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
+    _, most, jerks = limits.of_joints(rates.first.shape[1])
+    steady = [rates.second * v**2 / most, rates.third * v**3 / jerks]
+    whole = [steady[0] + rates.first * a / most, steady[1] + (3 * rates.second * v * a + rates.first * j) / jerks]
+    return np.abs(np.concatenate([x.T for x in whole])), np.abs(np.concatenate([x.T for x in steady]))

@@ -1,0 +1,158 @@
+"""Time along a path: the asked line speed wherever the limits allow it, slowed smoothly just where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ocp.errors import ProblemError
+from ocp.schedule.grid import make_grid
+from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names
+from ocp.schedule.profile import Array, Motion, SpeedProfile
+from ocp.schedule.search import Attempt, search
+
+__all__ = ["Dip", "Schedule", "schedule"]
+
+TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Dip:
+    """A stretch in which the schedule stays below what was asked.
+
+    Attributes:
+        start, end: Distances along the path, m.
+        cause: The limit that binds, for example "centripetal acceleration" or "joint 'elbow' velocity".
+        asked, speed: Asked line speed and lowest one permitted there, m/s.
+        acceleration: Line acceleration permitted there, m/s^2; below the limit where a ramp breaks a joint limit.
+    """
+
+    start: float
+    end: float
+    cause: str
+    asked: float
+    speed: float
+    acceleration: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} permits {self.speed:.4g} of {self.asked:.4g} m/s, "
+            f"line acceleration {self.acceleration:.4g} m/s^2"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """When the path is where.
+
+    Attributes:
+        path: What it was made for.
+        limits: What it keeps to.
+        profile: Distance and speed over time.
+        dips: Where it is slower than asked, and why; empty if nowhere.
+        joints: The joints along the path, if they were limited.
+    """
+
+    path: PathLike
+    limits: Limits
+    profile: SpeedProfile
+    dips: tuple[Dip, ...]
+    joints: JointPath | None = None
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.profile.duration
+
+    def at(self, time: ArrayLike) -> Motion:
+        """Motion at times of [0, duration]. Shape (M,), s."""
+        return self.profile.at(time)
+
+    def time_at(self, distance: ArrayLike) -> Array:
+        """Times at which the path has the given distances from its start. Shape (M,), s."""
+        return self.profile.at_distance(distance).t
+
+    def sample(self, period: float) -> Motion:
+        """Motion every `period` s from the start; the last sample, at the end, comes as early as the duration says.
+
+        Raises:
+            ProblemError: A period that is not positive, or nan.
+        """
+        if not (np.isfinite(period) and period > 0):
+            raise ProblemError(f"sample period {period!r} s must be positive and finite")
+        times = np.arange(int(np.ceil(self.duration / period * (1 - 1e-12)))) * period
+        return self.at(np.append(times, self.duration))
+
+    def function(self) -> Any:
+        """casadi Function of the time, see SpeedProfile.function."""
+        return self.profile.function()
+
+
+def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
+    """Plan the line speed along a path from rest to rest.
+
+    One jerk-limited motion if nothing but speed, acceleration and jerk binds; the speed is then constant at the asked
+    one, through the blends as well, between its ramps. Where a steady speed breaks a limit, a stretch gets the speed
+    that keeps it; where a ramp breaks a joint limit, it gets a gentler one. All limits hold on a grid that resolves
+    them to 0.1 %.
+
+    Args:
+        path: A models.paths.SmoothPath, or whatever has what PathLike says.
+        limits: What to keep to.
+        joints: The joints along the path, where limits.joints is given.
+        strict: Raise instead of slowing down.
+
+    Raises:
+        ProblemError: Joint limits without joints, or a limit that would be broken at the asked speed, if strict;
+            limits that no schedule keeps.
+    """
+    if limits.joints is not None and joints is None:
+        raise ProblemError(
+            "joint limits need the joints along the path: schedule(path, limits, joints=arm.along(path))"
+        )
+    limited = joints if limits.joints is not None else None
+    grid = make_grid(path, limits, limited)
+    found = search(grid, limits, limited)
+    dips = _dips(found, limits, cause_names(limited.names if limited is not None else ()))
+    if strict and dips:
+        listed = "\n  ".join(str(dip) for dip in dips[:10])
+        raise ProblemError(
+            f"the asked speed breaks limits in {len(dips)} places; ask for less, larger blends, or "
+            f"strict=False:\n  {listed}"
+        )
+    return Schedule(path, limits, found.profile, dips, joints)
+
+
+def _dips(state: Attempt, limits: Limits, names: tuple[str, ...]) -> tuple[Dip, ...]:
+    grid = state.grid
+    acceleration = limits.acceleration / state.gentler**2
+    slow = (state.speed < grid.asked * (1 - TOLERANCE)) | (state.acceleration < acceleration * (1 - TOLERANCE))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(np.int8), [0]])))
+    dips = []
+    if state.gentler > 1:
+        fastest, ends = float(grid.asked.max()), (float(grid.distance[0]), float(grid.distance[-1]))
+        dips.append(Dip(*ends, "joint limits on ramps", fastest, fastest, acceleration))
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        inside = slice(first, last)
+        ratio = state.speed[inside] / grid.asked[inside]
+        lowest = first + int(ratio.argmin())
+        if ratio.min() < 1 - TOLERANCE:
+            points = grid.permitted[first : last + 1]
+            cause = int(grid.cause[first + int(points.argmin())])
+        else:
+            lowest = first + int(state.acceleration[inside].argmin())
+            cause = int(state.ramp_cause[lowest])
+        dips.append(
+            Dip(
+                float(grid.distance[first]),
+                float(grid.distance[last]),
+                names[cause],
+                float(grid.asked[lowest]),
+                float(state.speed[lowest]),
+                float(state.acceleration[inside].min()),
+            )
+        )
+    return tuple(dips)

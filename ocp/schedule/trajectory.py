@@ -1,0 +1,135 @@
+"""Joint trajectories sampled from a schedule, and their exchange as CSV and as a ROS 2 JointTrajectory."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike as FilePath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.schedule.limits import JointPath
+from ocp.schedule.planner import Schedule
+from ocp.schedule.profile import Array, Motion
+
+__all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
+
+KINDS = ("positions", "velocities", "accelerations")
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrajectory:
+    """Sampled joints.
+
+    Attributes:
+        names: Of the n joints.
+        t: Time from the start, increasing. Shape (M,), s.
+        positions, velocities, accelerations: Shape (M, n), rad or m, and per s, s^2.
+
+    Raises:
+        ProblemError: Wrong shapes, nan, times that do not increase, names that repeat.
+    """
+
+    names: tuple[str, ...]
+    t: Array
+    positions: Array
+    velocities: Array
+    accelerations: Array
+
+    def __post_init__(self) -> None:
+        names = tuple(str(name) for name in self.names)
+        if not names or len(set(names)) != len(names):
+            raise ProblemError(f"trajectory: joint names {list(names)} must be there and differ")
+        object.__setattr__(self, "names", names)
+        t = np.array(self.t, dtype=float)
+        if t.ndim != 1 or not t.size or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+            raise ProblemError("trajectory: times must be finite, increasing, and at least one")
+        object.__setattr__(self, "t", t)
+        for kind in KINDS:
+            values = np.array(getattr(self, kind), dtype=float)
+            if values.shape != (len(t), len(names)):
+                raise ProblemError(f"trajectory: {kind} have shape {values.shape}, expected {(len(t), len(names))}")
+            if not np.isfinite(values).all():
+                raise ProblemError(f"trajectory: {kind} are not all finite")
+            object.__setattr__(self, kind, values)
+
+    def write_csv(self, path: str | FilePath[str]) -> None:
+        """Write columns t and position, velocity, acceleration of each joint, in full precision."""
+        head = ["t", *(f"{name}.{kind}" for kind in KINDS for name in self.names)]
+        rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
+        with Path(path).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(head)
+            writer.writerows([repr(value) for value in row] for row in rows.tolist())
+
+    @classmethod
+    def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
+        """Read what write_csv wrote, bit for bit; ProblemError for anything else."""
+        with Path(path).open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+        head = rows[0] if rows else []
+        count = (len(head) - 1) // 3
+        names = tuple(column.removesuffix(f".{KINDS[0]}") for column in head[1 : count + 1])
+        if count < 1 or head != ["t", *(f"{name}.{kind}" for kind in KINDS for name in names)]:
+            raise ProblemError(f"{path}: the head {head[:4]} is not that of a joint trajectory")
+        try:
+            table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(head))
+        except ValueError as error:
+            raise ProblemError(f"{path}: a cell is not a number, or a row is not complete: {error}") from error
+        return cls(names, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
+
+    def to_ros(self) -> dict[str, Any]:
+        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there."""
+        nanoseconds = np.round(self.t * 1e9).astype(np.int64)
+        points = [
+            {
+                "positions": q,
+                "velocities": v,
+                "accelerations": a,
+                "effort": [],
+                "time_from_start": {"sec": ns // 10**9, "nanosec": ns % 10**9},
+            }
+            for q, v, a, ns in zip(
+                self.positions.tolist(),
+                self.velocities.tolist(),
+                self.accelerations.tolist(),
+                nanoseconds.tolist(),
+                strict=True,
+            )
+        ]
+        header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+        return {"header": header, "joint_names": list(self.names), "points": points}
+
+    @classmethod
+    def from_ros(cls, message: Mapping[str, Any]) -> JointTrajectory:
+        """Read what to_ros made: the same numbers, times to the nanosecond. ProblemError when a field is missing."""
+        try:
+            points = message["points"]
+            t = np.array([p["time_from_start"]["sec"] + p["time_from_start"]["nanosec"] / 1e9 for p in points])
+            values = [np.array([p[kind] for p in points], dtype=float) for kind in KINDS]
+            names = tuple(message["joint_names"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProblemError(f"this is no joint trajectory message: {error!r}") from error
+        return cls(names, t, *values)
+
+
+def joint_motion(joints: JointPath, motion: Motion) -> tuple[Array, Array, Array, Array]:
+    """Joints, their velocities, accelerations and jerks during a motion along the path. Shape (M, n) each.
+
+    q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
+    """
+    along = joints.at(motion.distance)
+    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
+    velocity = along.first * v
+    acceleration = along.second * v**2 + along.first * a
+    return along.position, velocity, acceleration, along.third * v**3 + 3 * along.second * v * a + along.first * j
+
+
+def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
+    """Joints every `period` s from the start to the end of a schedule; ProblemError for a bad period."""
+    motion = schedule.sample(period)
+    return JointTrajectory(tuple(joints.names), motion.t, *joint_motion(joints, motion)[:3])
