@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce benchmark test check format dev build clean anew
+.PHONY: help reproduce gallery benchmark test check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -36,7 +36,10 @@ help: ## list the targets
 reproduce: $(VENV)/run.stamp ## run every paper script: figures, tables and summary.json into results/
 	$(BIN)/python scripts/reproduce.py --out "$(OUT)"
 
-benchmark: $(VENV)/run.stamp ## time model functions, builds and solves
+gallery: $(VENV)/gallery.stamp ## real robots: plan, audit and draw each example into results/gallery
+	$(BIN)/python scripts/gallery.py --out "$(OUT)"
+
+benchmark: $(VENV)/peers.stamp $(VENV)/gallery.stamp ## time model functions, builds, solves and plans, beside other packages
 	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)

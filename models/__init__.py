@@ -2,6 +2,7 @@
 
 from models.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.errors import ModelError
+from models.footprint import Footprint, footprint
 from models.free_floating import FreeFloating, paper_example
 from models.kinematics import (
     center_of_mass,
@@ -9,6 +10,7 @@ from models.kinematics import (
     centers_of_mass,
     frame_jacobian,
     link_frames,
+    link_jacobians,
     momentum_matrix,
     robot_inertia,
     tip_jacobian,
@@ -17,6 +19,18 @@ from models.kinematics import (
 from models.machine import FixedBase, Machine
 from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from models.parts import Joint, Link
+from models.rebuild import (
+    attached,
+    locked,
+    merged,
+    pruned,
+    renamed,
+    rerooted,
+    retipped,
+    simplified,
+    subtree,
+    with_load,
+)
 from models.robot import Robot, planar_chain
 from models.spatial import Frame
 from models.standing import Standing
@@ -24,6 +38,7 @@ from models.support import Support, rectangle
 
 __all__ = [
     "FixedBase",
+    "Footprint",
     "Frame",
     "FreeFloating",
     "Joint",
@@ -34,22 +49,34 @@ __all__ = [
     "Standing",
     "Support",
     "Wrench",
+    "attached",
     "base_reaction",
     "center_of_mass",
     "center_of_mass_jacobian",
     "center_of_mass_motion",
     "centers_of_mass",
+    "footprint",
     "frame_jacobian",
     "inverse_dynamics",
     "link_frames",
+    "link_jacobians",
     "link_motions",
+    "locked",
+    "merged",
     "momentum",
     "momentum_matrix",
     "momentum_rate",
     "paper_example",
     "planar_chain",
+    "pruned",
     "rectangle",
+    "renamed",
+    "rerooted",
+    "retipped",
     "robot_inertia",
+    "simplified",
+    "subtree",
     "tip_jacobian",
     "tip_pose",
+    "with_load",
 ]

@@ -71,6 +71,10 @@ class Rig:
         """Whether revolute joint 2..6 (counted from 1) has limits less than a full turn apart."""
         return bool(self.upper[joint - 1] - self.lower[joint - 1] < 2 * np.pi)
 
+    def unlimited(self) -> Rig:
+        """The same lengths without joint limits."""
+        return Rig(*(getattr(self, name) for name in LENGTHS))
+
 
 @dataclass(frozen=True, eq=False)
 class Tunnel:

@@ -29,15 +29,19 @@ from models.harmonics import (
 from models.spatial import Expression
 
 LIMITS = tuple(f"joint {joint} {side}" for joint in range(1, 7) for side in ("lower", "upper"))
-ACTIVE = ("free", "pitch reach", "yaw reach", *LIMITS)
+ACTIVE = ("free", "pitch reach", "yaw reach", *LIMITS, "clearance")
 """Name of the constraint that holds a roll back, by its code."""
 
-STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits")
+STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits", "clearance")
 """Why there is no roll, by its code."""
 
 ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
 """How far inside its limit an end is placed, so that the strict check of the limits that follows accepts it."""
+
+SQUARED_REACH = 1e-5
+ROUNDING = 2e-15  # of sin q4 and what depends on it
+LIMIT_SLACK = 1e-7  # in a cosine, where it is only asked whether an end can matter
 
 
 class Candidate(NamedTuple):
@@ -53,8 +57,42 @@ class Verdict(NamedTuple):
 
     pitch: Expression
     yaw: Expression
-    angles: Expression
-    slide: Expression
+    pitch_angles: Expression
+    yaw_angles: Expression
+    slide_lower: Expression
+    slide_upper: Expression
+
+    def relaxed(self) -> Expression:
+        """Whether all is met but for the limits of joint 1."""
+        return ca.logic_and(self.pitch_side(), ca.logic_and(self.yaw, self.yaw_angles))
+
+    def pitch_side(self) -> Expression:
+        """Whether the pitch link reaches and joints 4, 5 and 6 are within limits."""
+        return ca.logic_and(self.pitch, self.pitch_angles)
+
+    def angles(self) -> Expression:
+        """Whether joints 2 to 6 are within limits."""
+        return ca.logic_and(self.pitch_angles, self.yaw_angles)
+
+    def slide(self) -> Expression:
+        """Whether the limits of joint 1 are met."""
+        return ca.logic_and(self.slide_lower, self.slide_upper)
+
+
+class Level(NamedTuple):
+    """A value of cos q2 at which an arc may end.
+
+    Attributes:
+        cosine: The value.
+        code: Of the constraint, in ACTIVE.
+        above: Whether the constraint is met above the value, not below.
+        relevant: Whether joints 2 and 3 are within their limits at that value, in the branch at hand.
+    """
+
+    cosine: Expression
+    code: int
+    above: bool
+    relevant: Expression
 
 
 def limit_code(joint: int, upper: bool) -> int:
@@ -85,41 +123,38 @@ def verdict(rig: Rig, target: Expression, posture: Posture, c: Expression, s: Ex
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4
     pairs = {2: (p.sin2, p.cos2), 3: (pair3[1], pair3[0]), 4: (p.sin4, p.cos4), 5: (pair5[1], pair5[0]), 6: (s, c)}
-    angles: Expression = 1
+    angles: dict[bool, Expression] = {False: 1, True: 1}
     for joint, (sine, cosine) in pairs.items():
         if rig.limited(joint):
             low, high = rig.lower[joint - 1], rig.upper[joint - 1]
             middle, half = (low + high) / 2, (high - low) / 2
             inside = np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half)
-            angles = ca.logic_and(angles, inside)
-    slide: Expression = 1
-    if np.isfinite(rig.lower[0]):
-        slide = ca.logic_and(slide, p.q1 >= rig.lower[0])
-    if np.isfinite(rig.upper[0]):
-        slide = ca.logic_and(slide, p.q1 <= rig.upper[0])
-    return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles, slide)
+            angles[joint > 3] = ca.logic_and(angles[joint > 3], inside)
+    slide_lower = p.q1 >= rig.lower[0] if np.isfinite(rig.lower[0]) else 1
+    slide_upper = p.q1 <= rig.upper[0] if np.isfinite(rig.upper[0]) else 1
+    return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], slide_lower, slide_upper)
 
 
 def angle_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     """Ends of the reachable arcs by everything but the limits of joint 1, and points that mean nothing among them."""
-    axle, e_c, e_s = corner_circle(rig, target)
-    lg, lp = rig.goose_neck, rig.pitch_link
+    ends = simple_ends(rig, target, branch)
+    chart = yaw_chart(rig, branch)
+    for level in yaw_levels(rig, target, branch):
+        for point in level_points(rig, target, level.cosine):
+            above = 1 if level.above else -1
+            ends.append(Candidate(*sharp_level(rig, chart, target, level.cosine, above, point), level.code))
+    return ends
+
+
+def simple_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
+    """Ends by joints 4, 5 and 6 and by the reach of the pitch link, to rounding."""
+    axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
-        c = (-lp * sine - axle[2]) / _not_zero(lg * e_c[2])
+        c = (-rig.pitch_link * sine - axle[2]) / _not_zero(rig.goose_neck * e_c[2])
         c = ca.fmin(ca.fmax(c, -1.0), 1.0)
         s = ca.sqrt((1 - c) * (1 + c))
         ends += [Candidate(c, s, code), Candidate(c, -s, code)]
-
-    s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
-    stretched = minus(Harmonics(lp**2, 0, 0, 0, 0), first_square(axle[2], lg * e_c[2], lg * e_s[2]))
-    level = axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw
-    chart = _chart(rig, branch)
-    for cosine, code in _yaw_cosines(rig, target, branch):
-        square = first_square(level - rig.yaw_link_1 * cosine, lg * e_c[1], lg * e_s[1])
-        f = minus(square, scaled(stretched, s_yaw * s_yaw))
-        ends += [Candidate(*point, code) for point in roots(f, _sharper(chart, target, 0, cosine))]
-
     for upper in (False, True):
         if rig.limited(6):
             angle = _inside(rig, 6, upper)
@@ -127,14 +162,76 @@ def angle_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     return ends
 
 
+def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[Level]:
+    """Values of cos q2 at which an arc may end: by joints 2 and 3 and by the reach of the yaw link."""
+    found = []
+    s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
+
+    def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
+        """Adds the level of q2 with this sine and cosine, if joint 3 allows it."""
+        if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
+            cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
+            within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
+        found.append(Level(cosine, code, above, within))
+
+    for sign, angle in ((1, 0.0), (-1, np.pi)):
+        if _allows(rig, 2, angle):
+            add(0.0, sign * (1 - REACH_INSET), 2, sign < 0, 1)
+    for upper in (False, True):
+        if rig.limited(2):
+            angle = _inside(rig, 2, upper)
+            if branch.yaw * np.sin(angle) > 0:
+                add(np.sin(angle), np.cos(angle), limit_code(2, upper), (branch.yaw < 0) != upper, 1)
+        if rig.limited(3):
+            angle = _inside(rig, 3, upper)
+            cosine = s_yaw * np.cos(angle) - c_yaw * np.sin(angle)  # of q2 = yaw - pi/2 - q3
+            sine = -c_yaw * np.cos(angle) - s_yaw * np.sin(angle)
+            within = ca.logic_and(branch.yaw * sine > -LIMIT_SLACK, _within(rig, 2, sine, cosine))
+            add(sine, cosine, limit_code(3, upper), (branch.yaw < 0) == upper, within)
+    return found
+
+
+def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
+    """Four points near the rolls at which cos q2 takes a value, in any branch; to be polished by sharp_point.
+
+    Here the equation is squared: where the pitch link is nearly stretched it is smooth and cos q2 is not, where the
+    yaw is nearly 0 it has nearly double roots and cos q2 has not.
+    """
+    axle, e_c, e_s = corner_circle(rig, target)
+    lg, lp = rig.goose_neck, rig.pitch_link
+    s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
+    stretched = minus(Harmonics(lp**2, 0, 0, 0, 0), first_square(axle[2], lg * e_c[2], lg * e_s[2]))
+    level = axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw
+    square = first_square(level - rig.yaw_link_1 * cosine, lg * e_c[1], lg * e_s[1])
+    f = minus(square, scaled(stretched, s_yaw * s_yaw))
+    slope = f.derivative()
+    # a double root leaves Newton nothing but rounding to go by: hence the short reach
+    return [polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_REACH) for p in roots(f, steps=0)]
+
+
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     """Function of the target -> ends of the reachable arcs by one limit of joint 1, and points that mean nothing.
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
-    limit = (rig.upper if upper else rig.lower)[0]
-    limit += (-1 if upper else 1) * ANGLE_INSET
     t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
+    sharper = _sharper(yaw_chart(rig, branch), t, 2, slide_limit(rig, upper))
+    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), sharper)) for k in range(8)]
+    polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
+    target = ca.MX.sym("target", 5)
+    found = polished(target, slide_points(rig, upper)(target))
+    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
+
+
+def slide_limit(rig: Rig, upper: bool) -> float:
+    """Position of joint 1 just inside one of its limits, m."""
+    return float((rig.upper if upper else rig.lower)[0] + (-1 if upper else 1) * ANGLE_INSET)
+
+
+def slide_points(rig: Rig, upper: bool) -> Any:
+    """Function of the target -> points near the ends of arcs by one limit of joint 1. Output shape (2, 8)."""
+    limit = slide_limit(rig, upper)
+    t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
     s_yaw, c_yaw = ca.sin(t[3]), ca.cos(t[3])
     lg = rig.goose_neck
@@ -149,15 +246,10 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     known = _sum(_sum(product(x, x), product(y, y)), _sum(stretched, [(rig.yaw_link_1**2, 0.0)], -1))
     along = _sum([(c_yaw * a, c_yaw * b) for a, b in x], [(s_yaw * a, s_yaw * b) for a, b in y])
     f = _sum(product(known, known), product(stretched, product(along, along)), -4)
-    coefficients = ca.Function(
-        "slide", [t], [ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))]
-    )
-    sharper = _sharper(_chart(rig, branch), t, 2, limit)
-    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), sharper)) for k in range(8)]
-    polished = ca.Function("slide_ends", [t, points], [ca.horzcat(*sharp)])
+    outputs = ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])
+    coefficients = ca.Function("slide", [t], outputs)
     target = ca.MX.sym("target", 5)
-    found = polished(target, series_roots(4)(coefficients(target)))
-    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
+    return ca.Function("slide_points", [target], [series_roots(4)(coefficients(target))], ["target"], ["points"])
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
@@ -176,24 +268,17 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
     return found
 
 
-def _yaw_cosines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Values of cos q2 at which an arc may end."""
-    found: list[tuple[Expression, int]] = []
-    for sign, angle in ((1, 0.0), (-1, np.pi)):
-        if _allows(rig, 2, angle):
-            found.append((sign * (1 - REACH_INSET), 2))
-    for upper in (False, True):
-        if rig.limited(2):
-            angle = _inside(rig, 2, upper)
-            if branch.yaw * np.sin(angle) > 0:
-                found.append((np.cos(angle), limit_code(2, upper)))
-        if rig.limited(3):
-            found.append((ca.sin(target[3] - _inside(rig, 3, upper)), limit_code(3, upper)))
-    return found
-
-
 def _inside(rig: Rig, joint: int, upper: bool) -> float:
     return float(rig.upper[joint - 1] - ANGLE_INSET if upper else rig.lower[joint - 1] + ANGLE_INSET)
+
+
+def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression) -> Expression:
+    """Whether an angle given by its sine and cosine is within the limits of a joint, or as good as."""
+    if not rig.limited(joint):
+        return 1
+    low, high = rig.lower[joint - 1], rig.upper[joint - 1]
+    middle, half = (low + high) / 2, (high - low) / 2
+    return np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half) - LIMIT_SLACK
 
 
 def _allows(rig: Rig, joint: int, angle: float) -> bool:
@@ -204,13 +289,30 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
     return bool(np.cos(angle - (low + high) / 2) >= np.cos((high - low) / 2) - 1e-9)
 
 
-def _chart(rig: Rig, branch: Branch) -> Any:
-    """Function (target, cosine, sine of roll) -> cos q2, its derivative by roll, q1, its derivative."""
+def yaw_chart(rig: Rig, branch: Branch) -> Any:
+    """Function (target, cosine, sine of roll) -> cos q2, its derivative by roll, q1, its derivative, cos q4."""
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     posture = posture_at(rig, t, c, s, branch)
     values = ca.vertcat(posture.cos2, posture.q1)
     slope = ca.jacobian(values, c) * -s + ca.jacobian(values, s) * c
-    return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1]])
+    return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], posture.cos4])
+
+
+def sharp_point(chart: Any, target: Expression, output: int, value: Expression, point: Point) -> Point:
+    """A point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
+    return polish(point, _sharper(chart, target, output, value))
+
+
+def sharp_level(rig: Rig, chart: Any, target: Expression, value: Expression, above: Any, point: Point) -> Point:
+    """A point polished until cos q2 takes a value, or is beyond it by as much as rounding may take away again.
+
+    Where the pitch link is nearly stretched the rounding of sin q4 is amplified by 1 / cos q4. `above` is 1 where the
+    constraint is met above the value, -1 where it is met below.
+    """
+    c, s = sharp_point(chart, target, 0, value, point)
+    cos4 = ca.fabs(chart(target, c, s)[4])
+    margin = ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
+    return polish((c, s), _sharper(chart, target, 0, value + above * margin), 1)
 
 
 def _sharper(chart: Any, target: Expression, output: int, value: Expression) -> Slope:

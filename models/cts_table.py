@@ -9,7 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.clearance import Surroundings
 from models.cts import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
+from models.cts_clearance import clear_inverse
 from models.cts_iterations import checked_targets
 from models.cts_optimal import optimal_inverse
 from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
@@ -56,6 +58,10 @@ def solve_table(
     previous: ArrayInput = 0.0,
     in_sequence: bool = False,
     rate_weight: float = 0.0,
+    surroundings: Surroundings | None = None,
+    clearance: float = -np.inf,
+    clearance_weight: float = 0.0,
+    clearance_width: float = 0.05,
 ) -> Table:
     """Joints of least index for every target; a bad row is marked and does not touch the others.
 
@@ -67,6 +73,8 @@ def solve_table(
         in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows that are not ok are
             passed over.
         rate_weight: w4 of I2; 0 for I1.
+        surroundings: What to keep clear of, None for nothing, by at least `clearance`, m, or by a term
+            clearance_weight exp(-distance / clearance_width) of the index; see cts_clearance.clear_inverse.
 
     Raises:
         ModelError: An empty table, another shape, no branch, an unknown branch, a previous roll that is not finite.
@@ -82,7 +90,22 @@ def solve_table(
         raise ModelError(f"previous has shape {np.shape(previous)}, expected () or ({count},)") from error
     if not np.isfinite(before).all():
         raise ModelError("previous holds a roll that is not finite")
-    functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
+    if surroundings is None:
+        functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
+    else:
+        functions = [
+            clear_inverse(
+                rig,
+                tunnel,
+                surroundings,
+                branch,
+                clearance=clearance,
+                weight=clearance_weight,
+                width=clearance_width,
+                rate_weight=rate_weight,
+            )
+            for branch in chosen
+        ]
     if in_sequence:
         roll, steps = float(before[0]), []
         for row in rows:
@@ -103,7 +126,7 @@ def solve_table(
 def _best(results: list[Any]) -> Array:
     """Of the branches' results the best, per row: joints, cost, branch number, active, status. Shape (samples, 10)."""
     best: Array | None = None
-    for number, (joints, cost, active, status) in enumerate(results):
+    for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
         rows = np.vstack([columns[0], columns[1], np.full_like(columns[1], number), columns[2], columns[3]]).T
         if best is None:
@@ -184,7 +207,7 @@ def arc_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
     meets = verdict(rig, target, posture_at(rig, target, c, s, branch), c, s)
-    inside = ca.logic_and(ca.logic_and(meets.pitch, meets.yaw), ca.logic_and(meets.angles, meets.slide))
+    inside = ca.logic_and(meets.relaxed(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 
 

@@ -1,8 +1,8 @@
 """What a motion takes: torques of the joints and the reaction of the ground, with forces from outside.
 
 Recursive Newton-Euler (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) written in world axes. The base stands
-still; joint positions, velocities and accelerations are of shape (dof, 1) in the order of `robot.joint_names`, as SX,
-MX, DM or numbers. Any algebra of one kind: a wrench of SX entries goes with SX positions.
+still unless its motion is given; joint positions, velocities and accelerations are of shape (dof, 1) in the order of
+`robot.joint_names`, as SX, MX, DM or numbers. Any algebra of one kind: a wrench of SX entries goes with SX positions.
 """
 
 from __future__ import annotations
@@ -47,8 +47,6 @@ class Wrench:
     def __post_init__(self) -> None:
         for part in ("force", "moment", "point"):
             given = getattr(self, part)
-            if isinstance(given, list | tuple) and any(isinstance(entry, ca.SX | ca.MX | ca.DM) for entry in given):
-                given = ca.vertcat(*given)
             owner = f"wrench on link {self.link!r}"
             value = checked_vector(given, 3, f"{owner}: {part}", "x, y and z")
             if isinstance(value, ca.DM) and not np.isfinite(np.array(value)).all():
@@ -64,14 +62,22 @@ def inverse_dynamics(
     wrenches: Sequence[Wrench] = (),
     gravity: Expression = GRAVITY,
     world_from_base: Placement | None = None,
+    *,
+    base_twist: Expression | None = None,
+    base_acceleration: Expression | None = None,
 ) -> Expression:
     """Torques (forces of prismatic joints) that the joints must give. Shape (dof, 1), N m or N.
+
+    The base may move: `base_twist` and `base_acceleration` are (angular velocity, velocity of the origin of the root
+    link's frame) and their time derivatives, world axes, shape (6, 1).
 
     Raises:
         ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
     stacked = stacked_wrenches(robot, wrenches)
-    return _inverse_dynamics(robot, q, qd, qdd, stacked, tuple(w.link for w in wrenches), gravity, world_from_base)
+    links = tuple(w.link for w in wrenches)
+    moving = (base_twist, base_acceleration)
+    return _inverse_dynamics(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *moving)
 
 
 def base_reaction(
@@ -82,16 +88,22 @@ def base_reaction(
     wrenches: Sequence[Wrench] = (),
     gravity: Expression = GRAVITY,
     world_from_base: Placement | None = None,
+    *,
+    base_twist: Expression | None = None,
+    base_acceleration: Expression | None = None,
 ) -> Expression:
     """What the ground must do to the root link: (moment about the world's origin, force). Shape (6, 1), N m and N.
 
-    The rate of momentum less the weight of all links, the root link included, and less the wrenches.
+    The rate of momentum less the weight of all links, the root link included, and less the wrenches. Of a base that
+    moves, see inverse_dynamics, it is what drives it: zero where it floats freely.
 
     Raises:
         ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
     stacked = stacked_wrenches(robot, wrenches)
-    return _base_reaction(robot, q, qd, qdd, stacked, tuple(w.link for w in wrenches), gravity, world_from_base)
+    links = tuple(w.link for w in wrenches)
+    moving = (base_twist, base_acceleration)
+    return _base_reaction(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *moving)
 
 
 def external_wrench(
@@ -131,9 +143,12 @@ def _inverse_dynamics(
     links: tuple[str, ...],
     gravity: Expression,
     world_from_base: Placement | None,
+    base_twist: Expression | None,
+    base_acceleration: Expression | None,
 ) -> Expression:
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    needed = _needed_wrenches(robot, frames, motions_of(robot, frames, axes, qd, qdd), gravity)
+    motions = motions_of(robot, frames, axes, qd, qdd, base_twist, base_acceleration)
+    needed = _needed_wrenches(robot, frames, motions, gravity)
     for link, wrench in _given_wrenches(frames, stacked, links):
         needed[link] = needed[link] - wrench
     for joint in reversed(robot.joints):
@@ -152,9 +167,12 @@ def _base_reaction(
     links: tuple[str, ...],
     gravity: Expression,
     world_from_base: Placement | None,
+    base_twist: Expression | None,
+    base_acceleration: Expression | None,
 ) -> Expression:
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    needed = _needed_wrenches(robot, frames, motions_of(robot, frames, axes, qd, qdd), gravity)
+    motions = motions_of(robot, frames, axes, qd, qdd, base_twist, base_acceleration)
+    needed = _needed_wrenches(robot, frames, motions, gravity)
     total: Expression = sum(needed.values(), start=ca.DM(6, 1))
     return total - sum((wrench for _, wrench in _given_wrenches(frames, stacked, links)), start=ca.DM(6, 1))
 

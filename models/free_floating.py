@@ -1,7 +1,8 @@
-"""Arms on an unactuated, freely floating base whose momentum is zero (Kim, Kim 2011).
+"""Arms on an unactuated, freely floating base whose momentum is conserved, zero unless given (Kim, Kim 2011).
 
 The base moves so that E1 x1' + E2 x2' = 0 (24), with x1' the base twist and x2' the joint rates; the tip
-moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25).
+moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A momentum that is
+not zero adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
 
 The reaction is computed about the centre of mass of the machine, where linear and angular momentum decouple,
 and in the axes of the base, where nothing depends on the base's own pose: one rotational inertia, of size 3
@@ -22,6 +23,7 @@ import numpy as np
 
 from models.errors import ModelError
 from models.kinematics import (
+    center_of_mass,
     checked_vector,
     frames_and_axes,
     joint_vector,
@@ -33,16 +35,18 @@ from models.kinematics import (
 from models.kinematics import momentum_matrix as joint_momentum_matrix
 from models.linear import solve_spd
 from models.machine import TWIST_SIZE, jacobian_manipulability, require_joints
-from models.parts import Array, Link
+from models.parts import Array, ArrayInput, Link, checked_array
 from models.robot import Robot, planar_chain
 from models.spatial import (
     Expression,
     Frame,
     angular_velocity_from_quaternion,
+    cross,
+    expression,
     force_transform,
     motion_transform,
     on_scalars,
-    quaternion_rate,
+    quaternion_product,
     rotation,
     rotation_from_quaternion,
     skew,
@@ -58,7 +62,10 @@ Rotation about z, translation along x and y.
 
 
 class _Reaction(NamedTuple):
-    """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each."""
+    """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each.
+
+    The latter with what the conserved momentum adds.
+    """
 
     base_angular: Expression
     base_linear: Expression
@@ -68,7 +75,7 @@ class _Reaction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FreeFloating:
-    """A robot whose root link floats freely, the total momentum being zero at all times.
+    """A robot whose root link floats freely, the total momentum being conserved.
 
     The configuration of the base is the pose of the root link's frame in an inertial world: (x, y, angle) for
     a planar base, (x, y, z, qw, qx, qy, qz) for a spatial one, with a unit quaternion. A base twist is
@@ -78,14 +85,17 @@ class FreeFloating:
     Attributes:
         robot: The kinematic tree.
         base: "planar" or "spatial".
+        conserved_momentum: (Angular about the centre of mass, N m s; linear, N s), world axes, shape (6,);
+            (Lz, Px, Py), shape (3,), if planar. Zero if None.
 
     Raises:
-        ModelError: Unknown kind of base, no moving joint, no mass, no rotational inertia, or a joint that
-            would move a planar machine out of its plane.
+        ModelError: Unknown kind of base, no moving joint, no mass, no rotational inertia, a joint that would move a
+            planar machine out of its plane, or a momentum of a wrong size or not finite.
     """
 
     robot: Robot
     base: BaseKind = "spatial"
+    conserved_momentum: ArrayInput | None = None
 
     def __post_init__(self) -> None:
         if self.base not in ("planar", "spatial"):
@@ -94,6 +104,11 @@ class FreeFloating:
         if self.base == "planar":
             _require_planar(self.robot)
         _require_inertia(self.robot, self.twist_rows)
+        given = np.zeros(len(self.twist_rows)) if self.conserved_momentum is None else self.conserved_momentum
+        momentum = checked_array(
+            given, (len(self.twist_rows),), f"{self.base} free-floating base", "conserved_momentum"
+        )
+        object.__setattr__(self, "conserved_momentum", momentum)
 
     @property
     def base_size(self) -> int:
@@ -135,33 +150,38 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Generalized Jacobian G (25). Shape (6, joint_size)."""
+        """Generalized Jacobian G (25), the linear part of the tip's twist. Shape (6, joint_size)."""
         return self._tip_motion(base, self._reaction(q, None))
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Twist of the tip, G joint_rates (25). Shape (6, 1)."""
+        """Twist of the tip, G joint_rates (25) and what the conserved momentum adds. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
-        return self._tip_motion(base, self._reaction(q, rates))
+        return self._tip_motion(base, self._reaction(q, rates, base))
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Twist of the base that keeps the momentum zero, -E1^-1 E2 joint_rates (24).
+        """Twist of the base that conserves the momentum, E1^-1 (momentum - E2 joint_rates) (24).
 
         Shape (6, 1) or (3, 1).
         """
-        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"))
+        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
         turn = self.world_from_base(base).rotation
         twist = ca.vertcat(ca.mtimes(turn, reaction.base_angular), ca.mtimes(turn, reaction.base_linear))
         return ca.densify(twist)[self.twist_rows, :]
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Time derivative of the base configuration that keeps the momentum zero. Shape (base_size, 1)."""
-        twist = self.base_twist(base, q, joint_rates)
+        """Time derivative of the base configuration that conserves the momentum. Shape (base_size, 1)."""
         if self.base == "planar":
+            twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
-        return ca.vertcat(twist[3:6], quaternion_rate(base[3:7], twist[0:3]))
+        base = expression(base)
+        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
+        turn = self.world_from_base(base).rotation
+        quaternion, spin = base[3:7], reaction.base_angular
+        turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # in base axes: no rotation
+        return ca.densify(ca.vertcat(ca.mtimes(turn, reaction.base_linear), turning))
 
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
@@ -202,11 +222,12 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Momentum, as above, of a motion given by its configuration's derivatives:
+        """Momentum, as above, of a motion given by its configuration's derivatives, less the conserved one:
 
         Zero if the motion is possible.
         """
-        return self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
+        found = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
+        return found - self._momentum_about_origin(base, q) if self._moves_by_itself else found
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
@@ -235,8 +256,26 @@ class FreeFloating:
         angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
         return ca.densify(ca.vertcat(angular, linear))
 
-    def _reaction(self, q: Expression, joint_rates: Expression | None) -> _Reaction:
-        """Reaction to unit rate of each joint (n columns), or to the given joint rates (one column)."""
+    @property
+    def _moves_by_itself(self) -> bool:
+        return bool(np.any(self.conserved_momentum))
+
+    def _spatial_momentum(self) -> tuple[Expression, Expression]:
+        """(Angular about the centre of mass, linear), world axes. Shape (3, 1) each."""
+        full = np.zeros(6)
+        full[self.twist_rows] = self.conserved_momentum
+        return expression(full[:3]), expression(full[3:])
+
+    def _momentum_about_origin(self, base: Expression, q: Expression) -> Expression:
+        angular, linear = self._spatial_momentum()
+        center = center_of_mass(self.robot, q, self.world_from_base(base))
+        return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
+
+    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> _Reaction:
+        """Reaction to unit rate of each joint (n columns), or to the given joint rates (one column).
+
+        The latter needs the base's pose, in whose axes the conserved momentum is not constant.
+        """
         frames, axes = frames_and_axes(self.robot, q)
         moments = subtree_moments(self.robot, frames)
         columns = [moments[joint.child].momentum(*axes[joint.name]) for joint in self.robot.moving_joints]
@@ -245,6 +284,12 @@ class FreeFloating:
         joints = point_jacobian(self.robot, axes, str(self.robot.tip), tip)
         if joint_rates is not None:
             momentum, joints = ca.mtimes(momentum, joint_rates), ca.mtimes(joints, joint_rates)
+
+        if joint_rates is not None and self._moves_by_itself:
+            turn = self.world_from_base(base).rotation
+            angular, push = (ca.mtimes(turn.T, part) for part in self._spatial_momentum())
+            about_base = angular + cross(moments[self.robot.root].first, push) / self.robot.total_mass
+            momentum = momentum - ca.vertcat(about_base, push)
 
         total = moments[self.robot.root]
         center = total.first / total.mass

@@ -21,8 +21,10 @@ Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 SMALLEST_SECOND = 1e-6
 """Least second harmonic, relative, that the pencil of conics is given; the polish takes the difference out again."""
 TINY = 1e-300
-CUBIC_STEPS, POLISH_STEPS, POLISH_REACH = 2, 3, 0.05
-ABERTH_STEPS = 24
+SMALLEST_SQUARED = 1e-100  # a second harmonic whose square is still a number
+CUBIC_STEPS, POLISH_STEPS, POLISH_REACH, LEAST_STEPS = 2, 3, 0.05, 4
+ABERTH_STAGES, ABERTH_NEAR = (6, 1, 1, 1, 1, 2, 4, 8, 16), 1e-5
+"""Steps to all roots at once: after each stage but the last only those that still move by more go on."""
 
 
 class Harmonics(NamedTuple):
@@ -84,14 +86,7 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS)
     f = Harmonics(f.a0 / size, f.a1 / size, f.b1 / size, f.a2 / size, f.b2 / size)
     a0 = ca.fmin(ca.fmax(f.a0, -3.0), 3.0)  # beyond there is no root, only lost digits
     plain = f.a2 * f.a2 + f.b2 * f.b2 < SMALLEST_SECOND**2
-    a2 = f.a2 + ca.if_else(plain, 2 * SMALLEST_SECOND, 0.0)
-    r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
-    large = ca.sqrt((r + ca.fabs(a2)) / (2 * r))
-    small = ca.fabs(f.b2) / (2 * r * large)
-    turn_c = ca.if_else(a2 >= 0, large, small)
-    turn_s = ca.if_else(a2 >= 0, small, large) * _sign(f.b2)
-    p = f.a1 * turn_c + f.b1 * turn_s
-    q = f.b1 * turn_c - f.a1 * turn_s
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(plain, 2 * SMALLEST_SECOND, 0.0))
 
     t = _pencil(a0, p, q, r)
     wide, narrow = ca.sqrt(r * (1 + t)), ca.sqrt(r * (1 - t))
@@ -120,13 +115,65 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS)
     return [polish(point, sharp, steps) for point in points]
 
 
-def polish(point: Point, function: Slope, steps: int = POLISH_STEPS) -> Point:
-    """Newton steps of at most POLISH_REACH rad on the circle; `function` gives value and derivative by the angle."""
+def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
+    """Cosine and sine of the turn to axes x, y in which f = a0 + p x + q y + r (x^2 - y^2); p, q and r > 0.
+
+    `shift` is added to a2, so that there is a second harmonic to turn to.
+    """
+    a2 = f.a2 + shift
+    r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
+    large = ca.sqrt((r + ca.fabs(a2)) / (2 * r))
+    small = ca.fabs(f.b2) / (2 * r * large)
+    turn_c = ca.if_else(a2 >= 0, large, small)
+    turn_s = ca.if_else(a2 >= 0, small, large) * _sign(f.b2)
+    return turn_c, turn_s, f.a1 * turn_c + f.b1 * turn_s, f.b1 * turn_c - f.a1 * turn_s, r
+
+
+def least_point(f: Harmonics) -> Point:
+    """The point of the circle where f is least of all.
+
+    In axes where f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y changes the terms p x and q y only: the
+    least is in the quadrant where neither is positive. There f has one stationary point and no more, the root of
+    P / cos - Q / sin - 4 r, with P = |p|, Q = |q|, which grows from one end of the quadrant to the other. Halley steps
+    start from the larger of two lower bounds of the angle, or, by the cusp P = 4 r, Q = 0 where three roots meet,
+    from the cube root that leads there: four of them and one of Newton are good to rounding for all P, Q, r >= 0.
+    """
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(f.a2 >= 0, SMALLEST_SQUARED, -SMALLEST_SQUARED))
+    big_p, big_q = ca.fabs(p), ca.fabs(q)
+    scale = 1 / (big_p + big_q + 4 * r)
+    big_p, big_q, big_r = big_p * scale, big_q * scale, 4 * r * scale
+    hypot = ca.sqrt(big_p * big_p + big_q * big_q) + TINY
+    widest = ca.fmax(big_p, big_r)
+    c = big_p / ca.fmax(hypot, big_r)
+    s_cusp = ca.fmin(1.0, 2 * big_q / widest) ** (1 / 3)
+    near = ca.fabs(big_r - big_p) * s_cusp < big_q
+    c = ca.if_else(near, ca.fmin(c, ca.sqrt((1 - s_cusp) * (1 + s_cusp))), c)
+    s = ca.sqrt(ca.fmax((1 - c) * (1 + c), 0.0))
+    for k in range(LEAST_STEPS):
+        pc, ps, qc, qs, rc, rs = big_p * c, big_p * s, big_q * c, big_q * s, big_r * c, big_r * s
+        value = ps - qc - rs * c
+        slope = ca.fmax(pc + qs - (rc * c - rs * s), 1e-30)
+        if k < LEAST_STEPS - 1:
+            step = -value * slope / (slope * slope - 0.5 * value * (qc - ps + 4 * rs * c))
+            step = ca.fmin(ca.fmax(step, -1.0), 1.0)
+            c, s = ca.fmax(c - step * s, 0.0), ca.fmax(s + step * c, 0.0)
+        else:
+            step = -value / slope
+            c, s = c - step * s, s + step * c
+        size = c * c + s * s
+        norm = 1.5 - 0.5 * size if k == LEAST_STEPS - 2 else 1 / ca.sqrt(size)  # that step is small already
+        c, s = c * norm, s * norm
+    x, y = -_sign(p) * c, -_sign(q) * s
+    return x * turn_c - y * turn_s, x * turn_s + y * turn_c
+
+
+def polish(point: Point, function: Slope, steps: int = POLISH_STEPS, reach: float = POLISH_REACH) -> Point:
+    """Newton steps of at most `reach` rad on the circle; `function` gives value and derivative by the angle."""
     c, s = point
     for _ in range(steps):
         value, slope = function(c, s)
         step = -value * slope / (slope * slope + TINY)
-        step = ca.fmin(ca.fmax(step, -POLISH_REACH), POLISH_REACH)
+        step = ca.fmin(ca.fmax(step, -reach), reach)
         c, s = c - step * s, s + step * c
         shrink = 1.5 - 0.5 * (c * c + s * s)  # 1 / norm to first order
         c, s = c * shrink, s * shrink
@@ -187,8 +234,8 @@ def series_roots(degree: int) -> Any:
     """Function of the coefficients of a Series -> points of the circle, among which are its simple roots.
 
     Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. The roots z = exp(i angle) of the
-    polynomial z^degree f are found all at once (Aberth 1973) in ABERTH_STEPS steps, and those off the circle are
-    drawn to it, where they mean nothing. Good to a few digits at least; polish them with the function at hand.
+    polynomial z^degree f are found all at once (Aberth 1973) in at most sum(ABERTH_STAGES) steps, and those off the
+    circle are drawn to it, where they mean nothing. Good to a few digits; polish them with the function at hand.
     """
     n = 2 * degree
     given = ca.SX.sym("coefficients", 2, degree + 1)
@@ -200,6 +247,11 @@ def series_roots(degree: int) -> Any:
         a, b = (unit[0, k], unit[1, k]) if k else (2 * unit[0, 0], 0)
         real[degree + k], imaginary[degree + k] = a, -b
         real[degree - k], imaginary[degree - k] = a, b
+    apart: dict[tuple[int, int], Point] = {}
+    for i in range(n):
+        for k in range(i):
+            part = _over((1, 0), (z[0, i] - z[0, k], z[1, i] - z[1, k]))
+            apart[i, k], apart[k, i] = part, (-part[0], -part[1])
     moved = []
     for i in range(n):
         x, y = z[0, i], z[1, i]
@@ -213,22 +265,43 @@ def series_roots(degree: int) -> Any:
         push: Point = (0, 0)
         for k in range(n):
             if k != i:
-                part = _over((1, 0), (x - z[0, k], y - z[1, k]))
-                push = (push[0] + part[0], push[1] + part[1])
+                push = (push[0] + apart[i, k][0], push[1] + apart[i, k][1])
         drawn = _times(newton, push)
         step = _over(newton, (1 - drawn[0], -drawn[1]))
         length = ca.hypot(step[0], step[1])
-        calm = 1 / ca.fmax(1.0, length / (0.5 * (1 + ca.hypot(x, y))))
+        calm = 1 / ca.fmax(1.0, length / (2 * (1 + ca.hypot(x, y))))
         moved.append(ca.vertcat(x - calm * step[0], y - calm * step[1]))
-    step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*moved)])
+    longest = ca.SX(0)
+    for i in range(n):
+        longest = ca.fmax(longest, ca.norm_1(moved[i] - z[:, i]) - ABERTH_NEAR * ca.norm_1(moved[i]))
+    step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*moved), longest])
 
     symbol = ca.MX.sym("coefficients", 2, degree + 1)
     norm = ca.Function("norm", [given], [given / (ca.norm_1(ca.vec(given)) + TINY)])(symbol)
     angles = [0.37 + 2 * ca.pi * i / n for i in range(n)]
-    start = ca.DM([[1.05 * ca.cos(a) for a in angles], [1.05 * ca.sin(a) for a in angles]])
-    found = step_function.fold(ABERTH_STEPS)(start, ca.repmat(norm, 1, ABERTH_STEPS))
+    # off the circle the roots are in pairs z, 1 / conj z: one half starts inside, the other outside
+    radii = [3.0 if i % 2 else 1 / 3.0 for i in range(n)]
+    at = list(zip(angles, radii, strict=True))
+    found: Any = ca.DM([[r * ca.cos(a) for a, r in at], [r * ca.sin(a) for a, r in at]])
+    moving = None
+    for count in ABERTH_STAGES:
+        stage = _steps(step_function, count)
+        if moving is None:
+            found, moving = stage(found, norm)
+            continue
+        keep = ca.Function("keep", [z, unit], [z, 0])
+        found, moving = ca.Function.if_else("aberth", stage, keep)(moving > 0, found, norm)
     circle = ca.Function("circle", [z], [z / ca.repmat(ca.sqrt(ca.sum1(z * z) + TINY), 2, 1)])
     return ca.Function("series_roots", [symbol], [circle(found)], ["coefficients"], ["points"])
+
+
+def _steps(step: Any, count: int) -> Any:
+    """Function (z, coefficients) -> (z after some steps, whether it still moves)."""
+    z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
+    moved, longest = z, None
+    for _ in range(count):
+        moved, longest = step(moved, unit)
+    return ca.Function("steps", [z, unit], [moved, longest])
 
 
 def _times(a: Point, b: Point) -> Point:
@@ -236,5 +309,5 @@ def _times(a: Point, b: Point) -> Point:
 
 
 def _over(a: Point, b: Point) -> Point:
-    size = b[0] * b[0] + b[1] * b[1] + TINY
-    return (a[0] * b[0] + a[1] * b[1]) / size, (a[1] * b[0] - a[0] * b[1]) / size
+    scale = 1 / (b[0] * b[0] + b[1] * b[1] + TINY)
+    return (a[0] * b[0] + a[1] * b[1]) * scale, (a[1] * b[0] - a[0] * b[1]) * scale

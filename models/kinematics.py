@@ -131,6 +131,12 @@ def frame_jacobian(
     return ca.densify(point_jacobian(robot, axes, link, frames[link].point(point)))
 
 
+def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
+    """As frame_jacobian for the origins of all link frames, by link name. Shape (6, dof) each."""
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    return {link: ca.densify(point_jacobian(robot, axes, link, frame.position)) for link, frame in frames.items()}
+
+
 def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Geometric Jacobian of the tip: joint rates to (angular, linear) velocity of the tip frame, world axes.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Protocol, cast
 
 import casadi as ca
 import numpy as np
@@ -26,6 +26,9 @@ class Machine(Protocol):
     a planar one, position and unit quaternion [w, x, y, z] for a spatial one, in the world. `q` are the joint
     positions, shape (joint_size, 1). Both may be SX, MX, DM or numbers. Twists are (angular velocity,
     velocity of the tip's origin), world axes. Another kind of machine is made by writing these functions.
+
+    `tip_twist` and `base_rate` are affine in the joint rates: a machine that carries momentum moves with its joints at
+    rest too. Their value at zero rates is the drift; `tip_jacobian` is the linear part alone.
     """
 
     @property
@@ -56,10 +59,10 @@ class Machine(Protocol):
         """
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """tip_jacobian times joint_rates, in fewer operations. Shape (6, 1)."""
+        """tip_jacobian times joint_rates, in fewer operations, and the drift. Shape (6, 1)."""
 
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Time derivative of the base configuration that the joint rates cause. Shape (base_size, 1)."""
+        """Time derivative of the base configuration at these joint rates, with the drift. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """Manipulability of the task that fixes these rows of the tip's twist, as jacobian_manipulability.
@@ -87,7 +90,13 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
     """`rows` as a list; ModelError unless they are different indices of a twist, 0..5, and at least one."""
-    chosen = [int(row) for row in rows]
+    try:
+        chosen = [int(row) for row in rows]
+        whole = all(row == given for row, given in zip(chosen, rows, strict=True))
+    except (TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise ModelError(f"rows must be a list of the twist rows 0..5, not {rows!r}")
     if not chosen:
         raise ModelError("rows is empty; a task fixes at least one of the twist rows 0..5")
     if len(set(chosen)) < len(chosen):
@@ -162,6 +171,27 @@ class FixedBase:
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """As jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
+
+
+def with_tip(
+    machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
+) -> Machine:
+    """The same machine with another frame of interest: one fixed in any of its links, the root included.
+
+    Args:
+        machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.
+        link: Name of the link that carries the frame.
+        translation: The frame's origin in the link's frame. Shape (3,), m.
+        rotation: The frame's axes, as columns, in the link's frame. Shape (3, 3); parallel if None.
+
+    Raises:
+        ModelError: Unknown link, wrong sizes, a machine that is no such dataclass.
+    """
+    if not is_dataclass(machine) or "robot" not in {part.name for part in fields(machine)}:
+        raise ModelError(f"{type(machine).__name__} is no dataclass with a field 'robot': its tip cannot be moved")
+    turn = np.eye(3) if rotation is None else rotation
+    robot = replace(machine.robot, tip=link, tip_translation=translation, tip_rotation=turn)
+    return cast(Machine, replace(machine, robot=robot))
 
 
 def require_joints(robot: Robot) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from models.errors import ModelError
-from models.kinematics import Placement, frames_and_axes, joint_vector
+from models.kinematics import Placement, checked_vector, frames_and_axes, joint_vector
 from models.parts import Link
 from models.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars
@@ -122,12 +122,23 @@ def motions_of(
     axes: dict[str, tuple[Expression, Expression]],
     qd: Expression,
     qdd: Expression,
+    base_twist: Expression | None = None,
+    base_acceleration: Expression | None = None,
 ) -> dict[str, LinkMotion]:
-    """Outward recursion over the origins of the link frames, then from these to the centres of mass."""
+    """Outward recursion over the origins of the link frames, then from these to the centres of mass.
+
+    The root link's frame may move: (angular, of its origin) velocity and acceleration, shape (6, 1), world axes.
+    """
     qd, qdd = joint_vector(robot, qd, "qd"), joint_vector(robot, qdd, "qdd")
-    rest: Expression = ca.DM(3, 1)
+    meaning = "angular, then of the origin of the root link's frame"
+    twist, push = (
+        ca.DM(6, 1) if given is None else checked_vector(given, 6, what, meaning)
+        for given, what in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
+    )
     # of the frame's origin: velocity, acceleration, angular velocity, angular acceleration
-    origin = {robot.root: (rest, rest, rest, rest)}
+    origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {
+        robot.root: (twist[3:6], push[3:6], twist[0:3], push[0:3])
+    }
     column = 0
     for joint in robot.joints:
         velocity, acceleration, spin, turning = origin[joint.parent]

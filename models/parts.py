@@ -8,10 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from models.errors import ModelError
+from models.spatial import rotation
 
 Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
 Array: TypeAlias = NDArray[np.float64]
@@ -31,6 +33,7 @@ class Link:
         mass: kg, not negative.
         center_of_mass: In the link frame. Shape (3,), m.
         inertia: About the centre of mass, in link axes. Shape (3, 3), kg m^2.
+        any_inertia: Take an inertia that no body has, as some robot descriptions give. It must still be symmetric.
 
     Raises:
         ModelError: Negative or non-finite mass, wrong sizes, an inertia that no mass distribution has (not
@@ -41,6 +44,7 @@ class Link:
     mass: float = 0.0
     center_of_mass: ArrayInput = (0.0, 0.0, 0.0)
     inertia: ArrayInput = field(default_factory=lambda: np.zeros((3, 3)))
+    any_inertia: bool = False
 
     def __post_init__(self) -> None:
         owner = f"link {self.name!r}"
@@ -48,7 +52,7 @@ class Link:
         if mass < 0:
             raise ModelError(f"{owner}: mass {mass} kg is negative")
         inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
-        _check_inertia(inertia, owner)
+        _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
         object.__setattr__(self, "inertia", frozenchecked_array((inertia + inertia.T) / 2))
@@ -123,6 +127,25 @@ class Joint:
         """Whether the joint has a degree of freedom."""
         return self.kind != "fixed"
 
+    def placed(self, position: float) -> tuple[Array, Array]:
+        """Placement of the child link in the parent link at a joint position (rad or m): rotation, translation."""
+        turn, shift = self.rotation, self.translation
+        if self.kind == "prismatic":
+            return turn, shift + position * (turn @ self.axis)
+        return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift
+
+    def locked(self, position: float) -> Joint:
+        """The joint held fixed at a position (rad or m), which may lie outside its limits.
+
+        Raises:
+            ModelError: The joint is fixed already, or the position is not finite.
+        """
+        if not self.moves:
+            raise ModelError(f"joint {self.name!r} is fixed; only a joint that moves can be locked")
+        held = checked_array(position, (), f"joint {self.name!r}", "locked position").item()
+        turn, shift = self.placed(held)
+        return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
+
 
 def frozenchecked_array(array: Array) -> Array:
     array.setflags(write=False)
@@ -157,10 +180,12 @@ def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     return matrix
 
 
-def _check_inertia(inertia: Array, owner: str) -> None:
+def _check_inertia(inertia: Array, owner: str, lenient: bool) -> None:
     slack = INERTIA_TOLERANCE * float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > slack:
         raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric")
+    if lenient:
+        return
     least, middle, greatest = np.linalg.eigvalsh((inertia + inertia.T) / 2)
     if least < -slack:
         raise ModelError(f"{owner}: inertia has the negative principal moment {least:g} kg m^2")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -9,7 +11,8 @@ import numpy as np
 
 from models.errors import ModelError
 from models.parts import Array, ArrayInput, Joint, Link, checked_array, checked_rotation
-from models.tree import find_root, require_unique, tree_order
+from models.tree import absent, find_root, require_unique, reroot, tree_order
+from models.urdf import InertiaRule, MimicRule, Source, held_by_mimicry, read_urdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +25,7 @@ class Robot:
         tip: Name of the link that carries the tip; the only leaf when not given.
         tip_translation: Tip frame's origin in the tip link's frame. Shape (3,), m.
         tip_rotation: Tip frame's axes, as columns, in the tip link's frame. Shape (3, 3).
+        name: What the robot is called in texts.
         root: Name of the link without a parent, the base.
 
     Raises:
@@ -33,6 +37,7 @@ class Robot:
     tip: str | None = None
     tip_translation: ArrayInput = (0.0, 0.0, 0.0)
     tip_rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    name: str = "robot"
     root: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -53,13 +58,59 @@ class Robot:
         names = [link.name for link in self.links]
         if self.tip is not None:
             if self.tip not in names:
-                raise ModelError(f"tip link {self.tip!r} does not exist; the links are {sorted(names)}")
+                raise absent("tip link", self.tip, names)
             return self.tip
         parents = {joint.parent for joint in self.joints}
         leaves = [name for name in names if name not in parents]
         if len(leaves) > 1:
-            raise ModelError(f"the tree has the leaves {leaves}; say which carries the tip: Robot(..., tip=name)")
+            raise ModelError(f"the tree has the leaves {leaves}; say which carries the tip: tip=name")
         return leaves[0]
+
+    @classmethod
+    def from_urdf(
+        cls,
+        source: Source,
+        *,
+        tip: str | None = None,
+        root: str | None = None,
+        tip_translation: ArrayInput = (0.0, 0.0, 0.0),
+        tip_rotation: ArrayInput = None,
+        lock: Mapping[str, float] | None = None,
+        mimic: MimicRule = "error",
+        inertia: InertiaRule = "error",
+    ) -> Robot:
+        """The robot of a URDF description, see `models.urdf.read_urdf` for what is read and what has which default.
+
+        Args:
+            source: The text, recognised by its first character "<", or the path of a file.
+            tip: Link that carries the tip; needed where the tree has several leaves.
+            root: Link to hang the tree up at, the base of the robot; the root of the file if None. Links keep their
+                frames, joints their names, limits and signs, see `models.tree.reroot`.
+            tip_translation: As of Robot.
+            tip_rotation: As of Robot; no turn if None.
+            lock: Joints to hold fixed at given positions (rad or m), by name.
+            mimic: Joints that follow one that is locked or fixed are held with it. The other followers: refuse them
+                ("error"), hold each where it is when the joint that it follows is at 0 ("lock"), or take them as
+                independent ("free").
+            inertia: What to do about an inertia that no body can have: refuse it ("error") or take it "as_given".
+
+        Raises:
+            ModelError: What read_urdf, Robot and `models.rebuild.locked` refuse.
+        """
+        found = read_urdf(source, inertia=inertia)
+        held = dict(lock or {})
+        moving = {joint.name: joint for joint in found.joints}
+        for name in held:
+            if name not in moving:
+                raise absent("joint", name, moving)
+        held |= held_by_mimicry(found.joints, found.mimics, held, mimic)
+        joints = tuple(joint.locked(held[joint.name]) if joint.name in held else joint for joint in found.joints)
+        links = found.links
+        if root is not None:
+            whole = cls(links, joints, tip=links[0].name)  # says what is wrong with the tree before it is turned round
+            links, joints = reroot(links, joints, whole.root, root)
+        turn = np.eye(3) if tip_rotation is None else tip_rotation
+        return cls(links, joints, tip, tip_translation, turn, found.name)
 
     @cached_property
     def moving_joints(self) -> tuple[Joint, ...]:
@@ -101,45 +152,75 @@ class Robot:
         """Greatest torques or forces of the moving joints. Shape (dof,), N m or N."""
         return np.array([joint.effort for joint in self.moving_joints], dtype=float)
 
+    @cached_property
+    def _links_by_name(self) -> dict[str, Link]:
+        return {link.name: link for link in self.links}
+
+    @cached_property
+    def _joints_by_name(self) -> dict[str, Joint]:
+        return {joint.name: joint for joint in self.joints}
+
+    @cached_property
+    def _joint_above(self) -> dict[str, Joint]:
+        return {joint.child: joint for joint in self.joints}
+
     def link(self, name: str) -> Link:
-        """The link of that name; ModelError when there is none."""
-        for link in self.links:
-            if link.name == name:
-                return link
-        raise ModelError(f"link {name!r} does not exist; the links are {[link.name for link in self.links]}")
+        """The link of that name; ModelError, which says what names come near, when there is none."""
+        if name not in self._links_by_name:
+            raise absent("link", name, self._links_by_name)
+        return self._links_by_name[name]
+
+    def joint(self, name: str) -> Joint:
+        """The joint of that name, moving or fixed; ModelError, as for a link, when there is none."""
+        if name not in self._joints_by_name:
+            raise absent("joint", name, self._joints_by_name)
+        return self._joints_by_name[name]
 
     def path_to(self, name: str) -> tuple[Joint, ...]:
         """Joints from the root to a link, root first; ModelError when there is no such link."""
         self.link(name)
-        joint_above = {joint.child: joint for joint in self.joints}
         path: list[Joint] = []
         while name != self.root:
-            path.append(joint_above[name])
+            path.append(self._joint_above[name])
             name = path[-1].parent
         return tuple(reversed(path))
 
+    def print(self) -> None:
+        """Print the tree with masses and limits, which is also `str(robot)`. A limit that is not there is not shown."""
+        print(self)
+
     def __str__(self) -> str:
-        head = (
-            f"robot of {len(self.links)} links, {self.dof} degrees of freedom, "
-            f"{self.total_mass:g} kg, tip on {self.tip}"
-        )
-        return "\n".join([head, self._describe(self.root), *self._branches(self.root, "")])
+        lines = [
+            f"{self.name} of {len(self.links)} links, {self.dof} degrees of freedom, "
+            f"{self.total_mass:g} kg, tip on {self.tip}",
+            f"{self.root}  {self.link(self.root).mass:g} kg",
+        ]
+        below = defaultdict(list)
+        for joint in self.joints:
+            below[joint.parent].append(joint)
+        waiting = [(joint, "") for joint in reversed(below[self.root])]
+        while waiting:
+            joint, indent = waiting.pop()
+            last = joint is below[joint.parent][-1]
+            lines.append(
+                f"{indent}{'└─' if last else '├─'} {joint.name} ({_limits(joint)}) -> {joint.child}  "
+                f"{self.link(joint.child).mass:g} kg"
+            )
+            indent += "   " if last else "│  "
+            waiting += [(each, indent) for each in reversed(below[joint.child])]
+        return "\n".join(lines)
 
-    def _describe(self, name: str) -> str:
-        return f"{name}  {self.link(name).mass:g} kg"
 
-    def _branches(self, name: str, indent: str) -> list[str]:
-        lines = []
-        below = [joint for joint in self.joints if joint.parent == name]
-        for joint in below:
-            last = joint is below[-1]
-            text = f"{joint.name} ({joint.kind}"
-            if joint.moves:
-                unit = "m" if joint.kind == "prismatic" else "rad"
-                text += f", {joint.lower:g} .. {joint.upper:g} {unit}, {joint.velocity:g} {unit}/s"
-            lines.append(f"{indent}{'└─' if last else '├─'} {text}) -> {self._describe(joint.child)}")
-            lines += self._branches(joint.child, indent + ("   " if last else "│  "))
-        return lines
+def _limits(joint: Joint) -> str:
+    unit, push = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
+    parts: list[str] = [joint.kind]
+    if np.isfinite([joint.lower, joint.upper]).any() and joint.moves:
+        parts.append(f"{joint.lower:g} .. {joint.upper:g} {unit}")
+    if np.isfinite(joint.velocity) and joint.moves:
+        parts.append(f"{joint.velocity:g} {unit}/s")
+    if np.isfinite(joint.effort) and joint.moves:
+        parts.append(f"{joint.effort:g} {push}")
+    return ", ".join(parts)
 
 
 def planar_chain(

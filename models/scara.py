@@ -25,6 +25,9 @@ from models.spatial import Expression, Frame, expression, rotation
 __all__ = ["Elbow", "Scara"]
 
 Elbow: TypeAlias = Literal["left", "right"]
+QUILL = 2
+SLACK = 1e-9
+"""Joint limits are exceeded beyond this, rad or m: rounding is not."""
 ROUNDING = 1e-12
 """Reaches beyond the boundary by no more than this, relative, are on it."""
 
@@ -44,7 +47,7 @@ class Scara:
         names: Of the joints.
 
     Raises:
-        ModelError: A length that is not positive, limits that are nan or out of order.
+        ModelError: A length that is not positive, limits that are nan or out of order, names that are not four.
     """
 
     upper_arm: float
@@ -63,6 +66,8 @@ class Scara:
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
         for what in ("lower", "upper"):
             object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
+        if len(self.names) != 4 or len(set(self.names)) != 4:
+            raise ModelError(f"scara: joint names {list(self.names)} must be four that differ")
         for name, low, high in zip(self.names, self.lower, self.upper, strict=True):
             if low > high:
                 raise ModelError(f"scara: joint {name!r} has its lower limit {low:g} above its upper limit {high:g}")
@@ -101,11 +106,14 @@ class Scara:
         return Frame(rotation((0, 0, 1), bend + q[3]), ca.DM(self.mount) + ca.vertcat(x, y, q[2]))
 
     def inverse(self, position: ArrayInput, yaw: float = 0.0, elbow: Elbow = "left") -> Array:
-        """Joints that put the tool at a point with a yaw, shoulder and elbow within (-pi, pi]. Shape (4,).
+        """Joints that put the tool at a point with a yaw. Shape (4,).
+
+        Shoulder and elbow are within (-pi, pi] and wrist = yaw - shoulder - elbow, but for whole turns where only they
+        keep a limit. At both ends of the reach the elbows agree; on the shoulder axis the shoulder is arbitrary.
 
         Args:
             position: In world. Shape (3,), m.
-            yaw: Of the tool about the world's z, rad; wrist = yaw - shoulder - elbow.
+            yaw: Of the tool about the world's z, rad.
             elbow: "left" bends the elbow counter-clockwise (q2 >= 0), "right" clockwise.
 
         Raises:
@@ -115,13 +123,32 @@ class Scara:
         angle = checked_array(yaw, (), "scara", "yaw").item()
         self.check_reach(float(np.hypot(*(point - self.mount)[:2])), f"point {point.tolist()} m")
         q = np.array(ca.DM(self.inverse_expression(np.append(point, angle), elbow))).ravel()
-        for name, value, low, high in zip(self.names, q, self.lower, self.upper, strict=True):
-            if not low <= value <= high:
+        for joint, name in enumerate(self.names):
+            turn = self.whole_turn(joint, q[joint], q[joint])
+            if turn is None:
                 raise ModelError(
-                    f"scara: point {point.tolist()} m needs joint {name!r} at {value:g}, outside its limits {low:g} .. "
-                    f"{high:g}; take the other elbow, another yaw or another point"
+                    f"scara: point {point.tolist()} m needs joint {name!r} at {q[joint]:g}, outside its limits "
+                    f"{self.lower[joint]:g} .. {self.upper[joint]:g}; take the other elbow, another yaw or point"
                 )
+            q[joint] += turn
         return q
+
+    def whole_turn(self, joint: int, least: float, most: float) -> float | None:
+        """Smallest multiple of 2 pi that brings a joint's range within its limits (to 1e-9), always 0 for the quill.
+
+        None if there is none.
+
+        Args:
+            joint: Index.
+            least, most: The range, rad or m.
+        """
+        low, high, full = float(self.lower[joint]), float(self.upper[joint]), 2 * np.pi
+        turn = 0.0
+        if joint != QUILL and least < low - SLACK:
+            turn = full * float(np.ceil((low - SLACK - least) / full))
+        elif joint != QUILL and most > high + SLACK:
+            turn = -full * float(np.ceil((most - high - SLACK) / full))
+        return turn if low - SLACK <= least + turn and most + turn <= high + SLACK else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
         """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).

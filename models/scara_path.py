@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -98,7 +99,8 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
         s, q = np.insert(s, wide + 1, middle), np.insert(q, wide + 1, raw(middle), axis=0)
     for joint in (0, 1, 3):
         q[:, joint] = np.unwrap(q[:, joint])
-    return ScaraPath(scara, path, elbow, rates, (s, q), _turns(scara, s, q))
+    along = ScaraPath(scara, path, elbow, rates, (s, q), np.zeros(4))
+    return replace(along, turns=_turns(along))
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
@@ -120,22 +122,27 @@ def _continuous(q: Array, s: Array, table_s: Array, table_q: Array) -> Array:
     return q
 
 
-def _turns(scara: Scara, s: Array, q: Array) -> Array:
+def _turns(along: ScaraPath) -> Array:
     """Whole turns to add to the joints so that they keep their limits. Shape (4,)."""
-    turns = np.zeros(4)
+    turns, scara, (s, q) = np.zeros(4), along.scara, along.table
     for joint, name in enumerate(scara.names):
         low, high = float(scara.lower[joint]), float(scara.upper[joint])
-        choices = (0.0,) if joint == 2 else (0.0, 2 * np.pi, -2 * np.pi, 4 * np.pi, -4 * np.pi)
-        least, most = float(q[:, joint].min()), float(q[:, joint].max())
-        fitting = [turn for turn in choices if low <= least + turn and most + turn <= high]
-        if not fitting:
-            beyond = np.maximum(low - q[:, joint], q[:, joint] - high)
-            at = int(beyond.argmax())
+        if np.isneginf(low) and np.isposinf(high):
+            continue
+
+        def one(places: Array, joint: int = joint) -> Array:
+            return along.at(places).position[:, joint]
+
+        ends = [_extreme(one, s, q[:, joint], sign) for sign in (-1.0, 1.0)]
+        least, most = ends[0][1], ends[1][1]
+        turn = scara.whole_turn(joint, least, most)
+        if turn is None:
+            at, value = max(ends, key=lambda end: max(low - end[1], end[1] - high))
             raise ModelError(
-                f"scara: joint {name!r} goes from {least:g} to {most:g} along the path, at {q[at, joint]:g} at "
-                f"{s[at]:g} m, outside its limits {low:g} .. {high:g}; take the other elbow or move the path"
+                f"scara: joint {name!r} goes from {least:g} to {most:g} along the path, at {value:g} at "
+                f"{at:g} m, outside its limits {low:g} .. {high:g}; take the other elbow or move the path"
             )
-        turns[joint] = fitting[0]
+        turns[joint] = turn
     return turns
 
 
@@ -143,39 +150,45 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
     if not (np.isfinite(clearance) and clearance >= 0):
         raise ModelError(f"scara: clearance {clearance!r} m must not be negative")
     s = path.dense(8, 32)
-    for sign, bound, arm in ((1.0, scara.outer, "stretched"), (-1.0, scara.inner, "folded")):
-        at, radius = _extreme(scara, path, s, sign)
-        where = f"path at {at:g} m, {path.at([at]).position[0].tolist()} m,"
-        scara.check_reach(radius, where)
-        if sign * (bound - radius) < clearance:
-            what = "the singular column about the shoulder axis" if sign < 0 else "its greatest reach"
-            raise ModelError(
-                f"scara: {where} passes {abs(bound - radius):.3g} m from {what}, where the {arm} arm is singular and "
-                f"joint rates grow without bound; keep {clearance:g} m away or lower the clearance"
-            )
-
-
-def _extreme(scara: Scara, path: SmoothPath, s: Array, sign: float) -> tuple[float, float]:
-    """Place and size of the largest (sign 1) or smallest (-1) distance from the shoulder axis, between samples too."""
 
     def radius(places: Array) -> Array:
         return np.asarray(np.linalg.norm((path.at(places).position - scara.mount)[:, :2], axis=1))
 
     r = radius(s)
-    padded = np.concatenate([[-np.inf], sign * r, [-np.inf]])
+    for sign, bound, arm in ((1.0, scara.outer, "stretched"), (-1.0, scara.inner, "folded")):
+        at, extreme = _extreme(radius, s, r, sign)
+        where = f"path at {at:g} m, {path.at([at]).position[0].tolist()} m,"
+        scara.check_reach(extreme, where)
+        if sign * (bound - extreme) < clearance:
+            what = "the singular column about the shoulder axis" if sign < 0 else "its greatest reach"
+            raise ModelError(
+                f"scara: {where} passes {abs(bound - extreme):.3g} m from {what}, where the {arm} arm is singular and "
+                f"joint rates grow without bound; keep {clearance:g} m away or lower the clearance"
+            )
+
+
+def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
+    """Place and size of the largest (sign 1) or smallest (-1) value of a function of the distance, between samples too.
+
+    Args:
+        function: Of distances, shape (M,) to (M,).
+        s, values: Samples that resolve it. Shape (K,).
+        sign: 1 or -1.
+    """
+    padded = np.concatenate([[-np.inf], sign * values, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
-    # the radius changes by no more than the distance does: only peaks that may win are refined
-    step = np.diff(s).max()
-    peaks = peaks[sign * r[peaks] >= (sign * r).max() - step]
-    best = (float(s[peaks[0]]), float(r[peaks[0]]))
+    # a peak that the samples resolve rises above them by less than they differ from their neighbours
+    change = np.pad(np.abs(np.diff(values)), 1)
+    peaks = peaks[sign * values[peaks] + (change[:-1] + change[1:])[peaks] >= (sign * values).max()]
+    best = (float(s[peaks[0]]), float(values[peaks[0]]))
     low, high = s[np.maximum(peaks - 1, 0)], s[np.minimum(peaks + 1, len(s) - 1)]
     fractions = np.linspace(0, 1, 17)
     for _ in range(9):
         places = low[:, None] + (high - low)[:, None] * fractions
-        values = sign * radius(places.ravel()).reshape(places.shape)
-        top = values.argmax(axis=1)
+        inside = sign * function(places.ravel()).reshape(places.shape)
+        top = inside.argmax(axis=1)
         row = np.arange(len(top))
-        k = int(values[row, top].argmax())
-        best = (float(places[k, top[k]]), float(sign * values[k, top[k]]))
+        k = int(inside[row, top].argmax())
+        best = max(best, (float(places[k, top[k]]), float(sign * inside[k, top[k]])), key=lambda pair: sign * pair[1])
         low, high = places[row, np.maximum(top - 1, 0)], places[row, np.minimum(top + 1, 16)]
     return best

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 Expression = Any
-"""A casadi SX, MX or DM, or whatever numpy reads as an array of floats."""
+"""A casadi SX, MX or DM, whatever numpy reads as an array of floats, or a (nested) list with casadi entries."""
 
 _Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
@@ -38,21 +38,45 @@ class Frame(NamedTuple):
 
 
 def expression(value: Expression) -> Expression:
-    """`value` itself if it is a casadi matrix, else a DM without its exact zeros; vectors become columns."""
+    """`value` itself if it is a casadi matrix, else a DM without its exact zeros; vectors become columns.
+
+    Lists, tuples and arrays with casadi entries are stacked: the entries below each other, inner lists side by side.
+    """
     if isinstance(value, ca.SX | ca.MX | ca.DM):
         return value
+    if has_expressions(value):  # numpy would read a symbol as nan
+        rows = [ca.horzcat(*map(expression, row)) if _is_sequence(row) else expression(row) for row in value]
+        return ca.vertcat(*rows)
     return ca.sparsify(ca.DM(np.asarray(value, dtype=float)))
+
+
+def has_expressions(value: Any) -> bool:
+    """Whether a list, tuple or array has a casadi matrix among its entries, at any depth."""
+    if not _is_sequence(value):
+        return False
+    return any(isinstance(entry, ca.SX | ca.MX | ca.DM) or has_expressions(entry) for entry in value)
+
+
+def _is_sequence(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and value.ndim > 0
+    return isinstance(value, list | tuple)
 
 
 def on_scalars(function: _Callable) -> _Callable:
     """Let a function written element by element take MX arguments through one call of its SX form.
 
     Element-wise MX graphs are slow to build and to run. When an argument is MX, the function is evaluated on
-    SX symbols of the same sparsity and the result is called; other arguments pass through untouched.
+    SX symbols of the same sparsity and the result is called; other arguments pass through untouched. A plain list of
+    scalars with MX entries counts as the MX column it stands for.
     """
+
+    def column(value: Any) -> Any:
+        return expression(value) if isinstance(value, list) and has_expressions(value) else value
 
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        args, kwargs = tuple(map(column, args)), {name: column(value) for name, value in kwargs.items()}
         given = [value for value in (*args, *kwargs.values()) if isinstance(value, ca.MX)]
         if not given:
             return function(*args, **kwargs)

@@ -19,7 +19,8 @@ from models.errors import ModelError
 from models.kinematics import checked_vector
 from models.machine import FixedBase
 from models.parts import Array, ArrayInput, checked_array
-from models.robot import planar_chain
+from models.rebuild import simplified
+from models.robot import Robot, planar_chain
 from models.spatial import Expression, expression
 from models.support import Support, rectangle
 
@@ -99,11 +100,23 @@ class Standing(FixedBase):
         """Shape (3,), m/s^2."""
         return np.array([0.0, 0.0, -self.gravity])
 
+    def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
+        """The robot with one link for each moving joint, and those on which wrenches act: the same dynamics, sooner."""
+        keep = frozenset(self.robot.link(wrench.link).name for wrench in wrenches)
+        if keep not in self._bodies:
+            self._bodies[keep] = simplified(self.robot, keep)
+        return self._bodies[keep]
+
+    @cached_property
+    def _bodies(self) -> dict[frozenset[str], Robot]:
+        return {}
+
     def ground_reaction(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """What the ground does to the foot: (moment about the world's origin, force). Shape (6, 1), N m and N."""
-        return base_reaction(self.robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+        robot = self.bodies(wrenches)
+        return base_reaction(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
@@ -118,7 +131,8 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
-        return inverse_dynamics(self.robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+        robot = self.bodies(wrenches)
+        return inverse_dynamics(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
 
     def stability_index(self, point: Expression) -> Expression:
         """1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
@@ -158,12 +172,35 @@ class Standing(FixedBase):
         return ca.Function("zmp_rows", [q, qd, point, outside], outputs, {"cse": True})
 
     @cached_property
-    def moving_axes(self) -> tuple[int, ...]:
-        """Which coordinates of the zero moment point motion can change: (0, 1), or one of them if planar."""
+    def _reached(self) -> Array:
+        """Zero moment points of a few motions without wrenches. Shape (5, 2), m."""
         rng = np.random.default_rng(0)
         points = [ca.DM(self.zero_moment_point(*rng.normal(size=(3, self.joint_size)))) for _ in range(5)]
-        spread = np.ptp(np.array([np.array(point).ravel() for point in points]), axis=0)
-        return tuple(axis for axis in (0, 1) if spread[axis] > 1e-9)
+        return np.array([np.array(point).ravel() for point in points])
+
+    @cached_property
+    def moving_directions(self) -> Array:
+        """Directions on the ground in which motion can move the zero moment point, orthonormal. Shape (k, 2).
+
+        Both axes for k = 2; one direction for a machine that moves in a vertical plane, whichever plane that is.
+        """
+        _, sizes, directions = np.linalg.svd(self._reached - self._reached.mean(axis=0))
+        count = int((sizes > 1e-9 * max(1.0, sizes[0])).sum())
+        if count == 2:
+            return np.eye(2)
+        found = np.where(np.abs(directions[:count]) < 1e-9, 0.0, directions[:count])
+        return np.asarray(found * np.sign(found[np.arange(count), np.abs(found).argmax(axis=1)])[:, None])
+
+    @property
+    def moving_axes(self) -> tuple[int, ...]:
+        """Which coordinates of the zero moment point motion can change: (0, 1), or one of them, or none."""
+        return tuple(axis for axis in (0, 1) if self.moving_directions[:, axis].any())
+
+    def nearest_reachable(self, point: ArrayInput) -> Array:
+        """The place nearest to `point` to which motion alone can move the zero moment point. Shape (2,), m."""
+        given = checked_array(point, (2,), "standing machine", "point")
+        along = self.moving_directions.T @ self.moving_directions
+        return np.asarray(along @ given + (np.eye(2) - along) @ self._reached.mean(axis=0))
 
     def tip_wrench(self, force: Expression, moment: Expression = (0.0, 0.0, 0.0)) -> Wrench:
         """A force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""

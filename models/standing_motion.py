@@ -9,7 +9,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.dynamics import inverse_dynamics
 from models.errors import ModelError
 from models.kinematics import center_of_mass
 from models.parts import Array, ArrayInput
@@ -188,10 +187,10 @@ def _motion_function(machine: Standing, external: External | None, rows: Sequenc
     point = center_of_pressure(reaction)
     outside: Any = sum((ca.densify(wrench.force) for wrench in wrenches), start=ca.DM.zeros(3))
     outputs = {
-        "joint_torques": inverse_dynamics(robot, q, qd, qdd, wrenches, machine.gravity_in_world, placement),
+        "joint_torques": machine.joint_torques(q, qd, qdd, wrenches),
         "tip_in_world": tip,
         "external_force": outside,
-        "center_of_mass": center_of_mass(robot, q, placement),
+        "center_of_mass": center_of_mass(machine.bodies(), q, placement),
         "ground_force": reaction[3:6],
         "zero_moment_point": point,
         "index": machine.stability_index(point),

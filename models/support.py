@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import casadi as ca
 import numpy as np
@@ -75,6 +76,20 @@ class Support:
     def half_widths(self) -> Array:
         """Half the sides of the bounding box. Shape (2,), m."""
         return np.asarray(np.ptp(self.vertices, axis=0)) / 2
+
+    @cached_property
+    def inner_radius(self) -> float:
+        """Radius of the largest circle inside, m: the largest margin that any point has."""
+        offsets = (self.normals * self.vertices).sum(axis=1)
+        best = 0.0
+        for chosen in combinations(range(len(offsets)), 3):  # it touches three edges (two parallel ones and another)
+            edges = list(chosen)
+            system = np.column_stack([self.normals[edges], -np.ones(3)])
+            if abs(np.linalg.det(system)) > FLAT:
+                *point, radius = np.linalg.solve(system, offsets[edges])
+                if (self.normals @ point - offsets >= radius - FLAT).all():
+                    best = max(best, float(radius))
+        return best
 
     @cached_property
     def normals(self) -> Array:

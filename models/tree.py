@@ -1,11 +1,29 @@
-"""Order of a kinematic tree: which link is the root, which joint comes first."""
+"""Order of a kinematic tree: which link is the root, which joint comes first; and the same tree from another root."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+
+import numpy as np
 
 from models.errors import ModelError
+from models.parts import Joint, Link
+
+MANY = 12
+"""More names than these are not listed in full in a message."""
+
+
+def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
+    """The error that says a name does not exist and which ones come near it."""
+    names = list(known)
+    folded = {each.casefold(): each for each in reversed(names)}
+    near = [folded[each] for each in get_close_matches(str(name).casefold(), folded, n=3, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(repr(each) for each in near)}? " if near else ""
+    listed = f"{names[:MANY]} and {len(names) - MANY} more" if len(names) > MANY else f"{names}"
+    return ModelError(f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}")
 
 
 def require_unique(names: Iterable[str], what: str) -> None:
@@ -32,7 +50,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
     for joint, parent, child in edges:
         for role, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise ModelError(f"joint {joint!r}: {role} link {link!r} does not exist; the links are {sorted(known)}")
+                raise absent(f"joint {joint!r}: {role} link", link, links)
         if parent == child:
             raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop")
         if child in parent_joint:
@@ -59,13 +77,59 @@ def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
     Raises:
         ModelError: Some links form a loop that the root does not reach.
     """
-    reached, order, waiting = {root}, [], list(range(len(edges)))
-    while waiting:
-        ready = next((i for i in waiting if edges[i][1] in reached), None)
-        if ready is None:
-            names = [edges[i][0] for i in waiting]
-            raise ModelError(f"joints {names} form a loop that is not connected to the root link {root!r}")
-        waiting.remove(ready)
-        reached.add(edges[ready][2])
-        order.append(ready)
+    below = defaultdict(list)
+    for i, (_, parent, _) in enumerate(edges):
+        below[parent].append(i)
+    order: list[int] = []
+    ready = below[root][::]
+    while ready:
+        first = min(ready)
+        ready.remove(first)
+        ready += below[edges[first][2]]
+        order.append(first)
+    if len(order) < len(edges):
+        names = [edges[i][0] for i in sorted(set(range(len(edges))) - set(order))]
+        raise ModelError(f"joints {names} form a loop that is not connected to the root link {root!r}")
     return order
+
+
+def reroot(
+    links: Sequence[Link], joints: Sequence[Joint], old: str, new: str
+) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
+    """The tree of root `old` hung up at the link `new`.
+
+    Joints between the two change direction. Every link keeps its frame, and every joint its name, limits and the sign
+    of its position: a moving joint J now carries a massless link "J_frame" at the joint's frame, on which the former
+    parent is fixed by a joint "J_fixed". (Where parent and joint frame coincide, J carries the parent itself.)
+
+    Raises:
+        ModelError: The new root is no link; a name that is needed is taken.
+    """
+    names = [link.name for link in links]
+    if new not in names:
+        raise absent("root link", new, names)
+    above = {joint.child: joint for joint in joints}
+    turned: dict[str, list[Joint]] = {}
+    frames: list[Link] = []
+    while new != old:
+        joint = above[new]
+        turn, shift = joint.rotation, joint.translation
+        back = {"rotation": turn.T, "translation": -turn.T @ shift}
+        together = not shift.any() and np.array_equal(turn, np.eye(3))
+        at_origin = {"rotation": np.eye(3), "translation": np.zeros(3), "axis": -joint.axis}
+        if not joint.moves:
+            turned[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **back)]
+        elif together:
+            turned[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **at_origin)]
+        else:
+            frame = Link(f"{joint.name}_frame")
+            frames.append(frame)
+            turned[joint.name] = [
+                replace(joint, parent=joint.child, child=frame.name, **at_origin),
+                Joint(f"{joint.name}_fixed", "fixed", frame.name, joint.parent, **back),
+            ]
+        new = joint.parent
+    result = [each for joint in joints for each in turned.get(joint.name, [joint])]
+    require_unique((*names, *(frame.name for frame in frames)), "link")
+    require_unique((joint.name for joint in result), "joint")
+    return (*links, *frames), tuple(result)

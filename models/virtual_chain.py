@@ -59,8 +59,14 @@ class VirtualChain:
         The joints keep the order of `machine.robot.joint_names`; a planar base keeps its coordinates (x, y, angle).
 
         Raises:
-            ModelError: A branch with a joint of its own, a tip that the last joint does not carry.
+            ModelError: A branch with a joint of its own, a tip that the last joint does not carry, a momentum that is
+                not zero.
         """
+        if np.any(machine.conserved_momentum):
+            raise ModelError(
+                f"virtual chain: the machine carries the momentum {np.asarray(machine.conserved_momentum).tolist()}, "
+                "but (24) and what follows from it hold for zero momentum only"
+            )
         axes = [3, 4, 2] if machine.base == "planar" else [3, 4, 5, 0, 1, 2]
         base, joints, bodies, X_tip = _serial_bodies(machine.robot)
         massless = [np.zeros((6, 6))] * (len(axes) - 1)

@@ -10,6 +10,7 @@ from ocp.refine import refine
 from ocp.shooting import MultipleShooting
 from ocp.solution import Solution
 from ocp.solve import prepare, solve
+from ocp.tighten import tighten
 
 __all__ = [
     "Audit",
@@ -28,4 +29,5 @@ __all__ = [
     "prepare",
     "refine",
     "solve",
+    "tighten",
 ]

@@ -102,7 +102,7 @@ def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequen
         raise ProblemError(f"unknown law {law!r}; use one of {', '.join(get_args(Law))}")
     if not (np.isfinite(damping) and damping >= 0):
         raise ProblemError(f"null_damping must be a finite number, zero or above, not {damping!r}")
-    axes = len(machine.moving_axes)
+    axes = len(machine.moving_directions)
     tasks = {"the tip": len(rows), "the zero moment point": 0 if law == "pseudo_inverse" else axes}
     tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
     tasks |= {"the assigned layers": sum(layer.form == "assigned" for layer in layers)}
@@ -135,11 +135,11 @@ def accelerations(
             ``null_space``: the zero moment point in the null space of the task, (21)-(22). ``stabilised``: as
             augmented, with the centre of mass commanded in their null space.
         time, q, qd: Symbols of one kind.
-        zmp: Where the zero moment point is to be, (x, y) of the time, m.
+        zmp: Where the zero moment point is to be, (x, y) of the time, m, in the directions in which motion moves it.
         layers: Applied in this order after the law.
         null_damping: Of the joint velocities in the freedom that is left at last, 1/s.
     """
-    chosen, axes = list(rows), list(machine.moving_axes)
+    chosen, directions = list(rows), ca.DM(machine.moving_directions)
     tip = machine.tip_pose((), q).position
     wrenches = tuple(external(time, tip)) if external is not None else ()
     jacobian = ca.densify(machine.tip_jacobian((), q))[chosen, :]
@@ -147,7 +147,7 @@ def accelerations(
     task = path_derivatives(tip_path, time, len(chosen))[2] - bias
     place = zmp(time)
     zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
-    balance, needed = zmp_rows.jacobian[axes, :], zmp_rows.needed(qd)[axes]
+    balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
 
     stack = _Stack(machine.joint_size)
     if law in ("pseudo_inverse", "null_space"):
@@ -187,7 +187,6 @@ def _upright(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, 
     `right` is C of (18), minus the moment of weight and wrenches over the place: it vanishes for a centre of mass
     at y*, and C / (M g) is how far the centre of mass is beyond y*, with its sign turned.
     """
-    axes = list(machine.moving_axes)
     a, b, c = gains.poles
     k2, k1, k0 = a + b + c, a * b + b * c + c * a, a * b * c / machine.weight
     rest = ca.DM.zeros(machine.joint_size)
@@ -197,4 +196,5 @@ def _upright(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, 
     spin = momentum(machine.robot, q, qd, about, machine.world_from_base())
     lean = ca.vertcat(-spin[1], spin[0])  # grows with the fall towards -x, -y
     wanted = -k2 * motion.velocity[:2] + k1 * right / machine.weight + k0 * lean - motion.acceleration[:2]
-    return rows[axes, :], wanted[axes]
+    directions = ca.DM(machine.moving_directions)
+    return ca.mtimes(directions, rows), ca.mtimes(directions, wanted)

@@ -32,7 +32,8 @@ class Adjoint:
         integrated: Costates integrated backwards from the plan's own at the end. Shape (N + 1, nx), or None.
         plan: The plan's costates there. Shape (N + 1, nx).
         reason: Why they were not integrated, or "".
-        transversality: Largest entry that no multiplier of an end condition explains, in cost per unit of the state.
+        transversality: Largest entry that no multiplier of an end condition explains, in cost per unit of the state; a
+            bound that is active at an end explains what has the sign of its multiplier.
         horizon: H(T) + dPhi/dT where the final time is free, in cost per second; 0 where it is given.
         scale: Largest costate.
     """
@@ -65,24 +66,7 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
     reason = obstacle(form, solution, bounds)
     integrated = None
     if not reason:
-        nodes = solution.state_interpolant.nodes
-        samples = solution.control_interpolant.nodes
-        places = breaks[:-1, None] + np.diff(breaks)[:, None] * samples
-        owner = np.searchsorted(solution.control_interpolant.breaks, breaks[:-1] + 0.5 * np.diff(breaks)) - 1
-        begin, width = solution.control_interpolant.breaks[owner], np.diff(solution.control_interpolant.breaks)[owner]
-        within = (places - begin[:, None]) / width[:, None]
-        controls = solution.control_interpolant.within(np.repeat(owner, len(samples)), within.ravel())
-        data = np.vstack(
-            [
-                solution.state_interpolant.values.reshape(n, -1).T,
-                controls.reshape(n, -1).T,
-                breaks[:-1],
-                np.diff(breaks),
-                np.full(n, solution.horizon),
-                np.tile(p[:, None], (1, n)),
-            ]
-        )
-        integrator = costate_integrator(form, nodes, samples)
+        integrator, data = costate_pieces(form, solution, p)
         everywhere = np.full((n + 1, form.nx), np.inf)
         everywhere[-1] = lam = plan[-1]
         for k in reversed(range(n)):
@@ -96,12 +80,59 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
     return Adjoint(costates.breaks * solution.horizon, integrated, plan, reason, *ends, scale)
 
 
+def costate_pieces(form: Formulation, solution: Solution, p: np.ndarray) -> tuple[Any, np.ndarray]:
+    """The integrator over one piece of the states' interpolant, and its parameters for every piece, (size, n)."""
+    breaks, nodes = solution.state_interpolant.breaks, solution.state_interpolant.nodes
+    n, samples = len(breaks) - 1, solution.control_interpolant.nodes
+    places = breaks[:-1, None] + np.diff(breaks)[:, None] * samples
+    owner = np.searchsorted(solution.control_interpolant.breaks, breaks[:-1] + 0.5 * np.diff(breaks)) - 1
+    begin, width = solution.control_interpolant.breaks[owner], np.diff(solution.control_interpolant.breaks)[owner]
+    within = (places - begin[:, None]) / width[:, None]
+    controls = solution.control_interpolant.within(np.repeat(owner, len(samples)), within.ravel())
+    data = np.vstack(
+        [
+            solution.state_interpolant.values.reshape(n, -1).T,
+            controls.reshape(n, -1).T,
+            breaks[:-1],
+            np.diff(breaks),
+            np.full(n, solution.horizon),
+            np.tile(p[:, None], (1, n)),
+        ]
+    )
+    return costate_integrator(form, nodes, samples), data
+
+
+def over_intervals(form: Formulation, solution: Solution, p: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Costates at the start of every control interval, integrated from their own at its end. Shape (N, nx).
+
+    Args:
+        ends: Costates at the ends of the intervals. Shape (N, nx).
+    """
+    integrator, data = costate_pieces(form, solution, p)
+    pieces = data.shape[1] // len(ends)
+    starts = np.full(ends.shape, np.nan)
+    for k, lam in enumerate(ends):
+        try:
+            with quiet():
+                for i in reversed(range(k * pieces, (k + 1) * pieces)):
+                    lam = np.asarray(integrator(x0=lam, p=data[:, i])["xf"].full()).reshape(-1)
+        except RuntimeError:
+            continue
+        starts[k] = lam
+    return starts
+
+
 def obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
     """Why the costate equation alone does not say what the costates are, or ""."""
     x = np.hstack(list(solution.states.values()))
     index = form.bounds.places["state"]
     if np.any(near(x[1:-1], bounds[0][index], bounds[1][index])):
         return "a state is at its bound"
+    return path_obstacle(form, solution, bounds)
+
+
+def path_obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+    """Why the multipliers of path constraints are not known, or ""."""
     if len(form.path) and not np.all(form.path.equality & form.path.uses_control):
         return "there are path constraints beyond equalities with a control"
     if len(form.path):
@@ -195,6 +226,13 @@ def end_residuals(
         matrix = np.vstack([matrix, columns[2 * nx]])
     multipliers = np.linalg.lstsq(matrix, target, rcond=None)[0] if matrix.size else np.zeros(matrix.shape[1])
     residual = target - matrix @ multipliers
+    # a bound that holds an end free otherwise pushes one way only
+    x, index = np.concatenate([x1, x0]), np.concatenate([places["terminal"], places["initial"]])
+    no_limit = np.full(2 * nx, np.inf)
+    above, below = near(x[None], -no_limit, high[index])[0], near(x[None], low[index], no_limit)[0]
+    push = left - columns[: 2 * nx] @ multipliers
+    wrong = np.where(above & ~below, np.maximum(-push, 0), 0) + np.where(below & ~above, np.maximum(push, 0), 0)
+    residual = np.concatenate([wrong, residual])
     if horizon_free and not explicit:
         return float(np.max(np.abs(residual[:-1]), initial=0.0)), float(abs(residual[-1]))
     return float(np.max(np.abs(residual), initial=0.0)), 0.0

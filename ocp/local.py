@@ -6,7 +6,7 @@ The classical method that optimal plans are compared with, and the source of the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -15,8 +15,10 @@ import numpy as np
 
 from models import Machine
 from models.linear import solve_spd
-from models.machine import jacobian_manipulability
-from ocp.builders.task import Array, Start, Velocity, checked_start, is_singular, velocity_expression
+from ocp.builders.task import Array, Velocity, checked_configuration, checked_horizon, checked_weights
+from ocp.builders.task_checks import checked_tasks, dependent_rows
+from ocp.builders.task_equations import TaskEquations, bind
+from ocp.builders.tip_task import TipTask, one_of
 from ocp.errors import ProblemError
 
 __all__ = ["LocalSolution", "least_rates", "resolve"]
@@ -36,9 +38,11 @@ class LocalSolution:
         base_rates: Time derivative of `base`. Shape (M, base_size).
         tip_in_world: Position of the tip. Shape (M, 3), m.
         manipulability: Of the task's rows, undamped. Shape (M,).
-        cost: Integral of half the squared joint rates, up to each time. Shape (M,).
+        cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
         tolerance: Absolute and relative tolerance of the integration.
         stopped: Why the motion ends before the horizon; None when it does not.
+        task_error: Pose wanted less pose found in the rows of the tasks, m and rad; zero for velocities.
+            Shape (M, rows of all tasks).
     """
 
     t: Array
@@ -51,6 +55,7 @@ class LocalSolution:
     cost: Array
     tolerance: float
     stopped: str | None = None
+    task_error: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def at(self, time: float) -> dict[str, Array]:
         """Cubic interpolation of "base" and "joints", linear of "joint_rates"; beyond the ends the end values."""
@@ -73,17 +78,22 @@ class LocalSolution:
 
 def resolve(
     machine: Machine,
-    tip_velocity: Velocity,
-    rows: Sequence[int],
-    start_joints: Any,
-    horizon: float,
+    tip_velocity: Velocity | None = None,
+    rows: Sequence[int] | None = None,
+    start_joints: Any = None,
+    horizon: float | None = None,
     *,
+    task: TipTask | Sequence[TipTask] | None = None,
     start_base: Any = None,
+    weights: Any = None,
     damping: float = 0.0,
     tolerance: float = 1e-10,
     samples: Any = 501,
+    check_start: bool = True,
 ) -> LocalSolution:
     """Simulate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the base that follows.
+
+    What the machine does at rest (its drift) and what a pose task feeds back are part of v.
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
@@ -92,12 +102,15 @@ def resolve(
         rows: Which rows of the tip's twist v prescribes: angular 0..2, linear 3..5, world axes.
         start_joints: Shape (joint_size,).
         horizon: Final time, s.
+        task: Instead of tip_velocity and rows: a TipTask, or several that are done at once.
         start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
+        weights: Of the squared joint rates that are least, positive. Shape (joint_size,); all 1 if None.
         damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays
             bounded where the Jacobian loses rank, at the price of a task error.
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
         samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
             horizon.
+        check_start: Whether a start away from the pose of its task (see TipTask.start_gap) is refused.
 
     Returns:
         The motion up to the horizon, or up to the last sample before it breaks down, with the reason in
@@ -106,39 +119,43 @@ def resolve(
     Raises:
         ProblemError: Something does not fit the machine, or the task is singular already at the start.
     """
-    start = checked_start(machine, rows, start_joints, horizon, start_base)
+    equations = bind(machine, one_of(tip_velocity, rows, task))
+    joints, base = checked_configuration(machine, start_joints, start_base)
+    duration, heavy = checked_horizon(horizon), checked_weights(weights, machine.joint_size)
+    checked_tasks(equations, base, joints, duration, start=check_start)
     for what, number in (("damping", damping), ("tolerance", tolerance)):
         if not (np.isfinite(number) and number >= 0):
             raise ProblemError(f"{what} must be a finite number, zero or above, not {number!r}")
     if tolerance == 0:
         raise ProblemError("tolerance must be positive, not 0")
-    times = _times(samples, start.horizon)
-    try:
-        model = _Model(machine, tip_velocity, start, damping, ca.SX)
-    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-        model = _Model(machine, tip_velocity, start, damping, ca.MX)
-    first = np.concatenate([start.base, start.joints])
-    if damping == 0 and is_singular(machine, start):
+    times = _times(samples, duration)
+    if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         raise ProblemError(
-            f"the task of rows {start.rows} is singular at the start joints {start.joints.tolist()}; "
+            f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
             "start elsewhere, fix fewer rows, or give a damping"
         )
-    states, costs, stopped = _integrate(model, first, times, tolerance)
+    try:
+        model = _Model(equations, heavy, damping, ca.SX)
+    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
+        model = _Model(equations, heavy, damping, ca.MX)
+    states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
     return _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
 
 
-def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0) -> Any:
+def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
     """G' (G G' + damping^2 1)^-1 v: the least joint rates that give the velocity, G# v when undamped.
 
-    Shape (n, k).
+    With weights W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W their diagonal matrix. Shape (n, k).
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
         velocity: v, or several as columns. Shape (m, k).
         damping: In units of the Jacobian.
+        weights: Of the squared joint rates, positive numbers. Shape (n,).
     """
-    square = ca.mtimes(jacobian, jacobian.T) + damping**2 * ca.DM.eye(jacobian.shape[0])
-    return ca.mtimes(jacobian.T, solve_spd(square, velocity))
+    light = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
+    square = ca.mtimes(jacobian, light) + damping**2 * ca.DM.eye(jacobian.shape[0])
+    return ca.mtimes(light, solve_spd(square, velocity))
 
 
 def _times(samples: Any, horizon: float) -> Array:
@@ -158,18 +175,21 @@ def _times(samples: Any, horizon: float) -> Array:
 class _Model:
     """Rates of the state (base, joints) and what is reported of it, as casadi functions of (time, state)."""
 
-    def __init__(self, machine: Machine, tip_velocity: Velocity, start: Start, damping: float, symbols: Any) -> None:
+    def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
+        machine = equations.machine
         self.time = symbols.sym("time")
         self.state = symbols.sym("state", machine.base_size + machine.joint_size)
         base, joints = self.state[: machine.base_size], self.state[machine.base_size :]
-        velocity = velocity_expression(tip_velocity, self.time, len(start.rows))
-        jacobian = machine.tip_jacobian(base, joints)
-        rates = least_rates(jacobian[start.rows, :], velocity, damping)
+        targets = equations.targets(self.time)
+        jacobian, right = equations.jacobian(base, joints), equations.right(base, joints, targets)
+        rates = least_rates(jacobian, right, damping, None if (weights == 1).all() else weights)
         base_rate = machine.base_rate(base, joints, rates)
         self.ode = ca.vertcat(base_rate, rates)
-        self.running = ca.dot(rates, rates) / 2
+        self.running = ca.dot(rates, ca.DM(weights) * rates) / 2
+        if symbols is ca.SX:
+            self.ode, self.running = ca.cse([self.ode, self.running])  # both contain the kinematics
         self.rate = ca.Function("rate", [self.time, self.state], [self.ode])
-        outputs = [machine.tip_pose(base, joints).position, jacobian_manipulability(jacobian, start.rows)]
+        outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
     def integrator(self, start: float, times: Array, tolerance: float) -> Callable[..., Any]:
@@ -225,7 +245,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
         except RuntimeError:
             usable = False
         if not usable:
-            manipulability = float(model.outputs(begin, reached[-1])[1])
+            manipulability = float(_manipulabilities(np.array(model.outputs(begin, reached[-1])[1])[None])[0])
             reason = (
                 f"the integration fails between {begin:g} and {end:g} s, where the manipulability "
                 f"falls to {manipulability:.3g}: the task becomes singular; give a damping or another start"
@@ -246,17 +266,23 @@ def _report(
     stopped: str | None,
 ) -> LocalSolution:
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
-    tip, manipulability = model.outputs.map(len(times))(times[None, :], states.T)
-    cut = machine.base_size
+    tip, jacobians, error = (np.array(part) for part in model.outputs.map(len(times))(times[None, :], states.T))
+    cut, size = machine.base_size, error.size // len(times)
     return LocalSolution(
         t=times,
         base=states[:, :cut],
         joints=states[:, cut:],
         joint_rates=rates[:, cut:],
         base_rates=rates[:, :cut],
-        tip_in_world=np.array(tip).T,
-        manipulability=np.array(manipulability).ravel(),
+        tip_in_world=tip.T,
+        manipulability=_manipulabilities(jacobians.reshape(size, len(times), machine.joint_size).transpose(1, 0, 2)),
         cost=costs,
         tolerance=tolerance,
         stopped=stopped,
+        task_error=error.reshape(size, len(times)).T,
     )
+
+
+def _manipulabilities(jacobians: Array) -> Array:
+    """sqrt(det(G G')), as the product of the singular values. Shapes (M, m, n) to (M,)."""
+    return np.asarray(np.linalg.svd(jacobians, compute_uv=False).prod(axis=-1))

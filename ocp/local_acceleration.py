@@ -25,6 +25,7 @@ from ocp.errors import ProblemError
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]
 
 CHUNK = 50  # steps between two looks at the motion
+TIP_TOLERANCE = 1e-3  # m
 CVODES_STEPS = 5000  # of the integrator between two samples
 
 
@@ -62,13 +63,31 @@ class AccelerationSolution:
     stopped: Stop | None
 
     @property
+    def failures(self) -> tuple[str, ...]:
+        """What is wrong with the motion, () if nothing: a reason to stop, or one of those that do not end it.
+
+        ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point does;
+        ``joint_limits``; ``leaves_path``: the tip does, by more than 1 mm.
+        """
+        motion = self.motion
+        wrong = {
+            "lift_off": not motion.stays_on_ground,
+            "leaves_foot": not motion.stays_in_foot,
+            "joint_limits": not motion.stays_in_limits,
+            "leaves_path": not bool((self.tip_error <= TIP_TOLERANCE).all()),
+        }
+        first = () if self.stopped is None else (self.stopped.reason,)
+        return (*first, *(name for name, is_wrong in wrong.items() if is_wrong and name not in first))
+
+    @property
     def succeeded(self) -> bool:
-        """Whether it reaches the horizon on the ground, inside the foot and within the joint limits."""
-        return self.stopped is None and self.motion.stands and self.motion.stays_in_limits
+        """Whether it reaches the horizon on the ground, inside the foot, within the joint limits and on its path."""
+        return not self.failures
 
     def __str__(self) -> str:
         end = "reaches the horizon" if self.stopped is None else self.stopped.message
-        return f"law {self.law}: {end}\n{self.motion}"
+        verdict = ", ".join(self.failures) or "succeeds"
+        return f"law {self.law}: {end} ({verdict})\n{self.motion}"
 
 
 def resolve_accelerations(

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.formulation import Formulation
+from ocp.sawtooth import costates_at_samples
 from ocp.solution import Solution
 
 __all__ = ["Optimality", "minimum_principle"]
@@ -67,7 +68,8 @@ def minimum_principle(
     t = s * horizon
     controls = interpolant.values.reshape(len(s), form.nu)
     states = solution.state_interpolant(s)
-    costates = np.column_stack([np.interp(t, solution.t, costate[:, i]) for i in range(form.nx)])
+    sampled, beside = costates_at_samples(form, solution, p, bounds)
+    costates = sampled.reshape(len(s), form.nx)
     rows = form.path.select(form.path.uses_control)
     outputs = [
         ca.jacobian(form.running, form.u).T,
@@ -85,6 +87,8 @@ def minimum_principle(
     g, g_u = (np.hstack([place[i] for place in around]) for i in (0, 1))
     products = f_u.reshape(len(t), form.nu, form.nx) * costates[:, None, :]
     gradient = direct + products.sum(axis=2)
+    if beside.any() and interpolant.nodes.tolist() == [0.0, 1.0]:
+        gradient = over_hats(gradient, widths, beside)
 
     low, high = bounds
     control, path = form.bounds.places["control"], np.tile(rows.bounds, len(around))
@@ -101,6 +105,25 @@ def minimum_principle(
         reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
     parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
     return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)
+
+
+def over_hats(gradient: np.ndarray, widths: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Means of the gradient, linear in every interval, over the hats of the node values of a linear control.
+
+    A linear control answers for the hat of each of its node values. Only for nodes of the intervals ``beside`` (N,) a
+    jump of the costate; elsewhere the value at the node stands. Shape (2 N, nu), as given.
+    """
+    sides = gradient.reshape(len(widths), 2, -1)
+    first, last = sides[:, 0], sides[:, 1]
+    total, weight = np.zeros((len(widths) + 1, gradient.shape[1])), np.zeros((len(widths) + 1, 1))
+    total[:-1] += widths[:, None] * (first / 3 + last / 6)
+    total[1:] += widths[:, None] * (first / 6 + last / 3)
+    weight[:-1] += widths[:, None] / 2
+    weight[1:] += widths[:, None] / 2
+    mean = total / weight
+    at_node = np.append(beside, False) | np.append(False, beside)
+    chosen = np.where(at_node[:-1, None], mean[:-1], first), np.where(at_node[1:, None], mean[1:], last)
+    return np.stack(chosen, axis=1).reshape(gradient.shape)
 
 
 def reduce_gradient(

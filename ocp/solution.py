@@ -37,6 +37,9 @@ class Sample(Mapping[str, np.ndarray]):
             raise unknown_name("state or control", name, self.arrays)
         return self.arrays[name]
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.arrays
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.arrays)
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ocp.assembly import assemble
+from ocp.diagnosis import diagnosis
 from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.fragment import Fragment
@@ -24,8 +25,6 @@ from ocp.problem import Problem
 from ocp.solution import Solution
 
 __all__ = ["Method", "Prepared", "prepare", "solve"]
-
-WORST = 6
 
 
 class Method(Protocol):
@@ -63,55 +62,39 @@ class Prepared:
         parameters: Mapping[str, Any] | None = None,
         guess: Solution | Mapping[str, Any] | None = None,
         check: bool = True,
+        tighter: Mapping[str, np.ndarray] | None = None,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`solve`."""
+        """Solve with these parameters from this guess; see :func:`solve`.
+
+        ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
+        """
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(by_name("parameters", parameters))
         bounds = form.bound_values(p)
         lower, upper = bounds
-        lbx, ubx = lower[fragment.variable_bounds], upper[fragment.variable_bounds]
-        point = np.clip(initial_point(form, fragment, guess, bounds), lbx, ubx)
         arguments = {
-            "x0": point,
             "p": p,
-            "lbx": lbx,
-            "ubx": ubx,
+            "lbx": lower[fragment.variable_bounds],
+            "ubx": upper[fragment.variable_bounds],
             "lbg": lower[fragment.row_bounds],
             "ubg": upper[fragment.row_bounds],
         }
+        if tighter is not None:
+            draw_in(arguments, tighter)
+        point = initial_point(form, fragment, guess, bounds)
+        arguments["x0"] = np.clip(point, arguments["lbx"], arguments["ubx"])
         outcome = call_solver(self._solver, self._progress, arguments)
         try:
             solution = self._solution(outcome, p)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
-            raise SolveError(self._diagnosis(outcome, arguments, self._horizon(outcome, p))) from error
+            raise SolveError(diagnosis(self, outcome, arguments, self._horizon(outcome, p))) from error
         if check and not outcome.success:
-            raise SolveError(self._diagnosis(outcome, arguments, solution.horizon), solution)
+            raise SolveError(diagnosis(self, outcome, arguments, solution.horizon), solution)
         return solution
 
     def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
         index = self.fragment.horizon
         return float(self.formulation.horizon_at(p) if index is None else outcome.variables[index])
-
-    def _at_bounds(self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-        """Which states and controls sit at their bounds, and for how much of the plan."""
-        form, fragment = self.formulation, self.fragment
-        lines = []
-        for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
-            for i, label in enumerate(labels):
-                mine = (fragment.variable_role == role) & (fragment.variable_entry == i)
-                mine &= arguments["lbx"] < arguments["ubx"]  # not what is given
-                for side, key in (("lower", "lbx"), ("upper", "ubx")):
-                    bound = arguments[key][mine]
-                    with np.errstate(invalid="ignore"):
-                        at = np.abs(values[mine] - bound) <= 1e-6 * np.maximum(1.0, np.abs(bound))
-                    at &= np.isfinite(bound)
-                    if np.any(at):
-                        where = fragment.variable_fraction[mine][at]
-                        lines.append(
-                            f"  {role} {label} is at its {side} bound {bound[at][0]:.4g} at {np.mean(at):.0%} of its "
-                            f"points, from {where.min() * horizon:.4g} to {where.max() * horizon:.4g} s"
-                        )
-        return lines
 
     def _solution(self, outcome: Outcome, p: np.ndarray) -> Solution:
         form, fragment = self.formulation, self.fragment
@@ -191,45 +174,16 @@ class Prepared:
             np.add.at(push[1], index, np.maximum(force, 0.0))
         return np.asarray(direct - form.bounds.pull(p, push))
 
-    def _residuals(
-        self, v: np.ndarray, arguments: dict[str, np.ndarray]
-    ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-        """Label, fraction, value and miss of every row and of the bounds of every variable, evaluated anew."""
-        form, fragment = self.formulation, self.fragment
-        try:
-            g = np.asarray(self.program.values(v, arguments["p"])[1].full()).reshape(-1)
-        except RuntimeError:  # an integrator breaks down
-            g = np.full(fragment.n_rows, np.nan)
-        names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
-        bounds = [
-            f"{'' if role == 'horizon' else role + ' '}{names[role][entry]}"
-            for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
-        ]
-        value = np.concatenate([g, v])
-        lower, upper = (np.concatenate([arguments[s + "g"], arguments[s + "x"]]) for s in ("lb", "ub"))
-        at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
-        labels = [*fragment.row_labels, *(f"bound of {name}" for name in bounds)]
-        return labels, at, value, np.maximum(lower - value, value - upper)
 
-    def _diagnosis(self, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> str:
-        """What went wrong: the worst residuals by constraint, state and time."""
-        labels, at, value, miss = self._residuals(outcome.variables, arguments)
-        lines = [f"problem {self.problem.name!r}: {self.solver_name} ended with {outcome.status}"]
-        lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
-        broken = np.flatnonzero(~np.isfinite(value))
-        for i in broken[:WORST]:
-            lines.append(f"  {labels[i]} is not finite at {at[i] * horizon:.4g} s")
-        seen: set[str] = set()
-        for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
-            if len(seen) == WORST or not miss[i] > 1e-8:
-                break
-            if labels[i] not in seen:
-                seen.add(labels[i])
-                lines.append(f"  {labels[i]} is missed by {miss[i]:.3g} at {at[i] * horizon:.4g} s")
-        lines += self._at_bounds(outcome.variables, arguments, horizon)
-        if not seen and not broken.size:
-            lines.append("  all constraints are met; the plan is feasible but not optimal")
-        return "\n".join(lines)
+def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:
+    """Move lower bounds up and upper ones down, to their middle at most; leave equalities."""
+    for kind in ("x", "g"):
+        low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
+        room = low < high
+        with np.errstate(invalid="ignore"):
+            middle = np.where(room & np.isfinite(high - low), (low + high) / 2, np.nan)
+        arguments[f"lb{kind}"] = np.where(room, np.fmin(low + by[f"lb{kind}"], middle), low)
+        arguments[f"ub{kind}"] = np.where(room, np.fmax(high - by[f"ub{kind}"], middle), high)
 
 
 def by_name(what: str, values: Any) -> dict[str, Any]:
@@ -314,10 +268,12 @@ def solve(
         solver, options: See :func:`prepare`.
         guess: An earlier solution (of any grid or method), or a dictionary by name of values, functions of time, or
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
-        check: Raise where the solver fails; False returns the unsuccessful solution with its status.
+        check: Raise where the solver fails, after a second solve that finds what would have to give way; False returns
+            the unsuccessful solution with its status.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.
-        SolveError: The solver failed; names the worst residuals by constraint, state and time.
+        SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
+            worst residuals by constraint, state and time.
     """
     return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

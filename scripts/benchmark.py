@@ -7,6 +7,7 @@ of one run on one machine; what is claimed are ratios and growth, not seconds.
 from __future__ import annotations
 
 import argparse
+import importlib
 import subprocess
 import sys
 import tempfile
@@ -40,6 +41,8 @@ DEGREE = 3
 JOINTS = (3, 7, 14, 28)
 IPOPT = {"tol": 1e-10, "print_level": 0, "sb": "yes"}
 COMPILER = ["-O2", "-fPIC", "-shared"]
+MODULES = ("cts", "blend", "robots")
+"""scripts/benchmark_NAME.py, each with run(repeats) -> summary and plot(path, summary)."""
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -251,6 +254,24 @@ def costates(repeats: int, progress: Callable[[str], None]) -> list[dict[str, An
     return table
 
 
+# ---- other modules -------------------------------------------------------------------------------------------
+
+
+def run_module(name: str, folder: Path, repeats: int) -> dict[str, Any]:
+    """Runs scripts/benchmark_NAME.py and writes NAME.json, NAME.png and a table of every list of rows it returns.
+
+    The list called "rows" becomes NAME.csv, another one NAME_LIST.csv.
+    """
+    module = importlib.import_module(f"scripts.benchmark_{name}")
+    summary: dict[str, Any] = module.run(repeats)
+    for key, value in summary.items():
+        if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+            drawing.write_table(folder / (f"{name}.csv" if key == "rows" else f"{name}_{key}.csv"), value, 6)
+    drawing.write_json(folder / f"{name}.json", summary)
+    module.plot(folder / f"{name}.png", summary)
+    return summary
+
+
 # ---- the page ------------------------------------------------------------------------------------------------
 
 
@@ -295,7 +316,7 @@ def plot_costates(path: Path, rows: list[dict[str, Any]]) -> None:
 
 def run(out: Path, repeats: int) -> dict[str, Any]:
     """All benchmarks; writes OUT/benchmark and returns the summary."""
-    bar = tqdm(total=len(INTERVALS) + len(JOINTS) + 1, disable=None, file=sys.stderr)
+    bar = tqdm(total=len(INTERVALS) + len(JOINTS) + 1 + len(MODULES), disable=None, file=sys.stderr)
 
     def progress(text: str) -> None:
         bar.set_description(text)
@@ -316,8 +337,11 @@ def run(out: Path, repeats: int) -> dict[str, Any]:
         "costate_rate": table,
         "recursion_over_compiled_at_7": at_7["recursion_over_compiled"],
     }
-    bar.close()
     folder = out / "benchmark"
+    for name in MODULES:
+        progress(name)
+        run_module(name, folder, repeats)
+    bar.close()
     drawing.write_table(folder / "build_and_solve.csv", rows, 6)
     drawing.write_table(folder / "costate_rate.csv", table, 6)
     plot_build_and_solve(folder / "build_and_solve.png", rows)

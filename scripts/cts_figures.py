@@ -58,7 +58,9 @@ def draw(folder: Path, results: Results) -> None:
                 ax.set_xlabel("target z, in")
             handles, labels = axes[0, 0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside right upper")
-            figure.suptitle(title, fontsize=10)
+            bounds = [f"gain {gain:g}: {results.stability[name, gain]:.3g}" for gain in (1.0, 20.0)]
+            stable = "largest gain $n_6^2 I''$, stable below 2: " + ", ".join(bounds)
+            figure.suptitle(f"{title}\n{stable}", fontsize=10)
     _iterations(folder / "fig08_iterations.png", results)
 
 

@@ -2,7 +2,7 @@
 
 from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature
 from models.paths.chain import Path
-from models.paths.function import path_function
+from models.paths.function import path_function, turn_function
 from models.paths.mapping import gauss_newton, march, predictor_corrector
 from models.paths.segments import Arc, Line, Segment
 from models.paths.smooth import Blend, Place, SmoothPath, Turn
@@ -26,4 +26,5 @@ __all__ = [
     "peak_curvature",
     "predictor_corrector",
     "smooth",
+    "turn_function",
 ]

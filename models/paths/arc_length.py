@@ -1,7 +1,8 @@
 """Arc length of blends, to rounding, and its inverse.
 
 A blend's speed |dr/du| is analytic but nearly singular in the middle of a sharp corner, so each curve is cut into cells
-in which the 10-point Gauss-Legendre rule is exact to rounding: cells shrink where the corner is sharp.
+in which the 10-point Gauss-Legendre rule is exact to rounding: cells shrink where the corner is sharp. They also shrink
+until the cubic Hermite guess of the inverse is monotone, from which Newton's method converges.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ NODES, WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 ACCURACY = 1e-13
 """Largest disagreement of the rule on a cell and on its halves, relative to the length of the cell's curve."""
+STEEPEST = 3.0
+"""Largest slope du/ds at a cell's ends over its mean: up to it the cubic between them is monotone."""
 DEEPEST = 40
 NEWTON_STEPS = 4
 
@@ -88,6 +91,8 @@ def cells(coefficients: Array) -> Cells:
         mine = slopes[:, :, curve]
         left, right = _lengths(mine, start, half), _lengths(mine, start + half, half)
         fine = np.abs(whole - left - right) <= ACCURACY * scale[curve]
+        slowest = np.minimum(_speed(mine, start), _speed(mine, start + width))
+        fine &= left + right <= STEEPEST * width * slowest
         done.append((curve[fine], start[fine], width[fine], (left + right)[fine]))
         rough = ~fine
         curve = np.repeat(curve[rough], 2)

@@ -57,7 +57,10 @@ def checked_shape(shape: float | Array | None, kind: str) -> Array:
         ModelError: A factor that is not above zero and below that of the cusp (cubic 6, quintic 30/7), an unknown kind.
     """
     checked_kind(kind)
-    factors = np.asarray(DEFAULT_SHAPE[kind] if shape is None else shape, dtype=float)
+    try:
+        factors = np.asarray(DEFAULT_SHAPE[kind] if shape is None else shape, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"shape factor {shape!r} is not numeric") from error
     wrong = ~((factors > 0) & (factors < LARGEST_SHAPE[kind]))
     if wrong.any():
         raise ModelError(
@@ -111,18 +114,30 @@ def _falling(order: int) -> list[float]:
     return [float(np.prod(np.arange(k - order + 1, k + 1))) if k >= order else 0.0 for k in range(6)]
 
 
+def _check_corner(shape: float, angle: float, remaining: float = 1.0) -> None:
+    for name, value, least, most in (
+        ("shape factor", shape, 0.0, np.inf),
+        ("angle", angle, 0.0, np.pi),
+        ("remaining distance", remaining, 0.0, np.inf),
+    ):
+        if not (least < value <= most and np.isfinite(value)):
+            raise ModelError(f"{name} {value:g} of a corner must be above 0 and at most {most:.6g}")
+
+
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
     """Distance vertex to curve over the remaining distance, eq. (8), between two lines.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
     which is the nearest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
+    _check_corner(shape, angle)
     a = MIDDLE[checked_kind(kind)][0]
     return float(abs(1 - 2 * a * shape) * np.cos(angle / 2))
 
 
 def end_curvature(shape: float, angle: float, remaining: float) -> float:
     """Curvature (1/m) of the cubic where it leaves a line: |6 - 2 shape| sin(angle) / (shape^2 remaining)."""
+    _check_corner(shape, angle, remaining)
     return float(abs(6 - 2 * shape) * np.sin(angle) / (shape**2 * remaining))
 
 
@@ -132,6 +147,7 @@ def middle_curvature(shape: float, angle: float, remaining: float, kind: str = "
     For the cubic shape cos(angle/2) / [2 (1.5 - shape/4)^2 sin^2(angle/2) remaining], the largest of the curve near
     shape 3; a flatter shape bends more at its ends, see `peak_curvature`.
     """
+    _check_corner(shape, angle, remaining)
     _, b, c, d = MIDDLE[checked_kind(kind)]
     half = angle / 2
     return float(d * shape * np.cos(half) / (2 * (b - c * shape) ** 2 * np.sin(half) ** 2 * remaining))
@@ -142,6 +158,8 @@ def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cu
 
     Taken on a grid that is refined about its largest value, 1e-8 relative.
     """
+    _check_corner(shape, angle, remaining)
+    checked_shape(shape, kind)
     n1, n2 = np.array([1.0, 0.0, 0.0]), np.array([-np.cos(angle), np.sin(angle), 0.0])
     rate, zero = shape * remaining, np.zeros(3)
     start, end = -remaining * n1, remaining * n2

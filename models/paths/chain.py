@@ -50,7 +50,10 @@ class Path:
     turn: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        segments = tuple(self.segments)
+        try:
+            segments = tuple(self.segments)
+        except TypeError as error:
+            raise ModelError(f"the path {self.segments!r} is no sequence of segments") from error
         if not segments:
             raise ModelError("the path has no segment; give at least one Line or Arc")
         for i, segment in enumerate(segments):
@@ -152,6 +155,8 @@ class Path:
                         f"at vertex {i} the tool orientation jumps by {np.degrees(gap):.4g} deg, from "
                         f"{current.tolist()} to {begin.tolist()}; turn it along a segment"
                     )
+            if begin @ current < 0 and i:
+                begin = -begin  # the same orientation: the sign goes on from segment to segment
             starts.append(begin)
             if segment.end_orientation is None:
                 turns.append(np.zeros(3))
@@ -159,5 +164,6 @@ class Path:
             else:
                 current = np.asarray(segment.end_orientation)
                 turns.append(rotation_vector(begin, current, f"segment {i}"))
+                current = current if begin @ current >= 0 else -current
         object.__setattr__(self, "orientation", np.array(starts))
         object.__setattr__(self, "turn", np.array(turns))

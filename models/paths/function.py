@@ -1,4 +1,4 @@
-"""A smooth path as one casadi Function of the distance, for expressions and for generated C."""
+"""A smooth path as casadi Functions of the distance, for expressions and for generated C."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from models.parts import Array
 from models.paths.arc_length import NEWTON_STEPS, NODES, WEIGHTS, speed
+from models.paths.orientation import orientation_function
 from models.paths.smooth import SmoothPath
 
-__all__ = ["path_function"]
+__all__ = ["path_function", "turn_function"]
 
 # rows of the table of cells
 SEGMENT = slice(0, 10)  # start, tangent, normal, curvature
@@ -34,6 +35,21 @@ def path_function(path: SmoothPath) -> Any:
     cell = ca.low(ca.DM(knots), inside, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
     outputs = _in_cell()(ca.MX(ca.DM(columns))[:, cell], inside)
     return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
+
+
+def turn_function(path: SmoothPath) -> Any:
+    """Function distance (m) -> quaternion (4), rate (3, rad/m), acceleration (3, rad/m^2), jerk (3, rad/m^3).
+
+    Tool orientation in world and its rates, as of `SmoothPath.turn`; MX with the tables in it, made as path_function.
+    """
+    reference, theta = path.charts
+    columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
+    s = ca.MX.sym("distance")
+    inside = ca.fmin(ca.fmax(s, 0.0), path.length)
+    piece = ca.low(ca.DM(path.bounds), inside, {"lookup_mode": "binary"}) if len(path.bounds) > 2 else ca.MX(0)
+    column = ca.MX(ca.DM(columns))[:, piece]
+    outputs = orientation_function()(column[:4], column[4:22], column[22], (inside - column[23]) / column[22])
+    return ca.Function("turn", [s], list(outputs), ["distance"], ["quaternion", "rate", "acceleration", "jerk"])
 
 
 @lru_cache(maxsize=1)

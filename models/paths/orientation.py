@@ -16,9 +16,10 @@ import numpy as np
 
 from models.errors import ModelError
 from models.parts import Array, ArrayInput, checked_array
+from models.paths.blends import polynomial
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
-__all__ = ["exponential", "orientation_function", "rotation_vector", "unit_quaternion"]
+__all__ = ["along_piece", "exponential", "orientation_function", "rotation_vector", "unit_quaternion"]
 
 LARGEST_TURN = np.pi - 1e-3
 """Two orientations further apart (rad) have no shorter way between them that one would guess."""
@@ -67,6 +68,61 @@ def exponential(vector: Any) -> Any:
         cosine = (-1) ** k / factorial(2 * k) + square * cosine
         sinc = (-1) ** k / factorial(2 * k + 1) + square * sinc
     return ca.vertcat(cosine, sinc / 2 * vector)
+
+
+def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
+    """As orientation_function, in numpy, for M samples.
+
+    omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
+    a = |theta|, in the axes of the reference; B and C are entire functions of a^2.
+
+    Args:
+        reference: Shape (M, 4).
+        theta: Shape (M, 6, 3).
+        length, fraction: Shape (M,).
+
+    Returns:
+        Unit quaternion (M, 4); rate, acceleration and jerk by the distance (M, 3).
+    """
+    t0, t1, t2, t3 = (polynomial(theta, fraction, order) / length[:, None] ** order for order in range(4))
+    square = _dot(t0, t0)
+    first, second = 2 * _dot(t0, t1), 2 * (_dot(t1, t1) + _dot(t0, t2))
+    a0, a1 = np.cross(t0, t1), np.cross(t0, t2)
+    a2 = np.cross(t1, t2) + np.cross(t0, t3)
+    b0, b1 = np.cross(t0, a0), np.cross(t1, a0) + np.cross(t0, a1)
+    b2 = np.cross(t2, a0) + 2 * np.cross(t1, a1) + np.cross(t0, a2)
+    omega = [t1, t2, t3]
+    for start, (v0, v1, v2) in ((2, (a0, a1, a2)), (3, (b0, b1, b2))):
+        f0, f1, f2 = _series(start, square)
+        f2 = f2 * first**2 + f1 * second
+        f1 = f1 * first
+        omega[0] = omega[0] + f0 * v0
+        omega[1] = omega[1] + f1 * v0 + f0 * v1
+        omega[2] = omega[2] + f2 * v0 + 2 * f1 * v1 + f0 * v2
+    half = np.sqrt(square) / 2
+    scalar, vector = np.cos(half)[:, 0], np.sinc(half / np.pi) / 2 * t0
+    w, v = reference[:, 0], reference[:, 1:]
+    product = w[:, None] * vector + scalar[:, None] * v + np.cross(v, vector)
+    quaternion = np.column_stack([w * scalar - (v * vector).sum(axis=1), product])
+    rates = []
+    for value in omega:
+        twist = 2 * np.cross(v, value)
+        rates.append(value + w[:, None] * twist + np.cross(v, twist))
+    return quaternion, rates[0], rates[1], rates[2]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray((a * b).sum(axis=1, keepdims=True))
+
+
+def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
+    # sum of (-x)^k / (2 k + start)! and its two derivatives by x
+    value, first, second = (np.zeros_like(square) for _ in range(3))
+    for k in reversed(range(TERMS)):
+        second = second * square + 2 * first
+        first = first * square + value
+        value = value * square + (-1) ** k / factorial(2 * k + start)
+    return value, first, second
 
 
 @lru_cache(maxsize=1)

@@ -161,10 +161,13 @@ class Arc:
                 f"arc through {a.tolist()}, {b.tolist()}, {c.tolist()}: the points lie on a line or coincide; "
                 "use a Line, or Arc.about for a full circle"
             )
-        center = a + np.cross(ab @ ab * ac - ac @ ac * ab, axis) / (2 * area**2)
-        axis = axis / area
-        first, last = a - center, c - center
-        sweep = float(np.arctan2(axis @ np.cross(first, last), first @ last)) % (2 * np.pi)
+        # to rounding for flat arcs too, whose center is far away: all is built upon the chord and the angle at `via`
+        chord = float(np.linalg.norm(ac))
+        along, axis = ac / chord, axis / area
+        axis = axis - (axis @ along) * along
+        height = -chord / 2 * float((a - b) @ (c - b)) / area
+        center = (a + c) / 2 + height * np.cross(axis, along)
+        sweep = 2 * float(np.arctan2(chord / 2, height))
         return cls(a, center, axis, sweep, start_orientation, end_orientation)
 
     @property

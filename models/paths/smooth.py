@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from models.parts import Array, ArrayInput
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, by_arc_length, quintic
 from models.paths.chain import Path
-from models.paths.orientation import orientation_function
+from models.paths.orientation import along_piece
 
 __all__ = ["Blend", "Place", "SmoothPath", "Turn"]
 
@@ -125,7 +124,9 @@ class SmoothPath:
         """Distance at which each cell of each blend begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
         first = np.searchsorted(self.cells.curve, np.arange(len(self.coefficients)))
-        return np.asarray(self.bounds[self.blend_starts][self.cells.curve] + before - before[first][self.cells.curve])
+        # the first cell's bound must be that of its blend to the last bit, or a place there falls into the blend before
+        inside = before - before[first][self.cells.curve]
+        return np.asarray(self.bounds[self.blend_starts][self.cells.curve] + inside)
 
     def blend(self, vertex: int) -> Blend:
         """The blend at a vertex, 0 being the end of the first segment; ModelError when there is none."""
@@ -171,11 +172,15 @@ class SmoothPath:
             still = np.zeros((len(s), 3))
             return Turn(np.repeat(self.path.orientation[:1], len(s), axis=0), still, still, still)
         reference, theta = self.charts
-        piece = self._piece(s)
-        length = self.piece_lengths[piece]
-        inputs = (reference[piece].T, theta[piece].reshape(-1, 18).T, length, (s - self.bounds[piece]) / length)
-        function = orientation_function().map(len(s))
-        return Turn(*(np.array(value).T for value in function(*[ca.DM(np.atleast_2d(v)) for v in inputs])))
+        results = [np.empty((len(s), width)) for width in (4, 3, 3, 3)]
+        for first in range(0, len(s), CHUNK):
+            part = slice(first, first + CHUNK)
+            piece = self._piece(s[part])
+            length = self.piece_lengths[piece]
+            values = along_piece(reference[piece], theta[piece], length, (s[part] - self.bounds[piece]) / length)
+            for result, value in zip(results, values, strict=True):
+                result[part] = value
+        return Turn(*results)
 
     def parameter(self, distance: ArrayInput) -> Array:
         """u of the blend at distances from the start; nan on segments. Shape (M,)."""

@@ -47,7 +47,10 @@ def smooth(
         ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
     """
     checked_kind(kind)
-    factors = np.broadcast_to(checked_shape(shape, kind), (len(path.segments) - 1,))
+    factors, count = checked_shape(shape, kind), len(path.segments) - 1
+    if factors.ndim and factors.shape != (count,):
+        raise ModelError(f"shape has shape {factors.shape}; give one number, or one for each of the {count} vertices")
+    factors = np.broadcast_to(factors, (count,))
     distances = remaining_distances(path, remaining, deviation, kind, factors, overlap)
     coefficients = blend_coefficients(path, distances, kind, factors)
     curve_cells = cells(coefficients)

@@ -15,6 +15,7 @@ import numpy as np
 from models import ModelError
 from models.clearance import Radii, Surroundings, clearances, soft_minimum
 from models.cts import HOME, Branch, Rig, Tunnel, joints_of, posture_at
+from models.cts_clearance import nearness
 from models.cts_iterations import checked_targets
 from models.cts_optimal import optimal_inverse
 from models.cts_roll import index_harmonics
@@ -66,6 +67,8 @@ def roll_plan(
     start_rate: float | None = None,
     surroundings: Surroundings | None = None,
     clearance: float = 0.0,
+    clearance_weight: float = 0.0,
+    clearance_width: float = 0.05,
     softness: float = 2e-3,
     radii: Radii | None = None,
     symbols: Any = ca.MX,
@@ -83,7 +86,8 @@ def roll_plan(
         rate_limit, acceleration_limit: rad/s and rad/s^2.
         start_roll, start_rate: At time 0; free where None.
         surroundings: What to keep away from; None for nothing.
-        clearance: Least distance from it, m.
+        clearance: Least distance from it, m; -inf for no constraint.
+        clearance_weight, clearance_width: Of the term weight exp(-distance / width) of the index; width in m.
         softness: Width of the smooth minimum of all distances, m, see clearance.soft_minimum.
         radii: Of the rig's capsules.
         symbols: casadi.MX, or casadi.SX where the targets are plain expressions.
@@ -100,9 +104,14 @@ def roll_plan(
         ("acceleration_weight", acceleration_weight),
         ("rate_limit", rate_limit),
         ("acceleration_limit", acceleration_limit),
+        ("clearance_weight", clearance_weight),
     ):
         if not value >= 0:
             raise ProblemError(f"roll_plan: {name} {value} must not be negative")
+    if not clearance_width > 0:
+        raise ProblemError(f"roll_plan: clearance_width {clearance_width} m must be positive")
+    if np.isnan(clearance) or clearance == np.inf:
+        raise ProblemError(f"roll_plan: clearance {clearance} m must be a finite distance or -inf for none")
     if not (np.isfinite(horizon) and horizon > 0):
         raise ProblemError(f"roll_plan: horizon {horizon} s must be positive and finite")
     guess = _guess(rig, tunnel, targets, horizon, branch, start_roll, symbols)
@@ -127,10 +136,14 @@ def roll_plan(
     if held:
         limited = ca.Function("joints", [x, phi], [ca.vertcat(*[joints[k] for k in held])])
         problem.path("limits", limited(target, roll), rig.lower[held], rig.upper[held])
+    near: Any = 0.0
     if surroundings is not None:
         least = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
-        problem.path("clearance", ca.Function("gap", [x, phi], [least])(target, roll), clearance)
-    problem.minimize(running=index(target, roll) + rate_weight * rate**2 + acceleration_weight * pull**2)
+        gap = ca.Function("gap", [x, phi], [least])(target, roll)
+        if np.isfinite(clearance):
+            problem.path("clearance", gap, clearance)
+        near = nearness(gap, clearance_weight, clearance_width)
+    problem.minimize(running=index(target, roll) + near + rate_weight * rate**2 + acceleration_weight * pull**2)
     return problem
 
 

@@ -1,7 +1,7 @@
 """Redundancy resolved over the whole motion: the least joint velocity that does a task of the tip.
 
 Problem (27) of the free-floating paper (Kim, Kim 2011), for any machine of `models`, on a fixed or a floating
-base.
+base, and any task of `tip_task`: poses, free tool axes, several arms, a base held still.
 """
 
 from __future__ import annotations
@@ -13,25 +13,34 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.builders.task import Array, Velocity, checked_start, is_singular, velocity_expression
+from ocp.builders.task import Array, Velocity, checked_configuration, checked_horizon, checked_weights
+from ocp.builders.task_checks import check_closed, checked_tasks, dependent_rows
+from ocp.builders.task_equations import TaskEquations, bind
+from ocp.builders.tip_task import TipTask, one_of
 from ocp.errors import ProblemError
 from ocp.guess import Samples
+from ocp.inverse_kinematics import inverse_kinematics
 from ocp.local import LocalSolution, least_rates, resolve
 from ocp.problem import Problem
 
 __all__ = ["minimum_velocity"]
 
 GUESS_TOLERANCE = 1e-8
+LARGEST_DAMPING = 1.0
 
 
 def minimum_velocity(
     machine: Machine,
-    tip_velocity: Velocity,
-    rows: Sequence[int],
-    start_joints: Any,
-    horizon: float,
+    tip_velocity: Velocity | None = None,
+    rows: Sequence[int] | None = None,
+    start_joints: Any = None,
+    horizon: float | None = None,
     *,
+    task: TipTask | Sequence[TipTask] | None = None,
     start_base: Any = None,
+    free_start: bool = False,
+    cyclic: bool = False,
+    weights: Any = None,
     formulation: Literal["rates", "null_space"] = "rates",
     limits: bool = True,
     guess_damping: float = 0.005,
@@ -41,88 +50,112 @@ def minimum_velocity(
 
     States "joints" and, on a floating base, "base". Two formulations of the same problem:
 
-    "rates": control "rates" are the joint rates x2', the task G x2' = v is the path equality "task". Regular
-    where
-        the Jacobian loses rank as long as v stays in its range; the one to use.
-    "null_space": control "null" is u of x2' = (1 - G# G) u + G# v, equation (26), which does the task by
-    itself.
-        Fragile: G# is unbounded where the Jacobian loses rank. The part G# G u of the control has no effect
-            on the
-        motion; 1/2 |G# G u|^2 is added to the cost, so that the running cost is 1/2 |u|^2 + 1/2 |G# v|^2. It
-        vanishes at the optimum and makes the optimal u unique: u lies in the null space and x2' = u + G# v
-        there. Without it shooting with linear controls takes hundreds of iterations instead of ten.
+    "rates": control "rates" are the joint rates x2', the task G x2' = v is the path equality "task". Regular where the
+        Jacobian loses rank as long as v stays in its range; the one to use.
+    "null_space": control "null" is u of x2' = (1 - G# G) u + G# v, equation (26), which does the task by itself.
+        Fragile: G# is unbounded where the Jacobian loses rank. The part G# G u of the control has no effect on the
+        motion; 1/2 |G# G u|^2 is added to the cost, so that the running cost is 1/2 |u|^2 + 1/2 |G# v|^2. It vanishes
+        at the optimum and makes the optimal u unique: u lies in the null space and x2' = u + G# v there. Without it
+        shooting with linear controls takes hundreds of iterations instead of ten.
+
+    What a machine with momentum does at rest (its drift), and the feedback of a pose task, are part of v.
 
     Args:
         machine: A FixedBase, a FreeFloating, or anything else that is a Machine.
-        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a
-            function that takes `problem.time` (s) and returns a casadi vector or a list of expressions.
+        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a function that
+            takes `problem.time` (s) and returns a casadi vector or a list of expressions.
         rows: Which rows of the tip's twist the task fixes: angular 0..2, linear 3..5, world axes.
-        start_joints: Shape (joint_size,), rad or m.
+        start_joints: Shape (joint_size,), rad or m. A guess where the start is free; then inverse kinematics finds one
+            if None.
         horizon: Final time, s.
+        task: Instead of tip_velocity and rows: a TipTask, or several that are done at once.
         start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
+        free_start: Whether the joints start wherever the tip is where the task begins (path of poses), or where it is
+            at start_joints (velocities): the start condition "start pose".
+        cyclic: Whether the joints end where they started, after a closed task. What of this follows from the task is
+            not asked twice: a constant velocity, state "closure", of the size of the discretisation error is left to
+            the task, so that the joints close exactly. The base of a floating machine closes only if the task says so.
+        weights: Of the squared joint rates in the cost, positive. Shape (joint_size,); all 1 if None.
         formulation: "rates" or "null_space".
-        limits: Whether the robot's position limits bound the state "joints" and its velocity limits the joint
-            rates (a bound of the control "rates", or the path constraint "velocity limits" of the null-space
-            form).
-        guess_damping: Damping of the local solution (see ocp.local.resolve) that is attached as the initial
-            guess, relative to the root mean square of the singular values of the task's Jacobian at the
-            start. Small values start near the pseudo-inverse; large ones avoid its singular passages and may
-            lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03 to
-            J = 1.7467.
-        symbols: casadi.SX, or casadi.MX when tip_velocity calls an interpolant.
+        limits: Whether the robot's position limits bound the state "joints" and its velocity limits the joint rates (a
+            bound of the control "rates", or the path constraint "velocity limits" of the null-space form).
+        guess_damping: Damping of the local solution (see ocp.local.resolve) that is attached as the initial guess,
+            relative to the root mean square of the singular values of the task's Jacobian at the start; raised where
+            the local motion stops early. Small values start near the pseudo-inverse; large ones avoid its singular
+            passages and may lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03
+            to J = 1.7467.
+        symbols: casadi.SX, or casadi.MX when a track or velocity calls an interpolant.
 
     Returns:
         The problem, its guesses attached; nothing is solved but the local motion.
 
     Raises:
-        ProblemError: Rows out of range, repeated, none, more than joints, or moved by no joint; wrong sizes;
-            a start outside the limits, or singular for the null-space form; a horizon or a damping that is
-            not positive; an unknown formulation.
+        ProblemError: Rows out of range, repeated, none, more than joints, moved by no joint, or dependent everywhere;
+            wrong sizes; a start outside the limits, off the task's pose, or singular for the null-space form; a cyclic
+            task that is not closed; a horizon or a damping that is not positive; an unknown formulation.
+        Unreachable: No start found where it is free and not given (a ProblemError).
     """
     if formulation not in ("rates", "null_space"):
         raise ProblemError(f"unknown formulation {formulation!r}; use 'rates' or 'null_space'")
     if not (np.isfinite(guess_damping) and guess_damping > 0):
         raise ProblemError(f"guess_damping must be positive, not {guess_damping!r}")
-    start = checked_start(machine, rows, start_joints, horizon, start_base)
-    if formulation == "null_space" and is_singular(machine, start):
+    equations, duration = bind(machine, one_of(tip_velocity, rows, task)), checked_horizon(horizon)
+    if start_joints is None and free_start:
+        tasks = [part.task for part in equations.bound]
+        start_joints = inverse_kinematics(machine, tasks, base=start_base, limits=limits)[0].joints
+    start, place = checked_configuration(machine, start_joints, start_base)
+    heavy = checked_weights(weights, machine.joint_size)
+    checked_tasks(equations, place, start, duration, start=not free_start)
+    if formulation == "null_space" and (task_name := dependent_rows(equations, place, start)):
         raise ProblemError(
-            f"the task of rows {start.rows} is singular at the start joints {start.joints.tolist()}, where the "
+            f"{task_name} is singular at the start joints {start.tolist()}, where the "
             "null-space form does not exist; use formulation='rates' or start elsewhere"
         )
+    if cyclic:
+        check_closed(equations, duration)
     lower, upper, speed = _limits(machine, limits)
-    _check_inside(machine, start.joints, lower, upper)
-    jacobian = np.array(ca.DM(machine.tip_jacobian(start.base, start.joints)))[start.rows]
-    local = resolve(
-        machine,
-        tip_velocity,
-        rows,
-        start.joints,
-        horizon,
-        start_base=start.base,
-        damping=guess_damping * float(np.linalg.norm(jacobian)) / np.sqrt(len(start.rows)),
-        tolerance=GUESS_TOLERANCE,
-    )
+    _check_inside(machine, start, lower, upper)
+    local = _local_motion(equations, start, place, duration, heavy, guess_damping)
 
     problem = Problem(f"minimum velocity, {formulation.replace('_', ' ')}", symbols=symbols)
     base: Any = np.zeros(0)
     if machine.base_size:
-        base = problem.state("base", initial=start.base, guess=_guess(local, "base"))
-    joints = problem.state("joints", initial=start.joints, lower=lower, upper=upper, guess=_guess(local, "joints"))
-    problem.horizon(start.horizon)
-    velocity = velocity_expression(tip_velocity, problem.time, len(start.rows))
+        base = problem.state("base", initial=place, guess=_guess(local, "base"))
+    joints = problem.state(
+        "joints",
+        machine.joint_size,
+        initial=None if free_start else start,
+        terminal=start if cyclic and not free_start else None,
+        lower=lower,
+        upper=upper,
+        guess=_guess(local, "joints"),
+    )
+    problem.horizon(duration)
+    try:
+        targets = equations.targets(problem.time)
+    except (RuntimeError, NotImplementedError) as error:
+        raise ProblemError("the task calls an interpolant or an external function: pass symbols=casadi.MX") from error
+    closure: Any = ca.DM(equations.size, 1)
+    if cyclic and (directions := equations.closing(place, start)).shape[1]:
+        slack = problem.state("closure", directions.shape[1], guess=0.0)
+        problem.dynamics(slack, np.zeros(directions.shape[1]))
+        closure = ca.mtimes(ca.DM(directions), slack)
 
     running: Any = 0
     if formulation == "rates":
         rates = problem.control("rates", lower=-speed, upper=speed, guess=_guess(local, "joint_rates"))
-        base_rate, twist = machine.base_rate(base, joints, rates), machine.tip_twist(base, joints, rates)
-        base_rate, twist = ca.cse([base_rate, twist])  # both contain the kinematics
-        problem.path("task", twist[start.rows] - velocity, lower=0, upper=0)
+        base_rate = machine.base_rate(base, joints, rates)
+        residual = equations.residual(base, joints, rates, targets)
+        base_rate, residual = ca.cse([base_rate, residual])  # both contain the kinematics
+        problem.path("task", residual - closure, lower=0, upper=0)
     else:
         null = problem.control("null", machine.joint_size, guess=0.0)  # local motion has no part there
-        task = machine.tip_jacobian(base, joints)[start.rows, :]
-        both = least_rates(task, ca.horzcat(velocity, ca.mtimes(task, null)))
+        wanted = equations.right(base, joints, targets) + closure
+        root = np.sqrt(heavy)  # in the scaled rates root x2' the weights are one
+        scaled = ca.mtimes(equations.jacobian(base, joints), ca.diag(1 / ca.DM(root)))
+        both = least_rates(scaled, ca.horzcat(wanted, ca.mtimes(scaled, null)))
         idle = both[:, 1]  # G# G u, without effect
-        rates = null + both[:, 0] - idle
+        rates = (null + both[:, 0] - idle) / ca.DM(root)
         base_rate, rates, idle = ca.cse([machine.base_rate(base, joints, rates), rates, idle])
         running += ca.dot(idle, idle) / 2
         if np.isfinite(speed).any():
@@ -130,8 +163,46 @@ def minimum_velocity(
     if machine.base_size:
         problem.dynamics(base, base_rate)
     problem.dynamics(joints, rates)
-    problem.minimize(running=running + ca.dot(rates, rates) / 2)
+    if free_start:
+        _start_conditions(problem, equations, place, start, base, joints)
+        if cyclic:
+            problem.end("cyclic", joints - problem.at_start(joints), 0, 0)
+    problem.minimize(running=running + ca.dot(rates, ca.DM(heavy) * rates) / 2)
     return problem
+
+
+def _local_motion(
+    equations: TaskEquations, start: Array, base: Array, horizon: float, weights: Array, damping: float
+) -> LocalSolution:
+    """Damped local motion over as much of the horizon as can be, with more damping where it stops early."""
+    jacobian = np.array(ca.DM(equations.jacobian(base, start)))
+    size, best = float(np.linalg.norm(jacobian)) / np.sqrt(equations.size), None
+    while True:
+        local = resolve(
+            equations.machine,
+            task=[part.task for part in equations.bound],
+            start_joints=start,
+            horizon=horizon,
+            start_base=base,
+            weights=weights,
+            damping=damping * size,
+            tolerance=GUESS_TOLERANCE,
+            check_start=False,
+        )
+        best = local if best is None or local.t[-1] > best.t[-1] else best
+        if local.stopped is None or damping >= LARGEST_DAMPING:
+            return best
+        damping = min(5 * damping, LARGEST_DAMPING)
+
+
+def _start_conditions(
+    problem: Problem, equations: TaskEquations, place: Array, start: Array, base: Any, joints: Any
+) -> None:
+    """The tip is where the pose tasks begin, and for velocity tasks where it is at the joints given."""
+    at_zero = equations.target_function()(0.0)
+    pose = np.repeat([part.task.is_pose for part in equations.bound], [part.task.size for part in equations.bound])
+    error = equations.error(base, joints, at_zero)[np.flatnonzero(pose).tolist()]
+    problem.start("start pose", ca.vertcat(error, equations.holding(base, joints, place, start)), 0, 0)
 
 
 def _limits(machine: Machine, limits: bool) -> tuple[Array, Array, Array]:
@@ -152,4 +223,7 @@ def _check_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -
 
 
 def _guess(local: LocalSolution, what: str) -> Samples:
-    return Samples(local.t, getattr(local, what))
+    times, values = local.t, getattr(local, what)
+    if what == "joint_rates" and local.stopped is not None:  # it stands still from there
+        times, values = np.append(times, times[-1] + 1e-9), np.vstack([values, 0 * values[-1:]])
+    return Samples(times, values)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath, Limits, PathLike, line_demands
+from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names, line_demands
 from ocp.schedule.profile import Array
 
 __all__ = ["Grid", "make_grid"]
@@ -85,7 +85,14 @@ def _permitted(path: PathLike, limits: Limits, joints: JointPath | None, s: Arra
     with np.errstate(divide="ignore"):
         speeds = (1 / demand) ** (1 / power[:, None])
     cause = speeds.argmin(axis=0)
-    return np.take_along_axis(speeds, cause[None], axis=0)[0], cause
+    permitted = np.take_along_axis(speeds, cause[None], axis=0)[0]
+    if not (permitted > 0).all():  # nan too
+        at = int((~(permitted > 0)).argmax())
+        name = cause_names(joints.names if joints is not None else ())[int(cause[at])]
+        raise ProblemError(
+            f"at {s[at]:g} m the {name} limit permits no speed at all, the arm is singular there; keep the path away"
+        )
+    return permitted, cause
 
 
 def _asked(path: PathLike, s: Array, asked: Array) -> Array:

@@ -90,8 +90,10 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name, finite in (("speed", True), ("acceleration", True), ("jerk", True), ("centripetal", False)):
-            _check(name, getattr(self, name), finite)
+            _check(name, getattr(self, name), finite, 1 if name == "speed" else 0)
         if self.joints is not None:
+            if not isinstance(self.joints, JointLimits):
+                raise ProblemError(f"joint limits {self.joints!r} must be a JointLimits")
             for name in ("velocity", "acceleration", "jerk"):
                 _check(f"joint {name}", getattr(self.joints, name), False)
 
@@ -107,11 +109,13 @@ class Limits:
         return np.array(rows)
 
 
-def _check(name: str, value: ArrayLike, finite: bool) -> None:
+def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> None:
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{name} limit {value!r} is not numeric") from error
+    if array.ndim > dimensions:
+        raise ProblemError(f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}")
     wrong = ~(array > 0) | (finite & ~np.isfinite(array))
     if array.size == 0 or wrong.any():
         bad = float(array[wrong].flat[0]) if array.size else np.nan
@@ -139,7 +143,8 @@ def line_demands(
         number = rates.first.shape[1]
         bounds = limits.of_joints(number)
         for order, derivative in enumerate((rates.first, rates.second, rates.third)):
-            rows.append(np.abs(derivative.T) / bounds[order][:, None])
+            with np.errstate(invalid="ignore"):  # inf over inf, at a singular arm
+                rows.append(np.abs(derivative.T) / bounds[order][:, None])
             powers += [order + 1.0] * number
     return np.concatenate(rows), np.array(powers)
 

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ocp.errors import ProblemError
+from ocp.schedule.attempt import TOLERANCE, Attempt
 from ocp.schedule.grid import make_grid
 from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names
 from ocp.schedule.profile import Array, Motion, SpeedProfile
-from ocp.schedule.search import Attempt, search
+from ocp.schedule.search import search
 
 __all__ = ["Dip", "Schedule", "schedule"]
-
-TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
     """
     if limits.joints is not None and joints is None:
         raise ProblemError(
-            "joint limits need the joints along the path: schedule(path, limits, joints=arm.along(path))"
+            "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
         )
     limited = joints if limits.joints is not None else None
     grid = make_grid(path, limits, limited)
@@ -120,7 +119,7 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
         raise ProblemError(
-            f"the asked speed breaks limits in {len(dips)} places; ask for less, larger blends, or "
+            f"the asked speed breaks limits in {len(dips)} place(s); ask for less, larger blends, or "
             f"strict=False:\n  {listed}"
         )
     return Schedule(path, limits, found.profile, dips, joints)
@@ -155,4 +154,23 @@ def _dips(state: Attempt, limits: Limits, names: tuple[str, ...]) -> tuple[Dip, 
                 float(state.acceleration[inside].min()),
             )
         )
-    return tuple(dips)
+    return tuple(_joined(dips, state))
+
+
+def _joined(dips: list[Dip], state: Attempt) -> list[Dip]:
+    """Dips of one cause between which the schedule never gets back to the asked speed are one."""
+    peaks, grid = state.profile.peaks(), state.grid
+    order = np.argsort(peaks.distance)
+    places = peaks.distance[order]
+    at = np.clip(np.searchsorted(grid.distance, places, side="right") - 1, 0, len(grid.asked) - 1)
+    back = peaks.speed[order] >= grid.asked[at] * (1 - TOLERANCE)
+    joined: list[Dip] = []
+    for dip in dips:
+        last = joined[-1] if joined else dip
+        between = slice(*np.searchsorted(places, [last.end, dip.start]))
+        if joined and (last.cause, last.asked) == (dip.cause, dip.asked) and not back[between].any():
+            speed, acceleration = min(last.speed, dip.speed), min(last.acceleration, dip.acceleration)
+            joined[-1] = Dip(last.start, dip.end, dip.cause, dip.asked, speed, acceleration)
+        else:
+            joined.append(dip)
+    return joined

@@ -66,7 +66,11 @@ class SpeedProfile:
             raise ProblemError(f"time {wrong[:3].tolist()} s is outside the schedule, 0 to {self.duration:g} s")
         t = np.clip(t, 0.0, self.duration)
         piece = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.jerk) - 1)
-        return self._inside(piece, t - self.t[piece])
+        motion = self._inside(piece, t - self.t[piece])
+        # the end is known, but for rounding the pieces lead to it
+        for values, last in zip(motion[:4], (self.t, self.distance, self.speed, self.acceleration), strict=True):
+            values[t == self.duration] = last[-1]
+        return motion
 
     def at_distance(self, distance: ArrayLike) -> Motion:
         """Motion where the path has the given distances from its start, shape (M,), m; the first time, at a rest.
@@ -85,6 +89,13 @@ class SpeedProfile:
         inside = self._time_inside(piece, s - self.distance[piece])
         # at rest the time is the cube root of a rounding error: the end is known exactly
         return self._inside(piece, np.where(s == length, np.diff(self.t)[-1], inside))
+
+    def peaks(self) -> Motion:
+        """Motion wherever the speed may be largest: at the bounds of the pieces, and where one stops accelerating."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turn = -self.acceleration[:-1] / self.jerk
+        inside = np.flatnonzero((turn > 0) & (turn < np.diff(self.t)))
+        return self.at(np.concatenate([self.t, self.t[:-1][inside] + turn[inside]]))
 
     def function(self) -> Any:
         """casadi Function time (s) -> (distance, speed, acceleration, jerk); MX with the pieces as tables, makes C.

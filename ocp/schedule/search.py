@@ -2,56 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
+from ocp.schedule.attempt import TOLERANCE, Attempt
+from ocp.schedule.easing import ease_ramps
 from ocp.schedule.grid import Grid
-from ocp.schedule.limits import JointPath, Limits, joint_demands
-from ocp.schedule.profile import Array, Motion, SpeedProfile
-from ocp.schedule.zones import Memory, Zones, plan
+from ocp.schedule.limits import JointPath, Limits
+from ocp.schedule.profile import SpeedProfile
+from ocp.schedule.relaxing import relax_ramps
+from ocp.schedule.zones import plan
 
-__all__ = ["Attempt", "search"]
+__all__ = ["search"]
 
 ROUNDS = 200
 RELIEVED = 40
 """After so many rounds every place that is still too fast gets its own permitted speed as a limit."""
 SPREAD = 1.2
 """A stretch of one limit spans permitted speeds up to this ratio."""
-STEADY_SHARE = 0.8
-"""Where a steady speed alone takes more than this share of a joint limit, a ramp there needs a lower speed as well."""
-TOLERANCE = 1e-9
 GENTLER = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0)
 """Slower ramps tried where joint limits bind on ramps: acceleration over the square, jerk over the cube of these."""
-
-
-@dataclass(eq=False)
-class Attempt:
-    """Limits in each interval of the grid, lowered until the plan keeps all.
-
-    Attributes:
-        grid: Where they are looked at.
-        speed, acceleration, jerk: Limits of each interval. Shape (G - 1,).
-        ramp_cause: Row of `cause_names` that made a ramp gentler there, or -1. Shape (G - 1,).
-        gentler: Ramps of the whole path are this much slower in time.
-        profile: The plan.
-    """
-
-    grid: Grid
-    speed: Array
-    acceleration: Array
-    jerk: Array
-    ramp_cause: NDArray[np.intp]
-    gentler: float = 1.0
-    memory: Memory = field(default_factory=dict)
-    profile: SpeedProfile = field(init=False)
-
-    def zones(self) -> Zones:
-        values = np.stack([self.speed, self.acceleration, self.jerk])
-        starts = np.concatenate([[0], 1 + np.flatnonzero((np.diff(values, axis=1) != 0).any(axis=0))])
-        return Zones(self.grid.distance[np.append(starts, len(self.speed))], *values[:, starts])
 
 
 def search(grid: Grid, limits: Limits, joints: JointPath | None) -> Attempt:
@@ -60,12 +30,13 @@ def search(grid: Grid, limits: Limits, joints: JointPath | None) -> Attempt:
     Raises:
         ProblemError: No attempt kept the limits.
     """
-    best = _attempt(grid, limits, joints, 1.0)
-    if best is not None and (best.ramp_cause < 0).all():
-        return best
+    passed: set[tuple[float, ...]] = set()
+    best = _attempt(grid, limits, joints, 1.0, passed)
+    if joints is None or (best is not None and (best.ramp_cause < 0).all()):
+        return _found(best, grid)
     worse = 0
     for gentler in GENTLER:
-        other = _attempt(grid, limits, joints, gentler)
+        other = _attempt(grid, limits, joints, gentler, passed)
         if other is None:
             continue
         if best is None or other.profile.duration < best.profile.duration:
@@ -74,6 +45,10 @@ def search(grid: Grid, limits: Limits, joints: JointPath | None) -> Attempt:
             worse += 1
             if worse == 3:
                 break
+    return relax_ramps(_found(best, grid), limits, joints, lambda state: _slow_down(state, state.profile, True))
+
+
+def _found(best: Attempt | None, grid: Grid) -> Attempt:
     if best is None:
         raise ProblemError(
             f"no schedule found that keeps the joint limits, after {ROUNDS} rounds; raise the limits, or keep the path "
@@ -82,16 +57,20 @@ def search(grid: Grid, limits: Limits, joints: JointPath | None) -> Attempt:
     return best
 
 
-def _attempt(grid: Grid, limits: Limits, joints: JointPath | None, gentler: float) -> Attempt | None:
+def _attempt(
+    grid: Grid, limits: Limits, joints: JointPath | None, gentler: float, passed: set[tuple[float, ...]]
+) -> Attempt | None:
     count = len(grid.asked)
     acceleration = np.full(count, float(limits.acceleration) / gentler**2)
     jerk = np.full(count, float(limits.jerk) / gentler**3)
-    state = Attempt(grid, grid.asked.copy(), acceleration, jerk, np.full(count, -1, dtype=np.intp), gentler)
+    state = Attempt(
+        grid, grid.asked.copy(), acceleration, jerk, np.full(count, -1, dtype=np.intp), gentler, passed=passed
+    )
     for number in range(ROUNDS):
         state.profile = plan(state.zones(), state.memory)
         if _slow_down(state, state.profile, number >= RELIEVED):
             continue
-        if joints is None or not _ease_ramps(state, state.profile, limits, joints):
+        if joints is None or not ease_ramps(state, limits, joints):
             return state
     return None
 
@@ -101,10 +80,14 @@ def _slow_down(state: Attempt, profile: SpeedProfile, thoroughly: bool) -> bool:
     grid = state.grid
     if not np.isfinite(grid.permitted).any():
         return False
-    # between two points: at most the faster speed, at least the slower permitted one
+    # between two points: the fastest speed, against the slower permitted one
     speed = profile.at_distance(grid.distance).speed
+    top = np.maximum(speed[:-1], speed[1:])
+    peaks = profile.peaks()
+    between = np.clip(np.searchsorted(grid.distance, peaks.distance, side="right") - 1, 0, len(top) - 1)
+    np.maximum.at(top, between, peaks.speed)
     permitted = np.minimum(grid.permitted[:-1], grid.permitted[1:])
-    fast = np.minimum(np.maximum(speed[:-1], speed[1:]), state.speed) > permitted * (1 + TOLERANCE)
+    fast = np.minimum(top, state.speed) > permitted * (1 + TOLERANCE)
     if not fast.any():
         return False
     if thoroughly:
@@ -119,74 +102,3 @@ def _slow_down(state: Attempt, profile: SpeedProfile, thoroughly: bool) -> bool:
         right = int(high[high > least].min(initial=last - first)) + first
         np.minimum(state.speed[left:right], inside[least], out=state.speed[left:right])
     return True
-
-
-def _ease_ramps(state: Attempt, profile: SpeedProfile, limits: Limits, joints: JointPath) -> bool:
-    """Lower acceleration and jerk limits where a ramp breaks a joint limit; False when none does."""
-    phase, motion = _samples(state.grid, profile)
-    if not len(phase):
-        return False
-    whole, steady = joint_demands(limits, joints.at(motion.distance), motion)
-    worst = whole.argmax(axis=0)
-    demand = np.take_along_axis(whole, worst[None], axis=0)[0]
-    if demand.max() <= 1 + TOLERANCE:
-        return False
-    share = np.take_along_axis(steady, worst[None], axis=0)[0]
-    sign = np.sign(np.diff(profile.speed))
-    ramp = np.concatenate([[0], np.cumsum(np.diff(sign) != 0)])  # phases of one sense belong together
-    number = len(joints.names)
-    for one in np.unique(ramp[phase[demand > 1 + TOLERANCE]]):
-        mine = np.flatnonzero((ramp[phase] == one) & (demand > 1 + TOLERANCE))
-        at = int(mine[demand[mine].argmax()])
-        factor = np.min(
-            (1 - np.minimum(share[mine], STEADY_SHARE)) / (demand[mine] - np.minimum(share[mine], STEADY_SHARE))
-        )
-        factor = float(np.clip(0.99 * factor, 0.3, 0.98))
-        phases = np.flatnonzero(ramp == one)
-        begin, end = profile.distance[phases[0]], profile.distance[phases[-1] + 1]
-        longer = (end - begin) * (1 / factor - 1)
-        rising = sign[phases[0]] > 0
-        low = begin if rising else begin - longer
-        high = end + longer if rising else end
-        first, last = _interval(state.grid, low), _interval(state.grid, high)
-        worst_interval = _interval(state.grid, float(motion.distance[at]))
-        stretch = slice(first, last + 1)
-        changed = state.acceleration[stretch] > factor * state.acceleration[worst_interval]
-        state.ramp_cause[stretch] = np.where(changed, 1 + number + worst[at], state.ramp_cause[stretch])
-        np.minimum(
-            state.acceleration[stretch], factor * state.acceleration[worst_interval], out=state.acceleration[stretch]
-        )
-        np.minimum(state.jerk[stretch], factor * state.jerk[worst_interval], out=state.jerk[stretch])
-        hot = mine[share[mine] > STEADY_SHARE]
-        if hot.size:
-            power = np.where(worst[hot] < number, 2, 3)
-            ceiling = float(np.min(motion.speed[hot] * (STEADY_SHARE / share[hot]) ** (1 / power)))
-            places = [_interval(state.grid, float(s)) for s in motion.distance[hot]]
-            reached = slice(max(min(places) - 1, 0), max(places) + 2)
-            np.minimum(state.speed[reached], ceiling, out=state.speed[reached])
-    return True
-
-
-def _interval(grid: Grid, distance: float) -> int:
-    return int(np.clip(np.searchsorted(grid.distance, distance, side="right") - 1, 0, len(grid.asked) - 1))
-
-
-def _samples(grid: Grid, profile: SpeedProfile) -> tuple[NDArray[np.intp], Motion]:
-    """Motion on the ramps: at the grid's points, at each phase's ends and inside it, with the jerk of the phase."""
-    durations = np.diff(profile.t)
-    even = (profile.jerk == 0) & (profile.acceleration[:-1] == 0)
-    moving = np.flatnonzero(~even)
-    fractions = np.linspace(0, 1, 9)
-    inside = (profile.t[moving, None] + durations[moving, None] * fractions).ravel()
-    phase = np.repeat(moving, len(fractions))
-    at_grid = profile.at_distance(np.concatenate([grid.distance, grid.before])).t
-    owner = np.clip(np.searchsorted(profile.t, at_grid, side="right") - 1, 0, len(even) - 1)
-    kept = ~even[owner]
-    phase = np.concatenate([phase, owner[kept]])
-    t = np.concatenate([inside, at_grid[kept]])
-    motion = profile.at(np.minimum(t, profile.duration))
-    # at a phase's end the profile shows what comes after; the jerk before it counts too
-    start = profile.t[phase]
-    local = t - start
-    j = profile.jerk[phase]
-    return phase, motion._replace(jerk=j, acceleration=profile.acceleration[phase] + local * j)

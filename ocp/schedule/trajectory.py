@@ -83,8 +83,15 @@ class JointTrajectory:
         return cls(names, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def to_ros(self) -> dict[str, Any]:
-        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there."""
+        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there.
+
+        Raises:
+            ProblemError: Times less than a nanosecond apart.
+        """
         nanoseconds = np.round(self.t * 1e9).astype(np.int64)
+        if (np.diff(nanoseconds) <= 0).any():
+            at = int((np.diff(nanoseconds) <= 0).argmax())
+            raise ProblemError(f"trajectory: times {self.t[at]!r} and {self.t[at + 1]!r} s are the same nanosecond")
         points = [
             {
                 "positions": q,
@@ -109,7 +116,8 @@ class JointTrajectory:
         """Read what to_ros made: the same numbers, times to the nanosecond. ProblemError when a field is missing."""
         try:
             points = message["points"]
-            t = np.array([p["time_from_start"]["sec"] + p["time_from_start"]["nanosec"] / 1e9 for p in points])
+            stamps = [p["time_from_start"] for p in points]
+            t = np.array([(stamp["sec"] * 10**9 + stamp["nanosec"]) / 1e9 for stamp in stamps])
             values = [np.array([p[kind] for p in points], dtype=float) for kind in KINDS]
             names = tuple(message["joint_names"])
         except (KeyError, TypeError, ValueError) as error:
@@ -130,6 +138,13 @@ def joint_motion(joints: JointPath, motion: Motion) -> tuple[Array, Array, Array
 
 
 def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
-    """Joints every `period` s from the start to the end of a schedule; ProblemError for a bad period."""
-    motion = schedule.sample(period)
-    return JointTrajectory(tuple(joints.names), motion.t, *joint_motion(joints, motion)[:3])
+    """Joints every `period` s from the start to the end of a schedule; ProblemError for a bad period.
+
+    Times are whole nanoseconds, those of the message, and the joints are those of these times; the last is the first
+    one at or after the end, at rest.
+    """
+    whole = np.round(schedule.sample(period).t * 1e9)
+    whole[-1] = np.ceil(schedule.duration * 1e9)
+    t = np.unique(whole) / 1e9
+    motion = schedule.at(np.minimum(t, schedule.duration))
+    return JointTrajectory(tuple(joints.names), t, *joint_motion(joints, motion)[:3])

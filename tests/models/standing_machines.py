@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from models import Joint, Link, Robot
+from models import Joint, Link, Robot, planar_chain
 from models.standing import Standing
 from models.support import Support, rectangle
 from tests.models.trees import Array, random_robot, random_rotation
@@ -33,6 +35,30 @@ def standing_arm() -> Standing:
         )
     robot = Robot(tuple(links), tuple(joints), tip_translation=(0.0, 0.0, lengths[-1]))
     return Standing(robot, support=rectangle((-0.15, 0.15), (-0.2, 0.2)))
+
+
+def six_joint_arm() -> Standing:
+    """Six joints as industrial arms have them, shoulder and wrist offset, on a foot of 0.36 m x 0.36 m; 40 kg."""
+    places = ((0, 0, 0.12), (0.05, 0.06, 0.1), (0.35, 0, 0), (0.3, -0.05, 0), (0, 0, 0.08), (0.08, 0, 0))
+    axes = ((0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0))
+    centers = ((0, 0.02, 0.04), (0.17, 0, 0), (0.15, -0.02, 0), (0, 0, 0.03), (0.04, 0, 0), (0, 0.01, 0.02))
+    links, joints = [Link("foot", 18.0, (0.0, 0.0, 0.04), np.diag([0.3, 0.3, 0.5]))], []
+    for i, mass in enumerate((6.0, 7.0, 4.5, 2.0, 1.5, 1.0)):
+        links.append(Link(f"link{i + 1}", mass, centers[i], mass * np.diag([0.004, 0.01, 0.01])))
+        ends = links[i].name, links[i + 1].name
+        joint = Joint(f"joint{i + 1}", "revolute", *ends, places[i], axis=axes[i])
+        joints.append(replace(joint, lower=-3.0, upper=3.0, velocity=5.0, effort=250.0))
+    robot = Robot(tuple(links), tuple(joints), tip_translation=(0.0, 0.02, 0.1))
+    return Standing(robot, support=rectangle((-0.18, 0.18), (-0.18, 0.18)))
+
+
+def planar_machine(size: int) -> Standing:
+    """A chain of `size` links, 1.9 m long and 50 kg, in the y-z plane on a foot from y = -0.12 to 0.2 m."""
+    share = np.linspace(1.3, 0.7, size)
+    robot = planar_chain(1.9 * share / share.sum(), 50.0 * share**2 / (share**2).sum())
+    joints = tuple(replace(joint, lower=-3.0, upper=3.0, velocity=3.0, effort=400.0) for joint in robot.joints)
+    turn = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]  # the chain's x, y, z become the world's y, z, x
+    return Standing(replace(robot, joints=joints), rotation=turn, support=rectangle((-0.1, 0.1), (-0.12, 0.2)))
 
 
 def random_standing(rng: np.random.Generator, size: int) -> Standing:

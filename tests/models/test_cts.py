@@ -67,19 +67,27 @@ def test_tool_rotation_is_yaw_pitch_roll_of_the_pose(sizes: list[float], seed: i
 
 
 def test_inverse_of_forward_holds_the_joints_among_its_branches() -> None:
+    """To 1e-10 wherever the pose, rounded to double, says so; near a stretched link it does not.
+
+    There the rounding of the pose itself, 1e-16, is amplified by 1 / |cos q4 sin q2|: the inverse taken in extended
+    precision is off by as much. Of 1e5 targets that is more than 1e-10 for a few with that product below 2e-5.
+    """
     rig, count = reference_rig(), 100_000
     q = np.random.default_rng(6).uniform(-np.pi, np.pi, (6, count))
-    # a stretched link amplifies the rounding of the pose itself by 1 / |cos q4 sin q2|
     bent = np.abs(np.cos(q[3]) * np.sin(q[1]))
     joints, x, roll = ca.SX.sym("q", 6), ca.SX.sym("x", 5), ca.SX.sym("roll")
     pose = np.array(ca.Function("f", [joints], [forward(rig, joints)]).map(count)(q))
-    nearest = np.full(count, np.inf)
+    nearest, exact = np.full((2, count), np.inf)
     for branch in BRANCHES:
         found = ca.Function("i", [x, roll], [inverse(rig, x, roll, branch)[0]]).map(count)(pose[:5], pose[5:])
         nearest = np.minimum(nearest, np.abs(np.array(found) - q).max(axis=0))
+        extended = joints_by_geometry(rig, pose[:5].astype(np.longdouble), pose[5].astype(np.longdouble), branch)[0]
+        exact = np.fmin(exact, np.abs(extended - q).max(axis=0).astype(float))
     assert (nearest * bent).max() < 1e-14
-    assert nearest[bent > 1e-4].max() < 1e-10
-    assert np.mean(bent > 1e-4) > 0.998
+    assert nearest[bent > 2e-5].max() < 1e-10
+    assert np.mean(bent > 2e-5) > 0.9995
+    assert np.mean(nearest > 1e-10) <= 1e-4
+    assert nearest.max() < 3 * exact.max()
 
 
 @given(lengths, seeds)

@@ -15,7 +15,7 @@ from models.cts_optimal import optimal_inverse
 from models.cts_roll import ACTIVE, STATUS
 from models.cts_table import Table, all_joint_sets, reachable_arcs, solve_table
 from models.errors import ModelError
-from models.harmonics import Harmonics, roots, series_roots
+from models.harmonics import Harmonics, least_point, roots, series_roots
 from tests.models.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {
@@ -109,6 +109,32 @@ def test_other_rigs_tunnels_and_branches(sizes: list[float], seed: int, branch: 
     targets = np.array(ca.Function("f", [symbol], [forward(rig, symbol)]).map(40)(q))[:5]
     rate_weight = float(rng.choice([0.0, 0.1, 2.0]))
     check_against_grid(rig, tunnel, branch, targets, rng.uniform(-3, 3, 40), 240, rate_weight)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "limits"),
+    [
+        (None, {"lower": (1.2, -1.2, -4.8, -2.3, -1.9, -4.0), "upper": (1.6, 3.9, 1.2, 2.8, 2.8, 0.5)}),
+        (None, {"lower": (0.2, -3.8, -2.8, -3.7, -3.0, -3.5), "upper": (0.9, 1.2, 3.2, 1.1, 3.1, 2.2)}),
+        (0.0, {"lower": (0.5, *[-np.inf] * 5), "upper": (1.0, *[np.inf] * 5)}),
+        (np.pi / 2, {}),
+        (0.0, {}),
+    ],
+)
+@pytest.mark.parametrize("branch", [Branch(-1, -1), Branch(1, 1)])
+def test_several_arcs_and_special_yaws(yaw: float | None, limits: dict[str, Any], branch: Branch) -> None:
+    """Limits that leave out a window, so that arcs end and begin again; equations with double roots."""
+    rng = np.random.default_rng(12)
+    rig = Rig(0.76, 0.44, 0.22, 1.32, 0.95, 1.5, **limits)
+    low, high = np.maximum(rig.lower, -np.pi), np.minimum(rig.upper, np.pi)
+    q, symbol = rng.uniform(low[:, None], high[:, None], (6, 1500)), ca.SX.sym("q", 6)
+    targets = np.array(ca.Function("f", [symbol], [forward(rig, symbol)]).map(1500)(q))[:5]
+    if yaw is not None:
+        targets[3] = yaw
+        targets[4, ::2] = 0.0
+    tunnel = Tunnel((-0.6, -0.8, 2.0), (1.2, 1.7, 1.3), (1.2, 0.8, 0.2))
+    for rate_weight in (0.0, 0.5):
+        check_against_grid(rig, tunnel, branch, targets, rng.uniform(-3, 3, 1500), 480, rate_weight)
 
 
 def test_closed_form_without_limits_is_the_least_index_of_all_rolls() -> None:
@@ -293,6 +319,19 @@ def test_roots_are_among_the_four_points(values: list[float]) -> None:
         slope = f.derivative().value(np.cos(angle), np.sin(angle))
         gap = np.hypot(points[:, 0] - np.cos(angle), points[:, 1] - np.sin(angle)).min()
         assert gap < 1e-5 / max(abs(float(ca.DM(slope))), 1e-3)
+
+
+@given(st.lists(coefficient, min_size=5, max_size=5), st.booleans())
+def test_least_point_is_the_least_of_all(values: list[float], cusp: bool) -> None:
+    a0, a1, b1, a2, b2 = values
+    if cusp:  # where three stationary points are nearly one
+        a1, b1, b2 = -4 * abs(a2) * (1 + 1e-7 * a0), 1e-9 * b1, 0.0
+    f = Harmonics(*(ca.SX(value) for value in (a0, a1, b1, a2, b2)))
+    c, s = (float(ca.DM(part)) for part in least_point(f))
+    assert np.hypot(c, s) == pytest.approx(1, abs=1e-12)
+    angles = np.append(np.linspace(-np.pi, np.pi, 3000), np.arctan2(s, c))
+    every = a0 + a1 * np.cos(angles) + b1 * np.sin(angles) + a2 * np.cos(2 * angles) + b2 * np.sin(2 * angles)
+    assert every[-1] <= every.min() + 1e-13 * (1 + np.abs(values).sum())
 
 
 def test_roots_of_higher_degree_are_found_all_at_once() -> None:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import pinocchio
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,7 +26,10 @@ from models import (
 )
 from models.free_floating import PLANAR_ROWS
 from models.linear import solve_spd
+from models.machine import with_tip
 from models.spatial import Frame
+from models.virtual_chain import VirtualChain
+from tests.models.pinocchio_robots import ROBOTS, Peer, random_state, swapped, urdf_file
 from tests.models.trees import (
     Array,
     Base,
@@ -327,3 +332,115 @@ def test_point_masses_on_a_bent_arm_have_inertia_enough() -> None:
     place, q, rates = machine.base_home(), np.array([0.5, 0.7]), np.array([1.0, -2.0])
     rate = machine.base_rate(place, q, rates)
     np.testing.assert_allclose(numeric(machine.momentum_residual(place, q, rate, rates)), 0, atol=1e-14)
+
+
+@settings(max_examples=10)
+@given(seeds, st.integers(2, 6), bases)
+def test_a_momentum_that_is_given_is_conserved_along_an_integrated_motion(seed: int, size: int, base: Base) -> None:
+    """Momentum by finite differences of the link poses; the centre of mass moves at P / m."""
+    rng = np.random.default_rng(seed)
+    plain = random_machine(rng, size, base)
+    given = rng.normal(size=len(plain.twist_rows))
+    machine = replace(plain, conserved_momentum=given)
+    full = np.zeros(6)
+    full[machine.twist_rows] = given
+    motion, start, step = Motion(machine, rng), random_base(rng, base), 2e-3
+    robot, place, time = machine.robot, start, 0.0
+    center = numeric(center_of_mass(robot, motion.joints(0.0), machine.world_from_base(start))).ravel()
+    for end in (0.6, 1.5):
+        place, time = motion.base(place, time, end), end
+        moved = numeric(center_of_mass(robot, motion.joints(time), machine.world_from_base(place))).ravel()
+        np.testing.assert_allclose(moved, center + full[3:] / robot.total_mass * time, atol=1e-8)
+        near = [
+            poses_at(machine, motion.base(place, time, time + k * step), motion.joints(time + k * step))
+            for k in range(-2, 3)
+        ]
+        about_origin = np.concatenate([full[:3] + np.cross(moved, full[3:]), full[3:]])
+        found = momentum_by_differences(robot, near, step)
+        np.testing.assert_allclose(found[machine.twist_rows], about_origin[machine.twist_rows], atol=1e-6)
+
+
+@few
+@given(seeds, sizes, bases)
+def test_momentum_makes_base_and_tip_move_affinely_with_the_generalized_jacobian_unchanged(
+    seed: int, size: int, base: Base
+) -> None:
+    rng = np.random.default_rng(seed)
+    plain = random_machine(rng, size, base)
+    machine = replace(plain, conserved_momentum=rng.normal(size=len(plain.twist_rows)))
+    place, q = random_base(rng, base), rng.normal(size=machine.joint_size)
+    rates = rng.normal(size=machine.joint_size)
+    drift = numeric(machine.tip_twist(place, q, np.zeros(machine.joint_size)))
+    jacobian = numeric(machine.tip_jacobian(place, q))
+    np.testing.assert_array_equal(jacobian, numeric(plain.tip_jacobian(place, q)))
+    np.testing.assert_allclose(
+        numeric(machine.tip_twist(place, q, rates)).ravel(), jacobian @ rates + drift.ravel(), atol=1e-10
+    )
+    by_base, by_joints = map(numeric, machine.jacobians(place, q))
+    twist = numeric(machine.base_twist(place, q, rates)).ravel()
+    np.testing.assert_allclose(
+        numeric(machine.tip_twist(place, q, rates)).ravel(), by_base @ twist + by_joints @ rates, atol=1e-10
+    )
+    rate = machine.base_rate(place, q, rates)
+    np.testing.assert_allclose(numeric(machine.twist_of_rate(place, rate)).ravel(), twist, atol=1e-10)
+    np.testing.assert_allclose(numeric(machine.momentum_residual(place, q, rate, rates)), 0, atol=1e-10)
+
+
+def test_a_rigid_body_with_locked_joints_turns_about_its_axis_and_drifts() -> None:
+    """Symmetric body: omega = L / I, v = P / m, the centre of mass at the base's origin."""
+    body = Link("body", 10.0, inertia=np.diag([2.0, 2.0, 2.0]))
+    pin = Joint("pin", "revolute", "body", "pointer", axis=(1, 0, 0))
+    machine = FreeFloating(Robot((body, Link("pointer")), (pin,)), conserved_momentum=(0.2, 0.4, -0.6, 1.0, 2.0, 3.0))
+    twist = numeric(machine.base_twist([1.0, 2.0, 3.0, 0.0, 0.6, 0.8, 0.0], [0.3], [0.0])).ravel()
+    np.testing.assert_allclose(twist, [0.1, 0.2, -0.3, 0.1, 0.2, 0.3], atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["floating manipulator", "panda", "talos"])
+def test_the_momentum_that_is_given_is_that_of_pinocchio(name: str) -> None:
+    package, ending, told = ROBOTS[name]
+    path = urdf_file(package, ending)
+    robot = Robot.from_urdf(path, **told)
+    peer, rng = Peer.of(path, robot), np.random.default_rng(7)
+    given = rng.normal(size=6)
+    machine = FreeFloating(robot, conserved_momentum=given)
+    b, q, rates = (ca.SX.sym(n, k) for n, k in (("b", 7), ("q", robot.dof), ("r", robot.dof)))
+    moved = ca.Function("f", [b, q, rates], [machine.base_twist(b, q, rates), machine.tip_twist(b, q, rates)])
+    frame = peer.model.getFrameId(str(robot.tip))
+    for _ in range(10):
+        state = random_state(robot, rng)
+        twist, tip = (numeric(part).ravel() for part in moved(state.base, state.q, state.qd))
+        state = replace(state, base_twist=twist)
+        configuration, velocity = peer.configuration(state), peer.velocity(state)
+        momentum = pinocchio.computeCentroidalMomentum(peer.model, peer.data, configuration, velocity)
+        np.testing.assert_allclose(swapped(np.array(momentum.vector)), given, atol=1e-9)
+        pinocchio.forwardKinematics(peer.model, peer.data, configuration, velocity)
+        world = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        found = pinocchio.getFrameVelocity(peer.model, peer.data, frame, world).vector
+        np.testing.assert_allclose(tip, swapped(np.array(found)), atol=1e-9)
+
+
+@pytest.mark.parametrize("momentum", [(1.0, 2.0, 3.0), (np.nan,) * 6, "fast"])
+def test_a_momentum_of_the_wrong_size_is_refused(momentum: Any) -> None:
+    with pytest.raises(ModelError, match="spatial free-floating base: conserved_momentum"):
+        FreeFloating(planar_chain([1.0], [1.0], base=free_base()), conserved_momentum=momentum)
+
+
+def test_the_virtual_chain_refuses_momentum() -> None:
+    with pytest.raises(ModelError, match="zero momentum only"):
+        VirtualChain.from_machine(replace(paper_example(), conserved_momentum=(1.0, 0.0, 0.0)))
+
+
+def test_with_tip_moves_the_frame_of_interest_and_nothing_else() -> None:
+    machine = paper_example()
+    q, base = np.array([0.3, 0.4, -0.5]), np.array([0.1, 0.2, 0.3])
+    elbow = with_tip(machine, "link2", (0.5, 0.0, 0.0))
+    expected = numeric(link_frames(machine.robot, q, machine.world_from_base(base))["link2"].point([0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(numeric(elbow.tip_pose(base, q).position), expected, atol=1e-14)
+    rates = np.array([0.3, -0.2, 0.1])
+    same = [numeric(some.base_rate(base, q, rates)) for some in (machine, elbow)]
+    np.testing.assert_allclose(same[0], same[1], atol=1e-14)
+    root = with_tip(machine, "base")
+    spin = numeric(machine.base_twist(base, q, rates))[0]
+    np.testing.assert_allclose(numeric(root.tip_twist(base, q, rates)).ravel()[2], spin, atol=1e-14)
+    with pytest.raises(ModelError, match="elbow"):
+        with_tip(machine, "elbow")

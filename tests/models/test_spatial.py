@@ -13,6 +13,7 @@ from models.spatial import (
     Frame,
     angular_velocity_from_quaternion,
     cross,
+    expression,
     force_cross,
     force_transform,
     motion_cross,
@@ -218,3 +219,23 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any) -> None:
     found = ca.Function("f", [x, y], everything(x, y))(a, b)
     for one, other in zip(found, everything(ca.DM(a), ca.DM(b)), strict=True):
         np.testing.assert_allclose(numeric(one), numeric(other), atol=1e-14)
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+def test_lists_with_symbols_are_stacked_and_not_read_as_numbers(symbols: Any) -> None:
+    a, b = symbols.sym("a"), symbols.sym("b", 2)
+
+    def value(found: Any) -> Array:
+        return numeric(ca.Function("f", [a, b], [found])(3.0, [5.0, 7.0]))
+
+    assert value(expression([a, 0, 2.5])).ravel().tolist() == [3, 0, 2.5]
+    assert value(expression((b, a))).ravel().tolist() == [5, 7, 3]
+    assert value(expression(np.array([b[0], 1.0, a], dtype=object))).ravel().tolist() == [5, 1, 3]
+    assert value(expression([[a, 1], [0, b[1]]])).tolist() == [[3, 1], [0, 7]]
+    assert value(cross([a, 0, 0], (0, b[0], 0))).ravel().tolist() == [0, 0, 15]
+    assert value(rotation((0, 0, 1), [a])).shape == (3, 3)
+    assert expression([a, 0, 0]).sparsity().nnz() == 1
+
+
+def test_a_list_of_casadi_numbers_is_a_matrix_of_them() -> None:
+    assert numeric(expression([ca.DM(1), 2, ca.DM(3)])).ravel().tolist() == [1, 2, 3]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
+from models import Joint, Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
 from models.dynamics import Wrench
 from models.motion import link_motions
 from models.standing import PAPER_START, Standing, center_of_pressure, paper_example, tip_spring
@@ -17,7 +17,7 @@ from models.standing_motion import standing_motion
 from models.support import rectangle
 from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.standing_machines import random_motion, random_standing, standing_arm
-from tests.models.trees import Array, few, numeric, random_robot, seeds
+from tests.models.trees import Array, few, numeric, random_robot, random_rotation, seeds
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
 sizes = st.integers(1, 6)
@@ -92,16 +92,49 @@ def test_the_zero_moment_point_is_that_of_the_sums_over_links(seed: int, size: i
 def test_zmp_ground_force_and_torque_equal_an_independent_library(
     library: Any, seed: int, size: int, base: Any
 ) -> None:
+    """On a foot that stands anywhere and tilted, with a wrench at the hand and a force at a point of another link."""
     rng = np.random.default_rng(seed)
-    machine = Standing(with_masses(random_robot(rng, size, base), rng), support=FOOT)
+    robot = with_masses(random_robot(rng, size, base), rng)
+    turn, place = random_rotation(rng), rng.normal(size=3)
+    machine = Standing(robot, translation=place, rotation=turn, support=FOOT)
     q, qd, qdd = rng.normal(size=machine.joint_size), *rng.normal(scale=0.5, size=(2, machine.joint_size))
-    wrench = hand(rng, machine)
-    torques, reaction = library(machine.robot, q, qd, qdd, [wrench], machine.gravity_in_world)
+    other = robot.links[int(rng.integers(size + 1))].name
+    wrenches = [hand(rng, machine), Wrench(other, rng.normal(scale=5, size=3), point=rng.normal(size=3))]
+    # the library's root is at its origin: everything in the axes of the foot
+    given = [Wrench(w.link, turn.T @ numeric(w.force), turn.T @ numeric(w.moment), w.point) for w in wrenches]
+    torques, own = library(robot, q, qd, qdd, given, turn.T @ machine.gravity_in_world)
+    force = turn @ own[3:]
+    reaction = np.concatenate([turn @ own[:3] + np.cross(place, force), force])
     expected = np.array([-reaction[1], reaction[0]]) / reaction[5]
-    motion = (q, qd, qdd, [wrench])
+    motion = (q, qd, qdd, wrenches)
     np.testing.assert_allclose(numeric(machine.zero_moment_point(*motion)).ravel(), expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(numeric(machine.ground_reaction(*motion)).ravel(), reaction, rtol=0, atol=1e-9)
     np.testing.assert_allclose(numeric(machine.joint_torques(*motion)).ravel(), torques, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("library", [pinocchio_dynamics, mujoco_dynamics])
+def test_slides_are_weighed_as_an_independent_library_does(library: Any) -> None:
+    """A column that rises and a boom that slides out, which turns: every kind of motion bears on the ground."""
+    rng = np.random.default_rng(7)
+    links = [Link("foot", 4.0, (0, 0, 0.05), np.eye(3))]
+    links += [Link(name, mass, rng.normal(scale=0.2, size=3), np.eye(3) * mass / 50) for name, mass in (
+        ("column", 9.0), ("turret", 6.0), ("boom", 3.0), ("hook", 1.0))]  # fmt: skip
+    kinds = (("prismatic", (0, 0, 1)), ("revolute", (0, 0, 1)), ("prismatic", (1, 0, 0)), ("revolute", (0, 1, 0)))
+    joints = [
+        Joint(f"joint{i}", kind, links[i].name, links[i + 1].name, (0.1, 0, 0.3), axis=axis)  # type: ignore[arg-type]
+        for i, (kind, axis) in enumerate(kinds)
+    ]
+    machine = Standing(Robot(tuple(links), tuple(joints)), support=FOOT)
+    for _ in range(5):
+        q, qd, qdd = rng.normal(size=(3, 4))
+        wrenches = [hand(rng, machine)]
+        torques, reaction = library(machine.robot, q, qd, qdd, wrenches, machine.gravity_in_world)
+        found = numeric(machine.ground_reaction(q, qd, qdd, wrenches)).ravel()
+        np.testing.assert_allclose(found, reaction, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(numeric(machine.joint_torques(q, qd, qdd, wrenches)).ravel(), torques, atol=1e-9)
+        expected = np.array([-reaction[1], reaction[0]]) / reaction[5]
+        point = numeric(machine.zero_moment_point(q, qd, qdd, wrenches)).ravel()
+        np.testing.assert_allclose(point, expected, rtol=1e-9, atol=1e-9)
 
 
 @given(seeds, sizes)
@@ -254,6 +287,8 @@ def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
         ({"most_stable_point": (0.1,)}, "most_stable_point has shape"),
         ({"robot": planar_chain([1.0], [0.0])}, "has no mass"),
         ({"robot": Robot((Link("stone", 1.0),))}, "no moving joint"),
+        ({"gravity": -9.81}, "gravity -9.81 m/s.2 is not positive"),
+        ({"gravity": np.nan}, "gravity .*not finite"),
     ],
 )
 def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message: str) -> None:
@@ -264,3 +299,10 @@ def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message
 def test_a_motion_of_a_wrong_shape_is_refused() -> None:
     with pytest.raises(ModelError, match=r"joint_velocities has shape \(2, 4\), expected \(2, 5\)"):
         standing_motion(paper_example(), [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
+
+
+def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
+    with pytest.raises(ModelError, match=r"link 'link2'.* mass.*-14"):
+        planar_chain((0.44, 0.44), (6.02, -14.0))
+    with pytest.raises(ModelError, match=r"'counterweight'.*-1"):
+        Link("counterweight", -1.0)

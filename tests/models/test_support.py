@@ -37,6 +37,25 @@ def test_a_rectangle_has_its_closed_form() -> None:
     assert float(support.margin((0.0, 0.21))) == pytest.approx(-0.01)
 
 
+def test_the_inner_radius_has_its_closed_forms() -> None:
+    assert rectangle((-0.05, 0.05), (-0.1, 0.2)).inner_radius == pytest.approx(0.05)
+    assert Support([(0, 0), (3, 0), (0, 4)]).inner_radius == pytest.approx(1.0)
+    angles = np.linspace(0, 2 * np.pi, 8)[:-1] + 0.1
+    regular = Support(np.column_stack([np.cos(angles), np.sin(angles)]))
+    assert regular.inner_radius == pytest.approx(np.cos(np.pi / 7))
+
+
+@given(seeds, st.integers(3, 9))
+@few
+def test_no_point_has_a_margin_above_the_inner_radius(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 2))
+    support = Support(points[ConvexHull(points).vertices])
+    margins = [float(ca.DM(support.margin(rng.dirichlet(np.ones(count)) @ points))) for _ in range(50)]
+    assert max(margins) <= support.inner_radius + 1e-12
+    assert 2 * support.inner_radius <= support.half_widths.min() * 2 + 1e-12
+
+
 def test_corners_on_a_straight_edge_are_dropped() -> None:
     support = Support([(0, 0), (1, 0), (2, 0), (2, 1), (0, 1)])
     assert support.vertices.tolist() == [[0, 0], [2, 0], [2, 1], [0, 1]]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from models.standing import Standing
+from models.standing import External, Standing
 from models.standing_motion import StandingMotion
 from tests.models.oracles import mujoco_model
 from tests.models.trees import Array
@@ -19,23 +19,28 @@ STEP = 2.5e-4  # s
 CONTACT = 'friction="2 0.01 0.001" solref="0.004 1" solimp="0.99 0.999 0.0001" condim="4"'
 
 
-def replay(machine: Standing, motion: StandingMotion, fallen: float = 0.3) -> tuple[Array, Array]:
+def replay(
+    machine: Standing, motion: StandingMotion, fallen: float = 0.3, external: External | None = None
+) -> tuple[Array, Array]:
     """Times (K,) and tilts of the foot (K,), rad, until the end or until the foot is tilted by `fallen`.
 
-    The foot is a plate as long as the support and 0.6 m wide, for a machine that moves in the y-z plane. The joints get
-    the torques of the motion and are held to it by servos, softer towards the tip.
+    The foot is a plate of the size of the support, a rectangle; 0.6 m wide for a machine that moves in the y-z plane.
+    The joints get the torques of the motion and are held to it by servos, softer towards the tip. Wrenches from outside
+    act as they do along the motion.
     """
     robot = machine.robot
-    links = [
-        replace(link, mass=FOOT_MASS, inertia=0.02 * FOOT_MASS * np.eye(3)) if link.name == robot.root else link
-        for link in robot.links
-    ]
+    plate = replace(robot.link(robot.root), mass=FOOT_MASS, inertia=0.02 * FOOT_MASS * np.eye(3))
+    bare = robot.link(robot.root).mass == 0
+    links = [plate if bare and link.name == robot.root else link for link in robot.links]
     turn = np.asarray(machine.rotation)
-    center = turn.T @ [0.0, machine.support.center[1], -THICKNESS]
+    spatial = machine.moving_axes == (0, 1)
+    middle, half = machine.support.center, machine.support.half_widths
+    size = (half[0] if spatial else 0.3, half[1], THICKNESS)
+    center = turn.T @ [middle[0] if spatial else 0.0, middle[1], -THICKNESS]
     model = mujoco_model(
         replace(robot, links=tuple(links)),
         ground=f'<geom type="plane" size="5 5 1" pos="0 0 {-2 * THICKNESS}" {CONTACT}/>',
-        foot=f'<geom type="box" size="0.3 {machine.support.half_widths[1]} {THICKNESS}" '
+        foot=f'<geom type="box" size="{_text(np.array(size))}" '
         f'pos="{_text(center)}" quat="{_text(_quaternion(turn.T))}" {CONTACT}/>',
         options=f'timestep="{STEP}" integrator="implicitfast"',
     )
@@ -45,6 +50,7 @@ def replay(machine: Standing, motion: StandingMotion, fallen: float = 0.3) -> tu
     data.qpos[3:7] = _quaternion(turn)
     data.qpos[7:], data.qvel[6:] = motion.joints[0], motion.joint_velocities[0]
     times: Array = np.arange(int(motion.t[-1] / STEP), dtype=float) * STEP
+    tips = np.column_stack([np.interp(times, motion.t, column) for column in motion.tip_in_world.T])
     planned = [
         np.column_stack([np.interp(times, motion.t, column) for column in values.T])
         for values in (motion.joints, motion.joint_velocities, motion.joint_torques)
@@ -53,7 +59,14 @@ def replay(machine: Standing, motion: StandingMotion, fallen: float = 0.3) -> tu
     found = np.zeros(9)
     for k in range(len(times)):
         joints, velocities, torques = (values[k] for values in planned)
+        data.qfrc_applied[:] = 0.0
         data.qfrc_applied[6:] = torques + stiffness * (joints - data.qpos[7:]) + stiffness / 20 * velocities
+        for wrench in external(times[k], tips[k]) if external is not None else ():
+            body = model.body(wrench.link).id
+            mujoco.mj_kinematics(model, data)
+            point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ np.array(wrench.point).ravel()
+            force, moment = np.array(wrench.force).ravel(), np.array(wrench.moment).ravel()
+            mujoco.mj_applyFT(model, data, force, moment, point, body, data.qfrc_applied)
         mujoco.mj_step(model, data)
         mujoco.mju_quat2Mat(found, data.qpos[3:7])
         upright = found.reshape(3, 3)[2] @ turn.T[:, 2]

@@ -13,7 +13,7 @@ from models.standing import PAPER_START, External, Standing, paper_example, tip_
 from models.standing_motion import StandingMotion, standing_motion
 from ocp import Problem, Solution
 from ocp.builders.standing import FreeTime, Limits, Weights, standing_plan
-from tests.models.standing_machines import standing_arm
+from tests.models.standing_machines import planar_machine, six_joint_arm, standing_arm
 from tests.models.trees import Array
 
 HORIZON = 2 * np.pi
@@ -78,6 +78,41 @@ def arm_path(t: Any) -> list[Any]:
 def tool(time: Any, tip: Any) -> list[Wrench]:
     """A load that grows, and a constant moment, at the arm's tip."""
     return [arm().tip_wrench((0, 0, -25 - 20 * time), (1.0, 2.0, 0.5))]
+
+
+def quintic(s: Any) -> Any:
+    """From 0 to 1 at rest and without acceleration at both ends."""
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+PLANAR_HORIZON = 2.0
+SIX_START = np.array([0.3, -1.2, 1.6, -0.6, 0.2, 0.1])
+
+
+def planar_start(size: int) -> Array:
+    return np.array([np.pi / 2 + 0.5, -1.4, 1.2, *[-0.3] * (size - 3)])
+
+
+def planar_path(size: int, ahead: float = 0.35, up: float = -0.5) -> Any:
+    """The tip of planar_machine(size) forward and down, from rest to rest."""
+    _, y, z = tip_at(planar_machine(size), planar_start(size))
+    return lambda t: [y + ahead * quintic(t / PLANAR_HORIZON), z + up * quintic(t / PLANAR_HORIZON)]
+
+
+@cache
+def six() -> Standing:
+    return six_joint_arm()
+
+
+def six_path(t: Any) -> list[Any]:
+    """0.3 m aside and 0.15 m down in 1 s, from rest to rest."""
+    x, y, z = tip_at(six(), SIX_START)
+    return [x + 0.02 * quintic(t), y + 0.3 * quintic(t), z - 0.15 * quintic(t)]
+
+
+def six_tool(time: Any, tip: Any) -> list[Wrench]:
+    """A load that grows and swings, and a moment, at the tip of the six-joint arm."""
+    return [six().tip_wrench((3 * ca.sin(3 * time), 5, -40 - 40 * time), (1.0, -2.0, 0.5))]
 
 
 def sampled(

@@ -80,6 +80,28 @@ def test_clearance_is_kept_where_the_free_plan_would_not() -> None:
     assert least(kept) >= free + 0.01 - 1e-6
 
 
+def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
+    around = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 3.0]), INCH * np.array([3.0, 2.0, 2.0])),))
+    q = ca.SX.sym("q", 6)
+    gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    gap = ca.Function("gap", [x, phi], [gaps(inverse(RIG, x, phi, HOME)[0])])
+
+    def mean(weight: float) -> float:
+        found = plan(surroundings=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
+        t = np.linspace(0, HORIZON, 101)
+        return float(np.array(gap.map(101)(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1))).mean())
+
+    assert mean(0.02) > mean(0.0) + 5e-3
+    for options, name in (
+        ({"clearance_weight": -1.0}, "clearance_weight"),
+        ({"clearance_width": 0.0}, "clearance_width"),
+        ({"clearance": np.nan}, "clearance nan"),
+    ):
+        with pytest.raises(ProblemError, match=name):
+            roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, **options)  # type: ignore[arg-type]
+
+
 def test_joint_limits_hold_along_the_plan() -> None:
     rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 0.3, 3, 3, 9))
     found = plan(rig)

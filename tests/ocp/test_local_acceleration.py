@@ -1,19 +1,22 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given, settings
 
 from models.machine import jacobian_manipulability
 from models.motion import momentum
 from models.posture import joint_limit_index
 from models.standing import PAPER_START, Standing
-from ocp.acceleration_laws import accelerations
+from ocp.acceleration_laws import Law, accelerations
 from ocp.errors import ProblemError
 from ocp.local_acceleration import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
-from tests.models.trees import Array, numeric
+from tests.models.standing_machines import planar_machine, random_standing
+from tests.models.trees import Array, numeric, seeds
 from tests.ocp.standing_tasks import (
     ARM_HORIZON,
     ARM_START,
@@ -172,6 +175,54 @@ def test_layers_in_sequence_follow_the_corrected_printed_form_and_do_what_they_a
         np.testing.assert_allclose([float(part) for part in asked(q0, qd0, push)], [-0.3, 0.2], atol=1e-6)
 
 
+def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
+    """The least acceleration that does both tasks, whichever is written first; where the tasks are independent."""
+    rng, tried = np.random.default_rng(11), 0
+    while tried < 5:
+        standing = random_standing(rng, 8)
+        q0, qd0, push = *rng.normal(size=(2, standing.joint_size)), rng.normal(size=3)
+        if standing.joint_size < 5:
+            continue
+        rows = ca.vertcat(standing.tip_jacobian((), q0)[4:6, :], standing.zmp_rows(q0, qd0, (0, 0)).jacobian)
+        values = np.linalg.svd(numeric(rows), compute_uv=False)
+        if values[-1] < 1e-2 * values[0]:
+            continue
+        tried += 1
+        outside = {"external": lambda t, tip: [standing.tip_wrench(ca.DM(push) * (1 + t) - tip)]}  # noqa: B023
+        start = standing.tip_pose((), q0).position[1:3]
+        found = [
+            numeric(law(standing, lambda t: start + ca.sin(3 * t), (4, 5), law=name, **outside)(0.3, q0, qd0))  # noqa: B023
+            for name in ("augmented", "null_space")
+        ]
+        np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-9 * np.abs(found[0]).max())
+
+
+@pytest.mark.parametrize("name", ["arm", "chain"])
+def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> None:
+    """(23)-(34) on other machines: along q + q' t + q'' t^2 / 2 each index curves by its demand."""
+    if name == "arm":  # joint limits take the one degree of freedom that a task of two rows leaves on seven joints
+        standing, start, rows = arm(), ARM_START, (3, 5)
+    else:
+        standing, rows = planar_machine(6), ROWS
+        start = np.array([2.0, -1.4, 1.2, -0.4, -0.3, 0.2])
+    tip = tip_at(standing, start)[[row - 3 for row in rows]]
+    layers = (Layer("joint_limits", -0.4), Layer("manipulability", 0.1))
+    found = law(standing, lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows, law="augmented", layers=layers)
+    middle, width = (standing.robot.lower + standing.robot.upper) / 2, standing.robot.upper - standing.robot.lower
+
+    def indices(q: Array) -> Array:
+        jacobian = numeric(standing.tip_jacobian((), q))[list(rows)]
+        return np.array([(((q - middle) / width) ** 2).sum(), np.sqrt(np.linalg.det(jacobian @ jacobian.T))])
+
+    rng, step = np.random.default_rng(5), 2e-4
+    for _ in range(4):
+        time, q, qd = near(rng, start)
+        qdd = numeric(found(time, q, qd)).ravel()
+        motion = [indices(q + qd * t + qdd * t**2 / 2) for t in (-step, 0.0, step)]
+        curve = (motion[0] - 2 * motion[1] + motion[2]) / step**2
+        np.testing.assert_allclose(curve, [-0.4, 0.1], atol=2e-5 * max(1.0, np.abs(qdd).max()))
+
+
 @pytest.mark.parametrize(("name", "sign"), [("joint_limits", -1.0), ("manipulability", 1.0)])
 def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tasks(name: Any, sign: float) -> None:
     plain = law(machine(), table_path(1), ROWS, law="augmented")
@@ -216,7 +267,69 @@ def test_slower_poles_ask_less_of_the_joints() -> None:
 
 
 def test_the_stabilised_law_fails_on_table_2() -> None:
-    assert not table(2, law="stabilised").succeeded
+    found = table(2, law="stabilised")
+    assert not found.succeeded
+    assert found.failures
+    assert found.failures[0] in str(found)
+
+
+def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_beyond_its_limits() -> None:
+    """The pinned pendulum carried on past its lift-off, but stopped before it diverges; and tighter joint limits."""
+    flies = resolve_accelerations(
+        machine(), table_path(1), ROWS, PAPER_START[1], 1.2, law="augmented", stop_at_lift_off=False
+    )
+    assert flies.stopped is None
+    assert flies.motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert flies.motion.stays_in_foot
+    assert flies.failures[0] == "lift_off"
+    assert not flies.succeeded
+
+    standing = machine()
+    joints = [replace(joint, upper=min(joint.upper, 3.0)) if i == 0 else joint for i, joint in
+              enumerate(standing.robot.joints)]  # fmt: skip
+    joints[3] = replace(joints[3], lower=PAPER_START[1][3] - 0.01, upper=PAPER_START[1][3] + 0.01)
+    narrow = replace(standing, robot=replace(standing.robot, joints=tuple(joints)))
+    bent = resolve_accelerations(narrow, table_path(1), ROWS, PAPER_START[1], HORIZON, law="stabilised", step=5e-3)
+    assert bent.stopped is None
+    assert bent.motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert bent.motion.stands
+    assert bent.failures == ("joint_limits",)
+    assert "joint_limits" in str(bent)
+
+
+def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
+    """Held still by a path that swings faster than the steps see."""
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    found = resolve_accelerations(
+        machine(), lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2], ROWS, PAPER_START[1], 0.5, step=0.05, null_damping=2.0
+    )
+    assert found.tip_error.max() > 1e-3
+    assert "leaves_path" in found.failures
+
+
+@given(seeds)
+@settings(max_examples=8)
+def test_random_machines_stop_for_a_named_reason_or_reach_the_horizon_with_sound_numbers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    standing = planar_machine(int(rng.integers(4, 7)))
+    start = rng.uniform(-2.5, 2.5, size=standing.joint_size)
+    _, y, z = tip_at(standing, start)
+    laws: tuple[Law, ...] = ("augmented", "null_space", "pseudo_inverse")
+    law = laws[int(rng.integers(3))]
+
+    def path(t: Any) -> list[Any]:
+        return [y + 0.1 * ca.sin(t) ** 2, z]
+
+    found = resolve_accelerations(standing, path, ROWS, start, 1.0, law=law, step=1e-2)
+    motion = found.motion
+    assert np.isfinite(np.hstack([motion.joints, motion.joint_velocities, motion.joint_accelerations])).all()
+    if found.stopped is None:
+        assert motion.t[-1] == pytest.approx(1.0)
+    else:
+        assert found.failures[0] == found.stopped.reason
+        assert f"{found.stopped.time:.4g} s" in found.stopped.message
+    sound = (motion.ground_force[:, 2] > 0).all() and (motion.foot_margin >= -1e-9).all()
+    assert found.succeeded <= (sound and (motion.joint_excess <= 1e-9).all() and found.stopped is None)
 
 
 def test_the_pinned_pendulum_obeys_its_equation() -> None:

@@ -1,13 +1,33 @@
-"""The line-speed schedule of the example of Lee, Ryu, Cheong 2006."""
+"""Line-speed schedules: the example of Lee, Ryu, Cheong 2006, closed forms, and limits on random paths."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from models.paths import Path, SmoothPath, smooth
 from ocp import ProblemError
-from ocp.schedule import Limits, peak_acceleration, schedule
+from ocp.schedule import JointLimits, Limits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
+from tests.models.task_paths import random_path, seeds
 from tests.models.test_paths import example
+
+few = settings(max_examples=40)
+NAN = float("nan")
+
+
+def line(length: float) -> SmoothPath:
+    return smooth(Path.through([(0, 0, 0), (length, 0, 0)]), 0.1)
+
+
+def ladder(count: int = 4) -> SmoothPath:
+    """Lines of 1 m, one after the other, that hardly turn."""
+    return smooth(Path.through([(float(i), 1e-4 * (i % 2), 0) for i in range(count + 1)]), 0.05)
 
 
 def test_the_example_takes_the_time_checked_with_mean_acceleration() -> None:
@@ -16,8 +36,107 @@ def test_the_example_takes_the_time_checked_with_mean_acceleration() -> None:
     plan = schedule(path, limits)
     assert plan.duration == pytest.approx(1.868825, abs=1e-6)
     events = np.cumsum(np.asarray(path.piece_lengths))[:4]
-    assert plan.time_at(events) == pytest.approx([0.3500, 0.6203, 0.9722, 1.2419], abs=1e-4)
+    assert plan.time_at(events) == pytest.approx([0.3500, 0.6203, 0.9722, 1.2419], abs=5e-5)
     assert not plan.dips
+
+
+def test_the_example_takes_the_time_checked_with_peak_acceleration() -> None:
+    path = example("cubic")
+    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    assert plan.duration == pytest.approx(1.893825, abs=1e-6)
+    assert plan.time_at(path.bounds[1:5]) == pytest.approx([0.3625, 0.6328, 0.9847, 1.2544], abs=5e-5)
+    inside = (plan.time_at(path.bounds[1])[0], plan.time_at(path.bounds[4])[0])
+    assert plan.at(np.linspace(*inside, 999)).speed == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("length", [1e-6, 1e-3, 0.05, 0.2, 1.0, 1e3])
+def test_rest_to_rest_over_a_line_takes_the_seven_phase_time(length: float) -> None:
+    speed, acceleration, jerk = 1.0, 5.0, 200.0
+    plan = schedule(line(length), Limits(speed, acceleration, jerk))
+    # the top speed for which two ramps fill the line, by bisection on the closed form
+    low, high = 0.0, speed
+    for _ in range(200):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 2 * ramp_distance(0, middle, acceleration, jerk) <= length else (low, middle)
+    rest = max(length - 2 * ramp_distance(0, low, acceleration, jerk), 0.0)
+    expected = 2 * ramp_time(low, acceleration, jerk) + rest / low
+    assert plan.duration == pytest.approx(expected, rel=1e-9)
+    assert plan.profile.distance[-1] == length
+
+
+@given(st.floats(0.1, 20), st.floats(0.05, 5), st.floats(1, 1000))
+def test_the_peak_acceleration_has_the_mean_asked(mean: float, speed: float, jerk: float) -> None:
+    if 4 * mean**2 / speed >= jerk:
+        with pytest.raises(ProblemError, match="needs a jerk"):
+            peak_acceleration(mean, speed, 0.99 * jerk)
+        return
+    peak = peak_acceleration(mean, speed, jerk)
+    assert speed / ramp_time(speed, peak, jerk) == pytest.approx(mean, rel=1e-9)
+
+
+def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001) -> None:
+    """Rest to rest, continuous to the acceleration, within the limits of the line: ten times finer than 1 ms."""
+    profile, limits = plan.profile, plan.limits
+    step = np.diff(profile.t)
+    assert (step > 0).all()
+    s, v, a, j = profile.distance[:-1], profile.speed[:-1], profile.acceleration[:-1], profile.jerk
+    for end, reached, scale in (
+        (profile.distance, s + step * (v + step * (a / 2 + step * j / 6)), plan.path.length),
+        (profile.speed, v + step * (a + step * j / 2), asked.max()),
+        (profile.acceleration, a + step * j, limits.acceleration),
+    ):
+        assert end[1:] == pytest.approx(reached, abs=1e-9 * scale)
+    t = np.linspace(0, plan.duration, times)
+    motion = plan.at(t)
+    assert [motion.speed[0], motion.speed[-1]] == [0, 0]
+    assert motion.distance[-1] == pytest.approx(plan.path.length, rel=1e-12)
+    assert (np.diff(motion.distance) >= -1e-12 * plan.path.length).all()
+    piece = np.searchsorted(plan.path.bounds, motion.distance, side="right") - 1
+    of_piece = np.append(asked, asked[-1])[np.maximum(piece, 0)]
+    near = np.append(asked, asked[-1])[np.maximum(piece - 1, 0)]
+    on_bound = np.abs(plan.path.bounds[np.maximum(piece, 0)] - motion.distance) < 1e-9 * plan.path.length
+    assert (motion.speed <= np.where(on_bound, np.maximum(of_piece, near), of_piece) * (1 + 1e-9)).all()
+    assert np.abs(motion.acceleration).max() <= limits.acceleration * (1 + 1e-9)
+    assert np.abs(motion.jerk).max() <= limits.jerk * (1 + 1e-9)
+    if np.isfinite(limits.centripetal):
+        assert (motion.speed**2 * plan.path.curvature(motion.distance)).max() <= limits.centripetal * 1.001
+
+
+@few
+@given(seeds, st.integers(1, 9), st.sampled_from(["cubic", "quintic"]), st.booleans())
+def test_random_paths_never_exceed_asked_speed_or_limits(seed: int, count: int, kind: Any, each: bool) -> None:
+    rng = np.random.default_rng(seed)
+    path = smooth(random_path(rng, count), 10 ** rng.uniform(-3, -0.5), kind=kind)
+    speed = 10 ** rng.uniform(-1.5, 0.5, count if each else ())
+    centripetal = 10 ** rng.uniform(-1, 1.5) if rng.random() < 0.7 else np.inf
+    limits = Limits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), centripetal)
+    plan = schedule(path, limits)
+    check_profile(plan, path.by_piece(speed))
+    # time and distance are inverse
+    s = rng.uniform(0, path.length, 40)
+    assert plan.at(plan.time_at(s)).distance == pytest.approx(s, abs=1e-12 * path.length)
+    function = plan.function()
+    t = rng.uniform(0, plan.duration, 20)
+    for value, expected in zip(function.map(20)(t[None]), plan.at(t)[1:], strict=True):
+        assert np.array(value).ravel() == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_a_speed_that_bulges_between_two_points_of_the_grid_is_seen() -> None:
+    """Found once: slow at both ends of an interval on an arc, 12 % over the limit inside it."""
+    rng = np.random.default_rng(12)
+    path = smooth(random_path(rng, int(rng.integers(1, 9))), 10 ** rng.uniform(-3, -0.5))
+    speed = 10 ** rng.uniform(-1.5, 0.5)
+    limits = Limits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), 10 ** rng.uniform(-1, 1.5))
+    check_profile(schedule(path, limits), path.by_piece(speed), 100001)
+
+
+def test_any_sequence_of_speeds_is_reached_between_its_ramps() -> None:
+    path, speeds = ladder(5), [0.2, 1.0, 0.5, 0.05, 0.8]
+    plan = schedule(path, Limits(speeds, 5.0, 200.0))
+    middles = (path.bounds[:-1] + path.bounds[1:])[path.piece_segment >= 0] / 2
+    assert plan.profile.at_distance(middles).speed == pytest.approx(speeds, rel=1e-9)
+    check_profile(plan, path.by_piece(speeds))
+    assert not plan.dips  # each stretch gets what was asked of it
 
 
 def test_centripetal_acceleration_slows_the_blends_only() -> None:
@@ -26,12 +145,80 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
     motion = plan.sample(1e-3)
     assert np.max(motion.speed**2 * path.curvature(motion.distance)) < 5.0 * 1.001
     assert np.max(motion.speed) == pytest.approx(1.0, abs=1e-6)
-    assert plan.dips
+    assert len(plan.dips) == 2
+    for vertex, dip in enumerate(plan.dips):
+        blend = path.blend(vertex)
+        assert dip.cause == "centripetal acceleration"
+        assert blend.start <= dip.start < dip.end <= blend.end
+        most = path.curvature(np.linspace(blend.start, blend.end, 4001)).max()
+        assert dip.speed == pytest.approx(np.sqrt(5.0 / most), rel=2e-3)
+        assert dip.asked == 1.0
+        assert "centripetal acceleration permits" in str(dip)
+    # away from the dips and the ramps to them the asked speed is kept
+    away = ramp_distance(1.0, min(dip.speed for dip in plan.dips), 5.0, 200.0) * 1.01
+    free = (motion.distance > ramp_distance(0, 1, 5.0, 200.0)) & (motion.distance < plan.dips[0].start - away)
+    assert motion.speed[free] == pytest.approx(1.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+def test_a_slower_asked_speed_needs_no_dip() -> None:
+    path = example("quintic")
+    peak = path.curvature(path.dense(200)).max()
+    plan = schedule(path, Limits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
+    assert not plan.dips
+
+
+def test_strict_refuses_and_says_where() -> None:
+    with pytest.raises(ProblemError, match=r"2 place\(s\).*\n.* m: centripetal acceleration permits"):
+        schedule(example("quintic"), Limits(1.0, 5.0, 200.0, centripetal=5.0), strict=True)
+
+
+def test_the_last_sample_is_the_end() -> None:
+    plan = schedule(line(1.0), Limits(1.0, 5.0, 200.0))
+    t = plan.sample(2e-3).t
+    assert t[-1] == plan.duration
+    assert np.diff(t)[:-1] == pytest.approx(2e-3, rel=1e-9)
+    assert 0 < np.diff(t)[-1] <= 2e-3 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, NAN])
 def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> None:
-    with pytest.raises(ProblemError, match="speed"):
-        Limits(speed=bad, acceleration=5.0, jerk=200.0)
-    with pytest.raises(ProblemError, match="jerk"):
-        Limits(speed=1.0, acceleration=5.0, jerk=bad)
+    for name in ("speed", "acceleration", "jerk", "centripetal"):
+        with pytest.raises(ProblemError, match=f"{name} limit"):
+            replace(Limits(1.0, 5.0, 200.0), **{name: bad})  # type: ignore[arg-type]
+    for values in ((bad, 1.0, 200.0), (5.0, bad, 200.0), (5.0, 1.0, bad)):
+        with pytest.raises(ProblemError, match="positive"):
+            peak_acceleration(*values)
+    for name in ("velocity", "acceleration", "jerk"):
+        with pytest.raises(ProblemError, match=f"joint {name} limit"):
+            Limits(1.0, 5.0, 200.0, joints=JointLimits(**{name: [1.0, bad]}))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"speed": []}, "speed"),
+        ({"speed": "fast"}, "not numeric"),
+        ({"speed": [1.0, 0.0]}, "speed limit 0"),
+        ({"speed": [[1.0]]}, "shape"),
+        ({"speed": np.inf}, "finite"),
+        ({"jerk": [1.0, 2.0]}, "one number"),
+        ({"joints": 3.0}, "JointLimits"),
+    ],
+)
+def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        Limits(**{"speed": 1.0, "acceleration": 5.0, "jerk": 200.0, **given})
+
+
+def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
+    plan = schedule(line(1.0), Limits(1.0, 5.0, 200.0))
+    for wrong in (-0.1, 9.0, NAN):
+        with pytest.raises(ProblemError, match="outside the schedule"):
+            plan.at(wrong)
+        with pytest.raises(ProblemError, match="off the path"):
+            plan.time_at(wrong)
+    for period in (0.0, -1e-3, NAN, np.inf):
+        with pytest.raises(ProblemError, match="sample period"):
+            plan.sample(period)
+    with pytest.raises(ValueError, match="2 segments"):
+        schedule(smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1), Limits([1, 2, 3], 5.0, 200.0))

@@ -107,6 +107,8 @@ def test_at_is_defined_everywhere_and_stays_near_its_neighbours(method: str, fra
     there = solution.at(min(fraction * solution.horizon + step, solution.horizon))
     np.testing.assert_allclose(here["x"], there["x"], atol=1e-6)
     np.testing.assert_allclose(here["x"], solution.at_fraction(fraction)["x"], atol=1e-12)
+    assert "x" in here
+    assert "nothing" not in here
 
 
 def test_at_takes_one_time_or_many() -> None:

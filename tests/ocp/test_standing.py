@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -7,9 +8,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.standing import PAPER_START, center_of_pressure
+from models.standing import PAPER_START, Standing, center_of_pressure
 from models.standing_motion import standing_motion
-from ocp import Collocation, MultipleShooting, Solution, solve
+from models.support import Support, rectangle
+from ocp import Collocation, MultipleShooting, Solution, solve, tighten
 from ocp.builders.standing import (
     Anywhere,
     Following,
@@ -24,6 +26,7 @@ from ocp.builders.standing import (
 )
 from ocp.errors import ProblemError, SolveError
 from ocp.local_acceleration import Stabiliser, resolve_accelerations
+from tests.models.standing_machines import planar_machine
 from tests.models.trees import numeric
 from tests.ocp.standing_replay import replay
 from tests.ocp.standing_tasks import (
@@ -32,12 +35,19 @@ from tests.ocp.standing_tasks import (
     HORIZON,
     LIFT_LIMITS,
     LIMITS,
+    PLANAR_HORIZON,
     ROWS,
+    SIX_START,
     arm,
     arm_path,
     lift_plan,
     machine,
+    planar_path,
+    planar_start,
     sampled,
+    six,
+    six_path,
+    six_tool,
     spring,
     table_path,
     table_plan,
@@ -204,6 +214,17 @@ def test_the_zero_moment_point_follows_a_reference() -> None:
     np.testing.assert_allclose(motion.zero_moment_point[:, 1], 0.04 * np.sin(motion.t), atol=MILLIMETRE)
 
 
+@pytest.mark.parametrize("amplitude", [0.0, 0.04], ids=["pinned", "following"])
+def test_held_jerks_keep_the_zero_moment_point_at_its_place_between_the_points(amplitude: float) -> None:
+    def reference(t: Any) -> list[Any]:
+        return [0.0, amplitude * ca.sin(t)]
+
+    zmp: Any = Following(reference) if amplitude else Pinned()
+    motion = sampled(machine(), held(table_plan(1, zmp, control="jerk"), 80))
+    np.testing.assert_allclose(motion.zero_moment_point[:, 1], amplitude * np.sin(motion.t), atol=MILLIMETRE)
+    assert tip_error(motion, table_path(1)) < 1e-5
+
+
 def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
     solution = held(table_plan(1, IN_RANGE, control="jerk"), 60)
     assert solution.cost == pytest.approx(-0.703, abs=5e-3)
@@ -268,6 +289,123 @@ def test_a_spatial_arm_stands_where_the_local_method_tips() -> None:
     assert np.abs(motion.joint_torques).max() <= 300
     assert tip_error(motion, arm_path, (3, 4, 5)) < 1e-5
 
+    times, tilts = replay(arm(), motion, external=tool)  # in a contact simulation too
+    assert times[-1] > 0.99 * ARM_HORIZON
+    assert tilts.max() < 1e-3
+    times, tilts = replay(arm(), local, external=tool)
+    assert tilts[-1] == tilts.max() > 0.05  # and still falling
+    assert tilts[times < local.t[local.foot_margin < 0][0]].max() < 1e-3
+
+
+def test_six_joints_stand_where_the_local_method_tips() -> None:
+    local = resolve_accelerations(six(), six_path, (3, 4, 5), SIX_START, 1.0, external=six_tool, step=5e-3).motion
+    assert local.index.min() < -0.01
+    limits = Limits(friction=0.7, acceleration=100.0)
+    settings: dict[str, Any] = {"zmp": InFoot(0.005), "external": six_tool, "limits": limits}
+    problem = standing_plan(six(), six_path, (3, 4, 5), SIX_START, 1.0, tip_level="acceleration", **settings)
+    motion = sampled(six(), points(problem, 12), six_tool, (3, 4, 5))
+    assert motion.stands
+    assert motion.index.min() >= 0
+    assert motion.stays_in_limits
+    assert motion.friction.max() <= 0.7
+    assert tip_error(motion, six_path, (3, 4, 5)) < 1e-5
+
+
+def excess(standing: Standing, solution: Solution, limits: Limits, external: Any = None) -> dict[str, float]:
+    """By how much what is limited is exceeded on ten times the grid, the ends of the intervals included."""
+    count = solution.method["intervals"]
+    inside = np.clip(np.linspace(0.0, 1.0, 11), 1e-9, 1 - 1e-9)  # from within: controls jump at the ends
+    at = ((np.arange(count)[:, None] + inside) / count).ravel()
+    values = solution.at_fraction(at)
+    q, qd, qdd = (values[name] for name in ("joints", "velocities", "accelerations"))
+    motion = standing_motion(standing, at * solution.horizon, q, qd, qdd, external)
+    bounds = limits.bounds(standing)
+    pairs = {"velocities": "joint_velocities", "accelerations": "joint_accelerations", "torques": "joint_torques"}
+    found = {what: float((np.abs(getattr(motion, name)) - bounds[what]).max()) for what, name in pairs.items()}
+    least = 0.1 * standing.weight if limits.vertical_force is None else limits.vertical_force
+    found["vertical force"] = float(least - motion.ground_force[:, 2].min())
+    found["friction"] = float((motion.friction - limits.friction).max())
+    found["joints"] = float(motion.joint_excess.max()) if limits.joints else -np.inf
+    found["foot"] = -float(motion.foot_margin.min())
+    return found
+
+
+@pytest.mark.parametrize("size", [4, 6])
+def test_other_machines_hold_tip_and_zero_moment_point_between_the_points(size: int) -> None:
+    standing, path = planar_machine(size), planar_path(size)
+    for method, level in ((MultipleShooting(80), "position"), (Collocation(30, scheme="legendre"), "acceleration")):
+        problem = standing_plan(
+            standing,
+            path,
+            ROWS,
+            planar_start(size),
+            PLANAR_HORIZON,
+            zmp=InFoot(0.01),
+            tip_level=level,  # type: ignore[arg-type]
+        )
+        solution = solve(problem, method)
+        found = excess(standing, solution, Limits())
+        assert found.pop("foot") < -0.01 + MILLIMETRE
+        assert max(found.values()) < 1e-6, found
+        assert tip_error(sampled(standing, solution), path) < 1e-5
+
+
+def narrow() -> Standing:
+    """The machine of the paper with joints 3 and 4 held closer than they would like."""
+    joints = list(machine().robot.joints)
+    joints[2] = replace(joints[2], upper=np.deg2rad(303.0))
+    joints[3] = replace(joints[3], upper=np.deg2rad(261.0))
+    return replace(machine(), robot=replace(machine().robot, joints=tuple(joints)))
+
+
+FREELY = Weights(joint_limits=0.0)  # nothing but the limits keeps the joints from their ends
+
+
+@pytest.mark.parametrize("level", ["position", "acceleration"])
+@pytest.mark.parametrize(
+    ("standing", "limits", "weights"),
+    [
+        (narrow(), LIMITS, FREELY),
+        (machine(), replace(LIMITS, velocity=0.7), None),
+        (machine(), replace(LIMITS, torque=(45.0, 200.0, 108.0, 9.9, 2.9)), None),
+        (machine(), replace(LIMITS, acceleration=2.0), None),
+    ],
+    ids=["joints", "velocities", "torques", "accelerations"],
+)
+def test_a_tightened_plan_holds_its_limits_between_the_points(
+    standing: Standing, limits: Limits, weights: Any, level: Any
+) -> None:
+    problem = standing_plan(
+        standing,
+        table_path(1),
+        ROWS,
+        PAPER_START[1],
+        HORIZON,
+        zmp=IN_RANGE,
+        limits=limits,
+        weights=weights,
+        tip_level=level,
+    )
+    method = MultipleShooting(40) if level == "position" else Collocation(20, scheme="legendre")
+    solution = tighten(problem, method)
+    found = excess(standing, solution, limits)
+    assert found.pop("foot") < -IN_RANGE.margin + 1e-6
+    assert max(found.values()) < 1e-6, found
+    assert 0 <= solution.cost - solve(problem, method).cost < 0.02
+
+
+def test_the_fastest_lift_holds_its_limits_between_the_points() -> None:
+    solution = tighten(lift_plan(IN_RANGE), MultipleShooting(50))
+    found = excess(machine(), solution, LIFT_LIMITS)
+    assert found.pop("foot") < -IN_RANGE.margin + 1e-6
+    assert max(found.values()) < 1e-6, found
+    assert solution.horizon == pytest.approx(0.503, rel=2e-3)
+    values = solution.at_fraction((np.arange(500) + 0.5) / 500)
+    _, y, z = tip_at(machine(), PAPER_START[1])
+    tips = np.array([tip_at(machine(), joints) for joints in values["joints"]])
+    wanted = np.column_stack([np.full(500, y), z + 0.8 * values["path"][:, 0]])
+    assert np.abs(tips[:, 1:] - wanted).max() < 1e-5
+
 
 def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() -> None:
     plan = sampled(machine(), held(table_plan(1, IN_RANGE)))
@@ -282,20 +420,84 @@ def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() 
     assert tilts[times < leaves].max() < 2e-3
 
 
-def test_reaching_further_than_the_foot_allows_says_what_fails_when_and_by_how_much() -> None:
+def test_another_machine_stands_by_plan_and_tips_by_pseudo_inverse_in_a_contact_simulation() -> None:
+    standing, path = planar_machine(5), planar_path(5, 0.75, -0.2)
+    start, zmp = planar_start(5), InFoot(0.02)
+    plan = sampled(standing, held(standing_plan(standing, path, ROWS, start, PLANAR_HORIZON, zmp=zmp), 60))
+    times, tilts = replay(standing, plan)
+    assert times[-1] > 0.99 * PLANAR_HORIZON
+    assert tilts.max() < 1e-3
+    local = resolve_accelerations(standing, path, ROWS, start, PLANAR_HORIZON, step=5e-3).motion
+    assert not local.stands
+    times, tilts = replay(standing, local)
+    assert tilts[-1] == tilts.max() > 0.15  # and still falling
+    leaves = local.t[local.foot_margin < 0][0]
+    assert tilts[times < leaves].max() < 2e-3
+
+
+def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
+    """(constraint, by how much, when) as the error of a plan that cannot be says, the worst first."""
+    with pytest.raises(SolveError) as caught:
+        solve(problem, method, options={"max_iter": 60})
+    pattern = r"^  (.+) would have to go ([\d.e-]+) beyond its \w+ bound [\d.e-]+(?: at ([\d.e-]+) s)?$"
+    found = re.findall(pattern, str(caught.value), re.MULTILINE)
+    return [(name, float(amount), float(at) if at else np.nan) for name, amount, at in found]
+
+
+def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) -> Any:
+    """The tip led straight forward and up."""
     _, y, z = tip_at(machine(), PAPER_START[1])
-    problem = standing_plan(
-        machine(),
-        lambda s: [y + 0.9 * s, z + 0.5 * s],
-        ROWS,
-        PAPER_START[1],
-        3.0,
-        zmp=IN_RANGE,
-        limits=LIMITS,
-        along="parameter",
-    )
-    with pytest.raises(SolveError, match=r"(tip|zero moment point)\[\d\] is missed by [\d.e-]+ at [\d.]+ s"):
-        held(problem, 20, options={"max_iter": 60})
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes}
+    return standing_plan(machine(), lambda s: [y + forward * s, z + up * s], ROWS, PAPER_START[1], horizon, **settings)
+
+
+@pytest.mark.parametrize("horizon", [3.0, FreeTime(0.5, 3.0, 2.0)], ids=["fixed", "free"])
+def test_reaching_further_than_the_foot_allows_says_what_fails_when_and_by_how_much(horizon: Any) -> None:
+    """Held 0.9 m ahead at rest the machine leans out of the foot: no way of moving there changes where it ends."""
+    name, amount, time = misses(lean(horizon), MultipleShooting(20))[0]
+    assert name == "zero moment point[1]"  # the front edge
+    assert 0.1 < amount < 0.2
+    assert 2.0 < time <= 3.0
+
+
+def test_the_foot_that_the_error_asks_for_is_enough() -> None:
+    problem = lean(3.0)
+    _, amount, _ = misses(problem, MultipleShooting(20))[0]
+    longer = replace(machine(), support=rectangle((-0.05, 0.05), (-0.1, 0.2 + amount + 0.02)))
+    _, y, z = tip_at(machine(), PAPER_START[1])
+
+    def path(s: Any) -> list[Any]:
+        return [y + 0.9 * s, z + 0.5 * s]
+
+    problem = standing_plan(longer, path, ROWS, PAPER_START[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter")
+    assert held(problem, 20).success
+
+
+def test_joints_that_are_too_slow_are_named_for_a_given_time_and_the_time_for_a_free_one() -> None:
+    found = misses(table_plan(1, IN_RANGE, limits=replace(LIMITS, velocity=0.2)), MultipleShooting(20))
+    assert found[0][0].startswith("velocities[")
+    assert 0.2 < found[0][1] < 0.5
+    assert 0 < found[0][2] < HORIZON
+    slow = replace(LIMITS, velocity=0.8)
+    found = misses(lean(FreeTime(0.2, 0.6, 0.5), 0.0, 0.8, limits=slow), MultipleShooting(20))
+    assert found[0][0] == "horizon"
+    assert 0.1 < found[0][1] < 0.6
+
+
+def test_joints_that_are_too_weak_are_named() -> None:
+    """Little more than what they take at the start; joint limits are lifted, or a posture beyond them would do."""
+    weak = replace(LIMITS, joints=False, torque=(5.0, 205.0, 13.0, 6.0, 2.1))
+    found = misses(table_plan(1, IN_RANGE, limits=weak), MultipleShooting(20))
+    assert found[0][0] == "torques[2]"
+    assert 0.5 < found[0][1] < 10
+    assert 0 <= found[0][2] <= HORIZON
+
+
+def test_a_tip_that_cannot_come_to_its_path_is_named() -> None:
+    """Within the arm's length, but the joints cannot fold so far: they, or the tip, have to give way."""
+    found = misses(lean(3.0, -0.6, -1.2, zmp=Anywhere()), MultipleShooting(20))
+    assert {name.partition("[")[0] for name, *_ in found} <= {"joints", "tip"}
+    assert found[0][1] > 0.05
 
 
 def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it() -> None:
@@ -329,6 +531,8 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
+        ({"zmp": InFoot(np.nan)}, "margin nan m leaves no room"),
+        ({"end_joints": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),
         ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
         ({"zmp": Following(lambda t: [t])}, "Following: the reference gives"),
         ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity must be positive, one number or 5"),
@@ -345,6 +549,14 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
     }
     with pytest.raises(ProblemError, match=message):
         standing_plan(machine(), **arguments)
+
+
+def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
+    """Inscribed circle of 0.0828 m, though the bounding box is 0.3 m wide."""
+    triangle = replace(arm(), support=Support([(-0.1, -0.1), (0.2, -0.1), (-0.1, 0.1828427)]))
+    settings: dict[str, Any] = {"zmp": InFoot(0.09)}
+    with pytest.raises(ProblemError, match=r"margin 0.09 m leaves no room .* 0.08\d"):
+        standing_plan(triangle, arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, **settings)
 
 
 def test_a_path_longer_than_the_arm_is_refused() -> None:

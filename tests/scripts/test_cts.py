@@ -22,7 +22,14 @@ from scripts import cts
 from tests.models.cts_oracle import random_targets
 
 ROOT = Path(__file__).resolve().parents[2]
-PICTURES = ("fig06_rig.png", "fig07_joints_i1.png", "fig08_iterations.png", "fig09_joints_i2.png", "release.png")
+PICTURES = (
+    "fig06_rig.png",
+    "fig07_joints_i1.png",
+    "fig08_iterations.png",
+    "fig09_joints_i2.png",
+    "release.png",
+    "plan.png",
+)
 TABLES = ("table6_time.csv", "iterations.csv", "reference_rolls.csv", "sweep.csv")
 
 
@@ -73,17 +80,20 @@ def test_the_null_space_method_takes_more_iterations(summary: dict[str, Any]) ->
     assert summary["compiled_ns_per_target"] > 0
 
 
-def cts_targets() -> Any:
-    from scripts.cts_results import sweep_targets
-
-    return sweep_targets()
-
-
 def test_the_release_is_tracked_and_keeps_clear(summary: dict[str, Any]) -> None:
     release = summary["release"]
     assert release["tracking_m"] < 1e-12
     assert release["tracking_rad"] < 1e-12
     assert release["least_clearance_m"] > 0.05
+
+
+def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: dict[str, Any]) -> None:
+    found = summary["plan"]
+    plan, single = found["plan"], found["each_target_by_itself"]
+    assert found["audit_passed"]
+    assert plan["rate_max_rad_s"] <= found["rate_limit_rad_s"] * 1.001 < single["rate_max_rad_s"]
+    assert plan["least_clearance_m"] >= found["clearance_m"] - 1e-5 > single["least_clearance_m"]
+    assert plan["index_integral_s"] > single["index_integral_s"]
 
 
 def test_all_files_are_written(folder: Path) -> None:

@@ -1,0 +1,141 @@
+"""Roll of least index that keeps clear of the surroundings: clearance as a constraint, in the index, or both.
+
+With links and obstacles in it the index has no closed form any more. The rolls of a fixed grid are compared, together
+with the best roll of the closed form, and the best is refined by a pattern search whose step shrinks: a fixed number
+of operations. What is between two rolls of the grid and better than both sides may be missed; a finer grid finds it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.clearance import Radii, Surroundings, clearances, soft_minimum
+from models.cts import HOME, Branch, Rig, Tunnel, joints_of, posture_at
+from models.cts_convex import unrolled
+from models.cts_optimal import checked_gain, optimal_inverse
+from models.cts_roll import ACTIVE, STATUS, index_harmonics, verdict
+from models.errors import ModelError
+from models.spatial import Expression
+
+STEPS, SHRINK = 34, 0.62
+AT_LIMIT = 1e-6  # m; nearer to the least clearance than this counts as held by it
+
+
+def nearness(gap: Expression, weight: float, width: float) -> Expression:
+    """Term of the index that grows as the rig comes near: weight exp(-gap / width), gap and width in m.
+
+    Raises:
+        ModelError: A weight that is negative or not finite, a width that is not positive.
+    """
+    if not (np.isfinite(weight) and weight >= 0):
+        raise ModelError(f"clearance weight {weight} must be finite and not negative")
+    if not (np.isfinite(width) and width > 0):
+        raise ModelError(f"clearance width {width} m must be positive and finite")
+    return weight * ca.exp(-gap / width)
+
+
+def clear_inverse(
+    rig: Rig,
+    tunnel: Tunnel,
+    surroundings: Surroundings,
+    branch: Branch = HOME,
+    *,
+    clearance: float = -np.inf,
+    weight: float = 0.0,
+    width: float = 0.05,
+    rate_weight: float = 0.0,
+    samples: int = 72,
+    softness: float = 2e-3,
+    radii: Radii | None = None,
+) -> Any:
+    """Function (target, previous) -> (joints, cost, active, status, gap): optimal_inverse among obstacles.
+
+    Args:
+        clearance: Least distance of the rig from its surroundings, m; -inf for no constraint.
+        weight, width: Of the term weight exp(-gap / width) of the index.
+        rate_weight: w4 of I2; 0 for I1.
+        samples: Rolls of the grid, at least 8.
+        softness: Width of the smooth minimum of all distances, m; see clearance.soft_minimum.
+        radii: Of the rig's capsules.
+
+    Returns:
+        A casadi Function as cts_optimal.optimal_inverse, and the smooth least distance, m. `active` is "clearance"
+        where it holds the roll; where the closed form has the best roll it is that of the closed form, else "free".
+        The status "clearance" says that the target is reached within limits, but by no roll clear of everything.
+
+    Raises:
+        ModelError: A weight, width, clearance or number of samples that cannot be.
+    """
+    gain = checked_gain(rate_weight)
+    if np.isnan(clearance) or clearance == np.inf:
+        raise ModelError(f"clearance {clearance} m must be a finite distance or -inf for none")
+    if samples < 8:
+        raise ModelError(f"samples {samples} must be 8 or more")
+    target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
+    c, s = ca.cos(angle), ca.sin(angle)
+    posture = posture_at(rig, target, c, s, branch)
+    roll = unrolled(rig, c, s, previous)
+    joints = joints_of(rig, target, roll, posture)
+    gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
+    cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
+    cost += nearness(gap, weight, width)
+    meets = verdict(rig, target, posture, c, s)
+    held = ca.logic_and(meets.relaxed(), meets.slide())
+    fine = ca.logic_and(held, gap >= clearance)
+    value = ca.Function("value", [target, previous, angle], ca.cse([ca.if_else(fine, cost, ca.inf)]))
+    place = ca.Function("place", [target, previous, angle], ca.cse([joints, gap]))
+
+    x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
+    reached = closed_status == 0
+    free = ca.if_else(reached, closed[5], 0.0)
+    grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
+    values = value.map(samples)(x, before, grid)
+    best_angle, best_cost = free, value(x, before, free)
+    from_closed: Any = 1
+    choice = ca.Function("choice", *_choice(samples))
+    at, least = choice(values)
+    better = least < best_cost
+    best_angle, best_cost = ca.if_else(better, at, best_angle), ca.if_else(better, least, best_cost)
+    from_closed = ca.logic_not(better)
+
+    step = _pattern(value)
+    refined = step.mapaccum(STEPS)(
+        ca.vertcat(best_angle, best_cost, 2 * np.pi / samples), ca.repmat(ca.vertcat(x, before), 1, STEPS)
+    )[:, -1]
+    moved = refined[1] < best_cost
+    from_closed = ca.logic_and(from_closed, ca.logic_not(moved))
+    q, distance = place(x, before, refined[0])
+    found = refined[1] < ca.inf
+    status = ca.if_else(reached, ca.if_else(found, 0, STATUS.index("clearance")), closed_status)
+    spoilt = ca.if_else(status == 0, 0, np.nan)
+    active = ca.if_else(from_closed, closed_active, 0)
+    active = ca.if_else(distance - clearance < AT_LIMIT, ACTIVE.index("clearance"), active)
+    outputs = [q + spoilt, refined[1] + spoilt, active, status, distance + spoilt]
+    labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
+    return ca.Function("clear_inverse", [x, before], outputs, *labels)
+
+
+def _choice(samples: int) -> tuple[list[Any], list[Any]]:
+    """Inputs and outputs of the function (values of the grid) -> (angle of the least, the least)."""
+    values = ca.SX.sym("values", 1, samples)
+    at, least = ca.SX(0), ca.SX(ca.inf)
+    for k, angle in enumerate(np.linspace(-np.pi, np.pi, samples, endpoint=False)):
+        better = values[k] < least
+        at, least = ca.if_else(better, angle, at), ca.if_else(better, values[k], least)
+    return [values], [at, least]
+
+
+def _pattern(value: Any) -> Any:
+    """Function (state, given) -> state: one step of the search; state (angle, cost, step), given target, previous."""
+    state, given = ca.MX.sym("state", 3), ca.MX.sym("given", 6)
+    angle, cost, step = ca.vertsplit(state)
+    for side in (-0.5, 0.5):
+        at = state[0] + side * step
+        found = value(given[:5], given[5], at)
+        better = found < cost
+        angle, cost = ca.if_else(better, at, angle), ca.if_else(better, found, cost)
+    return ca.Function("pattern", [state, given], [ca.vertcat(angle, cost, step * SHRINK)])

@@ -1,0 +1,184 @@
+"""Where a robot described in URDF touches level ground: its support, from the collision shapes of wheels and feet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import casadi as ca
+import numpy as np
+
+from models.errors import ModelError
+from models.kinematics import link_frames
+from models.parts import Array, ArrayInput, checked_rotation
+from models.robot import Robot
+from models.spatial import Frame
+from models.support import Support
+from models.tree import absent
+from models.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
+
+RIM = 32
+"""Points by which the rim of a cylinder is described: its contact is this polygon, inside the true one."""
+
+LEVEL = 1e-3
+"""Slope up to which the end of a cylinder counts as level."""
+
+
+class Footprint(NamedTuple):
+    """What a robot stands on.
+
+    With it the robot stands on z = 0 of the world: `Standing(robot, support=found.support,
+    translation=found.translation, rotation=found.rotation)`.
+
+    Attributes:
+        support: Convex hull of the lowest points, in axes x and y of the world through the root link's origin.
+        translation: The root link's origin in the world, above the ground. Shape (3,), m.
+        rotation: The root link's axes, as columns, in the world. Shape (3, 3).
+        links: Names of the links that touch the ground.
+    """
+
+    support: Support
+    translation: Array
+    rotation: Array
+    links: tuple[str, ...]
+
+
+def footprint(
+    robot: Robot,
+    source: Source,
+    *,
+    q: ArrayInput = None,
+    rotation: ArrayInput = None,
+    links: Sequence[str] | None = None,
+    depth: float = 0.005,
+) -> Footprint:
+    """Support of a robot that stands on whatever of its shapes is lowest.
+
+    Boxes, cylinders, capsules and spheres of <collision> are looked at. Meshes are not read: where a foot is a mesh
+    give the support yourself; where a mesh might be lower than what is found name the `links` that touch the ground.
+
+    Args:
+        robot: Made from `source`, before it is simplified: it has the links whose shapes may touch the ground.
+        source: URDF text or path, as Robot.from_urdf takes it.
+        q: Joint positions in which it stands, zeros if None. Shape (dof,), rad or m.
+        rotation: The root link's axes, as columns, in the world, z upwards; those of the world if None. Shape (3, 3).
+        links: Links that may touch the ground; all if None.
+        depth: How far above the lowest point a point still counts as touching, m: wheels and casters give way.
+
+    Raises:
+        ModelError: Unknown links, links with shapes that the robot lacks, no shape but meshes or the origin of a mesh
+            below them, contact points in one line, sizes that are not positive, no rotation.
+    """
+    if not (np.isfinite(depth) and depth >= 0):
+        raise ModelError(f"footprint: depth {depth!r} m must be zero or positive")
+    known = [link.name for link in robot.links]
+    for name in links or ():
+        if name not in known:
+            raise absent("footprint: link", name, known)
+    upright = checked_rotation(np.eye(3) if rotation is None else rotation, "footprint", "rotation")
+    frames = link_frames(robot, np.zeros(robot.dof) if q is None else q, Frame(ca.DM(upright), ca.DM.zeros(3)))
+    owners: list[str] = []
+    points: list[Array] = []
+    meshes: list[tuple[float, str]] = []  # height of the origin, link
+    for element in parsed(source).findall("link"):
+        name = name_of(element)
+        if links is not None and name not in links:
+            continue
+        if name not in frames:
+            if element.find("collision") is not None:
+                raise ModelError(
+                    f"footprint: the robot has no link {name!r}, whose shapes may be the lowest; take the footprint "
+                    "before the robot is simplified or cut, or name the links that touch the ground"
+                )
+            continue
+        turn, place = (np.array(ca.DM(part)) for part in frames[name])
+        for shape in element.findall("collision"):
+            corners = _corners(shape, f"link {name!r}", turn)
+            if corners is None:
+                meshes.append((float((place.ravel() + turn @ origin_of(shape, name)[0])[2]), name))
+                continue
+            points.extend(corners @ turn.T + place.ravel())
+            owners.extend([name] * len(corners))
+    if not points:
+        owning = sorted({name for _, name in meshes})
+        what = f"only meshes, in {owning}, which are not read" if meshes else "no collision shapes"
+        raise ModelError(f"footprint: there are {what}; give the support yourself, for example models.rectangle(...)")
+    cloud = np.array(points)
+    height = float(cloud[:, 2].min())
+    if meshes and min(meshes)[0] < height:
+        low, name = min(meshes)
+        raise ModelError(
+            f"footprint: the mesh of link {name!r} begins {height - low:.3g} m lower than all shapes that are read; "
+            "give the support yourself, or name the links that touch the ground"
+        )
+    touching = cloud[:, 2] <= height + depth
+    names = tuple(dict.fromkeys(name for name, low in zip(owners, touching, strict=True) if low))
+    hull = convex_hull(cloud[touching, :2])
+    if len(hull) < 3:
+        raise ModelError(
+            f"footprint: the links {list(names)} touch the ground in one point or line, on which nothing stands; "
+            f"name other links, allow for more depth than {depth:g} m, or give the support yourself"
+        )
+    return Footprint(Support(hull), np.array([0.0, 0.0, -height]), upright, names)
+
+
+def convex_hull(points: ArrayInput) -> Array:
+    """Corners of the convex hull of points in the plane, counter-clockwise (Andrew 1979). Shape (k, 2).
+
+    Fewer than three where all points lie in one line.
+    """
+    cloud = np.unique(np.asarray(points, dtype=float), axis=0)  # sorted by x, then y
+    flat = 1e-12 * float(np.ptp(cloud, axis=0).max(initial=0.0)) ** 2
+    lower, upper = _chain(cloud, flat), _chain(cloud[::-1], flat)
+    return np.array([*lower[:-1], *upper[:-1]])
+
+
+def _chain(points: Iterable[Array], flat: float) -> list[Array]:
+    chain: list[Array] = []
+    for point in points:
+        while len(chain) > 1:
+            a, b = chain[-1] - chain[-2], point - chain[-1]
+            if a[0] * b[1] - a[1] * b[0] > flat:
+                break
+            chain.pop()
+        chain.append(point)
+    return chain
+
+
+def _corners(shape: ElementTree.Element, owner: str, world_from_link: Array) -> Array | None:
+    """Points of a shape that may be its lowest, in the link's frame; None for a mesh. Shape (k, 3), m."""
+    kinds: list[Any] = list(child_of(shape, "geometry", owner))
+    if len(kinds) != 1:
+        raise ModelError(f"{owner}: <geometry> has {len(kinds)} shapes, not one")
+    kind = kinds[0]
+    shift, turn = origin_of(shape, owner)
+    down = -(world_from_link @ turn)[2]  # in the shape's axes
+    if kind.tag == "box":
+        half = _positive(numbers_of(kind, "size", owner, 3), "size", owner) / 2
+        corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * half
+    elif kind.tag == "sphere":
+        corners = _positive(number_of(kind, "radius", owner), "radius", owner) * down[None, :]
+    elif kind.tag in ("cylinder", "capsule"):
+        radius = _positive(number_of(kind, "radius", owner), "radius", owner)
+        half = _positive(number_of(kind, "length", owner), "length", owner) / 2
+        ends = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])
+        if kind.tag == "capsule":
+            corners = ends + radius * down
+        else:
+            lowest = np.arctan2(down[1], down[0])  # the rim's own lowest point is one of its corners
+            angles = lowest + 2 * np.pi * np.arange(RIM) / RIM
+            rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
+            rim = rim[rim @ down >= (rim @ down).max() - LEVEL * radius]  # a wheel stands on its lowest line alone
+            corners = (ends[:, None] + rim[None]).reshape(-1, 3)
+    elif kind.tag == "mesh":
+        return None
+    else:
+        raise ModelError(f"{owner}: unknown shape <{kind.tag}>; a shape is a box, cylinder, capsule, sphere or mesh")
+    return np.asarray(corners @ turn.T + shift)
+
+
+def _positive(value: Any, what: str, owner: str) -> Any:
+    if not (np.asarray(value) > 0).all() or not np.isfinite(value).all():
+        raise ModelError(f"{owner}: {what} {value} of a collision shape is not positive")
+    return value

@@ -1,0 +1,142 @@
+"""What a path asks of speed, as a smooth casadi function of a reference time: polynomials between its corners.
+
+Everything is sampled between the places where a derivative of the path jumps, never across one, and cells are halved
+until their polynomials agree with the path to `ACCURACY`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import comb
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.schedule.limits import JointPath, Limits, PathLike, joint_demands, line_demands
+from ocp.schedule.profile import Array, Motion, SpeedProfile
+
+__all__ = ["Columns", "asked_speed", "demand_of_pieces", "largest_demand", "path_columns", "table"]
+
+Columns = Callable[[Array], Array]
+"""Times (M,) to values (M, m)."""
+
+DEGREE = 7
+ACCURACY = 1e-8
+"""Largest error of a column, relative to its largest value."""
+SMALLEST = 1e-9
+"""Cells below this share of the whole are not halved further."""
+ROUNDS = 40
+INSIDE = 40
+"""Points of a piece at which demands are looked at: ten times those of the collocation and the node."""
+
+
+def table(columns: Columns, breaks: Array) -> Any:
+    """casadi Function time -> values (m, 1), polynomials of degree 7 on cells that have all `breaks` among their ends.
+
+    At a break its value is that of the cell that begins there.
+    """
+    nodes = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2  # inside: no break is touched
+    between = (nodes[1:] + nodes[:-1]) / 2
+    fit = np.linalg.inv(_bernstein(nodes))
+    start, width = breaks[:-1], np.diff(breaks)
+    done: list[tuple[Array, Array]] = []
+    scale: Array | None = None
+    for number in range(ROUNDS):
+        if not start.size:
+            break
+        places = np.concatenate([nodes, between])
+        values = columns((start[:, None] + width[:, None] * places).ravel()).reshape(len(start), len(places), -1)
+        if scale is None:
+            scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
+        coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
+        error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
+        fine = ((error <= ACCURACY * scale).all(axis=(1, 2))) | (width < SMALLEST * (breaks[-1] - breaks[0]))
+        fine |= number == ROUNDS - 1
+        done.append((start[fine], coefficients[fine]))
+        half = width[~fine] / 2
+        start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
+        width = np.repeat(half, 2)
+    starts, pieces = (np.concatenate(parts) for parts in zip(*done, strict=True))
+    order = np.argsort(starts)
+    pieces = pieces[order]
+    # a constant cell behind the end, which would belong to none
+    pieces = np.concatenate([pieces, np.repeat(pieces[-1:, -1:], DEGREE + 1, axis=1)])
+    ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
+    knots = np.repeat(ends, DEGREE + 1).tolist()
+    flat = pieces.reshape(-1, pieces.shape[2])
+    time = ca.MX.sym("time")
+    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [DEGREE], flat.shape[1], {"lookup_mode": ["binary"]})
+    return ca.Function("along", [time], [value])
+
+
+def asked_speed(path: PathLike, limits: Limits, s: Array) -> Array:
+    """Asked line speed at distances (M,)."""
+    of_pieces = path.by_piece(limits.speed)
+    piece = np.clip(np.searchsorted(path.bounds, s, side="right") - 1, 0, len(of_pieces) - 1)
+    return np.asarray(of_pieces[piece])
+
+
+def path_columns(path: PathLike, limits: Limits, joints: JointPath | None, s: Array) -> Array:
+    """Asked speed, curvature, and three derivatives of the joints by the distance, at distances (M,). Shape (M, m).
+
+    Zero curvature where centripetal acceleration is not limited; no joints if None.
+
+    Raises:
+        ProblemError: A curvature or a joint that is not finite, joints of a wrong shape.
+    """
+    found = [asked_speed(path, limits, s)[:, None]]
+    found.append(np.asarray(path.curvature(s))[:, None] if np.isfinite(limits.centripetal) else np.zeros((len(s), 1)))
+    if joints is not None:
+        along = joints.at(s)
+        shape = (len(s), len(joints.names))
+        for kind, value in (("first", along.first), ("second", along.second), ("third", along.third)):
+            if np.shape(value) != shape:
+                raise ProblemError(f"joints along the path: {kind} has shape {np.shape(value)}, expected {shape}")
+            found.append(np.asarray(value))
+    values = np.concatenate(found, axis=1)
+    wrong = ~np.isfinite(values).all(axis=1)
+    if wrong.any():
+        raise ProblemError(
+            f"curvature or joint derivatives are not finite at {s[wrong][0]:g} m of the path; keep it away from "
+            "singular arms and cusps"
+        )
+    return values
+
+
+def largest_demand(path: PathLike, limits: Limits, joints: JointPath | None, motion: Motion) -> Array:
+    """The largest of speed, acceleration, jerk, centripetal acceleration and joint demands over its limit. Shape (M,).
+
+    Values of the path's derivatives where they jump are those after the jump.
+    """
+    s = motion.distance
+    rates = joints.at(s) if joints is not None and limits.joints is not None else None
+    curvature = np.asarray(path.curvature(s)) if np.isfinite(limits.centripetal) else np.zeros(len(s))
+    steady, power = line_demands(limits, curvature, rates)
+    rows = [
+        motion.speed / asked_speed(path, limits, s),
+        np.abs(motion.acceleration) / limits.acceleration,
+        np.abs(motion.jerk) / limits.jerk,
+        steady[0] * motion.speed**2,
+    ]
+    if rates is not None:
+        velocities = steady[1:][power[1:] == 1]
+        rows += [*(velocities * motion.speed), *joint_demands(limits, rates, motion)[0]]
+    return np.asarray(np.max(rows, axis=0))
+
+
+def demand_of_pieces(path: PathLike, limits: Limits, joints: JointPath | None, profile: SpeedProfile) -> Array:
+    """Largest demand inside each piece of a profile, from either side where the path jumps. Shape (K,)."""
+    count = INSIDE
+    inside = (np.arange(count) + 0.5) / count
+    inside[0], inside[-1] = 1e-9, 1 - 1e-9
+    motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
+    distance = np.clip(motion.distance, 0.0, path.length)
+    found = largest_demand(path, limits, joints, motion._replace(distance=distance))
+    return np.asarray(found.reshape(-1, count).max(axis=1))
+
+
+def _bernstein(x: Array) -> Array:
+    # values of the DEGREE + 1 Bernstein polynomials at x. Shape (len(x), DEGREE + 1)
+    return np.stack([comb(DEGREE, i) * x**i * (1 - x) ** (DEGREE - i) for i in range(DEGREE + 1)], axis=1)

@@ -1,0 +1,301 @@
+"""Minimum time along a given path under all limits, as an optimal control problem on the path parameter.
+
+The reference for ocp.schedule, which plans by construction. The independent variable is a path parameter theta: the
+time (s) at which a reference motion, usually a schedule of the same path, passes a place. Its distance, its speed
+w(theta), curvature and joints are known functions of theta, smooth between the joints of the path, where the mesh has
+nodes. With line speed v, acceleration a and jerk j,
+
+    dv/dtheta = a w/v,   da/dtheta = j w/v,   time = integral of w/v dtheta.
+
+From rest the jerk is constant over a first short distance d (and over a last one, mirrored): there v = j t^2/2,
+a = j t, d = j t^3/6, so that a = 2 v^2/(3 d), j = a v/(3 d), t = 3 d/v. The problem begins where this ends, v stays
+positive, and it is regular for every method. Held jerks on the mesh given here contain the reference itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.builders.path_reference import cut, distinct, reference_mesh, reference_motion
+from ocp.builders.path_tables import demand_of_pieces, path_columns, table
+from ocp.collocation import Collocation
+from ocp.errors import ProblemError
+from ocp.problem import Problem
+from ocp.schedule.grid import make_grid
+from ocp.schedule.limits import JointPath, Limits, PathLike
+from ocp.schedule.planner import Schedule
+from ocp.schedule.profile import Array, SpeedProfile
+from ocp.solution import Solution
+from ocp.solve import solve
+
+__all__ = ["Fastest", "TimingProblem", "minimum_time", "timing_problem"]
+
+SPLIT = 2e-4
+"""Intervals in which a limit is passed by more than this share are cut, into up to `PARTS`."""
+DEFECT = 1e-6
+"""And those whose states do not follow from their jerk to this share, of the distance and of the top speed."""
+PARTS = 8
+OPTIONS = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
+
+
+@dataclass(frozen=True, eq=False)
+class TimingProblem:
+    """Minimum time along a path, and what belongs to it.
+
+    Attributes:
+        problem: States "speed" and "acceleration", control "jerk" in `units`; its time is theta less its start, and
+            its cost the time (s).
+        mesh: Fractions of the horizon with nodes at every place where the path's derivatives jump, and at the
+            reference's changes of jerk.
+        units: Of speed, acceleration and jerk: the reference's largest, m/s, m/s^2, m/s^3.
+        reference: The motion whose time is theta.
+        span: First and last theta of the problem, s. Before and after, the jerk is constant.
+    """
+
+    problem: Problem
+    mesh: tuple[float, ...]
+    units: tuple[float, float, float]
+    reference: SpeedProfile
+    span: tuple[float, float]
+
+    @property
+    def method(self) -> Collocation:
+        """Collocation with one jerk an interval: no overshoot between its points, at no change of the jerk."""
+        return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
+
+    def profile(self, solution: Solution) -> SpeedProfile:
+        """The motion of a solution, as pieces of constant jerk.
+
+        Raises:
+            ProblemError: A solution whose jerk is not held.
+        """
+        curve = solution.control_interpolant
+        if curve.values.shape[1] != 1:
+            raise ProblemError("the jerk of this solution is not constant in its intervals; solve with control='held'")
+        breaks = np.asarray(curve.breaks)
+        states = solution.state_interpolant(breaks) * np.array(self.units[:2])
+        jerk = curve.values[:, 0, 0] * self.units[2]
+        points, weights = np.polynomial.legendre.leggauss(8)
+        inside = breaks[:-1, None] + np.diff(breaks)[:, None] * (points + 1) / 2
+        horizon = self.span[1] - self.span[0]
+        speed = solution.state_interpolant(inside.ravel())[:, 0].reshape(inside.shape) * self.units[0]
+        pace = self.reference.at(self.span[0] + horizon * inside.ravel()).speed.reshape(inside.shape) / speed
+        durations = horizon * np.diff(breaks) * (pace @ weights) / 2
+        first, last = self.ends
+        theta = self.span[0] + horizon * breaks
+        s = self.reference.at(theta).distance
+        v, a = states.T
+        ramps = 3 * first / v[0], 3 * last / v[-1]
+        return SpeedProfile(
+            np.concatenate([[0.0], np.cumsum([ramps[0], *durations, ramps[1]])]),
+            np.concatenate([[0.0], s, self.reference.distance[-1:]]),
+            np.concatenate([[0.0], v, [0.0]]),
+            np.concatenate([[0.0], a, [0.0]]),
+            np.concatenate([[a[0] * v[0] / (3 * first)], jerk, [-a[-1] * v[-1] / (3 * last)]]),
+        )
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Distances (m) at both ends over which the jerk is constant."""
+        return _ends(self.reference, self.span)
+
+
+@dataclass(frozen=True, eq=False)
+class Fastest:
+    """The fastest motion found.
+
+    Attributes:
+        schedule: The motion, without dips listed; as that of ocp.schedule.
+        solution: Of the last problem solved. timing: That problem.
+        demand: Largest demand over its limit at ten times the grid, the largest of all kinds; 1 is at the limit.
+    """
+
+    schedule: Schedule
+    solution: Solution
+    timing: TimingProblem
+    demand: float
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.schedule.duration
+
+
+def minimum_time(
+    path: PathLike,
+    limits: Limits,
+    joints: JointPath | None = None,
+    *,
+    guess: Schedule | None = None,
+    intervals: int = 200,
+    rounds: int = 6,
+    options: dict[str, Any] | None = None,
+) -> Fastest:
+    """Fastest motion along a path from rest to rest under all limits.
+
+    A motion that keeps them, hence an upper bound of the least time: jerks held over intervals cannot follow a limit
+    exactly, which costs time in proportion to their width (about 0.2 % of the example's with joint limits at 200).
+    The audit of its solution finds everything right but the stationarity, which held jerks have on average only.
+
+    Args:
+        path, limits, joints: As of `ocp.schedule.schedule`.
+        guess: A schedule of the same path to start from; planned here if None.
+        intervals: Least number of intervals, beside those at the path's joints and the guess's changes of jerk.
+        rounds: How often intervals in which a limit is passed between the points are cut, at most.
+        options: Of ipopt.
+
+    Raises:
+        ProblemError: As timing_problem. SolveError: the solver failed, naming the worst residuals.
+    """
+    timing = timing_problem(path, limits, joints, guess=guess, intervals=intervals)
+    solution: Solution | None = None
+    for number in range(rounds + 1):
+        solution = solve(timing.problem, timing.method, guess=solution, options={**OPTIONS, **(options or {})})
+        profile = timing.profile(solution)
+        demand = demand_of_pieces(path, limits, joints, profile)
+        parts = _parts(profile, demand)
+        if number == rounds or parts.max() == 1:
+            break
+        mesh = tuple(cut(np.array(timing.mesh), parts).tolist())
+        timing = TimingProblem(timing.problem, mesh, timing.units, timing.reference, timing.span)
+    assert solution is not None
+    return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
+
+
+def timing_problem(
+    path: PathLike,
+    limits: Limits,
+    joints: JointPath | None = None,
+    *,
+    guess: Schedule | None = None,
+    intervals: int = 200,
+) -> TimingProblem:
+    """The problem of `minimum_time`, for any method to solve.
+
+    Path constraints "asked speed", "centripetal acceleration", "joint velocity", "joint acceleration" and "joint jerk"
+    (those that are limited), each over its limit; "start at rest" and "end at rest", "start jerk" and "end jerk".
+
+    Raises:
+        ProblemError: Joint limits without joints; a joint jerk limit on a path whose curvature jumps; curvature or
+            joints that are not finite; a guess for another path; fewer than 10 intervals.
+    """
+    if isinstance(intervals, bool) or not isinstance(intervals, int | np.integer) or intervals < 10:
+        raise ProblemError(f"intervals = {intervals!r} must be a whole number, 10 or more")
+    if limits.joints is not None and joints is None:
+        raise ProblemError("joint limits need the joints along the path: minimum_time(path, limits, arm)")
+    limited = joints if limits.joints is not None else None
+    if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
+        raise ProblemError(f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m")
+    path_columns(path, limits, limited, path.dense())  # refuses what is not finite
+    reference = reference_motion(path, limits, limited) if guess is None else guess.profile
+    if guess is not None and limited is not None:
+        make_grid(path, limits, limited)  # refuses what no motion keeps, as a schedule does
+    whole = reference.duration
+    phases = np.diff(reference.t)
+    span = (min(phases[0], whole / intervals), whole - min(phases[-1], whole / intervals))
+    joins = reference.at_distance(np.asarray(path.bounds)[1:-1]).t if len(path.bounds) > 2 else np.zeros(0)
+    mesh = reference_mesh(reference, joins, span, intervals)
+
+    peak = reference.at(np.linspace(0, whole, 1001)).speed
+    units = tuple(float(np.abs(values).max()) for values in (peak, reference.acceleration, reference.jerk))
+    breaks = distinct(np.concatenate([[0.0, whole], joins, reference.t]), 1e-9 * whole)
+
+    def columns(theta: Array) -> Array:
+        motion = reference.at(theta)
+        return np.column_stack([motion.speed, path_columns(path, limits, limited, motion.distance)])
+
+    problem = _declared(path, limits, limited, reference, span, units, table(columns, breaks))
+    return TimingProblem(problem, tuple(mesh.tolist()), units, reference, span)  # type: ignore[arg-type]
+
+
+def _declared(
+    path: PathLike,
+    limits: Limits,
+    joints: JointPath | None,
+    reference: SpeedProfile,
+    span: tuple[float, float],
+    units: tuple[float, ...],
+    along: Any,
+) -> Problem:
+    problem = Problem("minimum time along a path", symbols=ca.MX)
+    top, most, sharp = units
+    asked = np.asarray(path.by_piece(limits.speed))
+
+    def guessed(kind: str, unit: float) -> Any:
+        return lambda theta: float(getattr(reference.at([span[0] + float(theta)]), kind)[0]) / unit
+
+    slowest = 1e-3 * float(reference.at(list(span)).speed.min())
+    fast, steep = float(asked.max()) / top, limits.acceleration / most
+    speed = problem.state("speed", lower=slowest / top, upper=fast, guess=guessed("speed", top))
+    rate = problem.state("acceleration", lower=-steep, upper=steep, guess=guessed("acceleration", most))
+    bend = problem.control("jerk", lower=-limits.jerk / sharp, upper=limits.jerk / sharp, guess=guessed("jerk", sharp))
+    problem.horizon(span[1] - span[0])
+    v, a, j = top * speed, most * rate, sharp * bend
+    values = along(span[0] + problem.time)
+    pace = values[0] / v
+    problem.dynamics(speed, a * pace / top)
+    problem.dynamics(rate, j * pace / most)
+    if asked.min() < asked.max():
+        problem.path("asked speed", v / values[1], upper=1)
+    for name, rows in _demands(limits, joints, values, v, a, j).items():
+        problem.path(name, rows, lower=-1, upper=1)
+
+    first, last = _ends(reference, span)
+    at_start = problem.at_start(speed) * top
+    whole = reference.duration
+    for where, sign, distance, ends, theta in (
+        ("start", 1.0, first, problem.start, 0.0),
+        ("end", -1.0, last, problem.end, whole),
+    ):
+        ends(f"{where} at rest", (sign * a - 2 * v**2 / (3 * distance)) / most, 0, 0)
+        jerk = sign * a * v / (3 * distance)
+        # the jerk, and with it the joints', at rest and where the problem begins
+        rows = [jerk / limits.jerk]
+        if joints is not None:
+            for at, v_, a_ in ((theta, 0.0, 0.0), (span[0] if sign > 0 else span[1], v, a)):
+                rows += [_demands(limits, joints, ca.DM(along(at)), v_, a_, jerk).get("joint jerk", ca.MX(0, 1))]
+        ends(f"{where} jerk", ca.vertcat(*rows), -1, 1)
+    problem.minimize(running=pace, terminal=3 * first / at_start + 3 * last / v)
+    return problem
+
+
+def _demands(limits: Limits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
+    """Everything limited along the path over its limit, by name; `values`: reference speed, then path_columns."""
+    found: dict[str, Any] = {}
+    if np.isfinite(limits.centripetal):
+        found["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
+    if joints is None:
+        return found
+    number = len(joints.names)
+    q1, q2, q3 = (values[3 + k * number : 3 + (k + 1) * number] for k in range(3))
+    kinds = {
+        "joint velocity": q1 * v,
+        "joint acceleration": q2 * v**2 + q1 * a,
+        "joint jerk": q3 * v**3 + 3 * q2 * v * a + q1 * j,
+    }
+    for (name, value), bound in zip(kinds.items(), limits.of_joints(number), strict=True):
+        rows = np.flatnonzero(np.isfinite(bound))
+        if rows.size:
+            found[name] = value[rows.tolist()] / ca.DM(bound[rows])
+    return found
+
+
+def _parts(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
+    """Into how many each interval of the problem is to be cut; the error falls with the square of their width."""
+    v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
+    covered = t * (v[:-1] + t * (a[:-1] / 2 + t * j / 6)) / np.diff(profile.distance) - 1
+    gained = (v[:-1] + t * (a[:-1] + t * j / 2) - v[1:]) / v.max()
+    error = np.maximum((demand - 1) / SPLIT, np.maximum(np.abs(covered), np.abs(gained)) / DEFECT)[1:-1]
+    parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
+    return np.where(error > 1, np.minimum(parts, PARTS), 1)
+
+
+def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
+    # the reference's jerk is constant there; from the cube, which keeps its digits near the end
+    left = reference.duration - span[1]
+    return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

@@ -1,0 +1,289 @@
+"""Tasks of a machine's tips as equations of its joint rates: J u = b, the drift and the feedback in b.
+
+Everything that depends on the time alone is the column of targets; everything else is a function of configuration and
+targets, written element by element on SX symbols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FreeFloating, Machine, ModelError, center_of_mass
+from models.machine import with_tip
+from models.spatial import on_scalars, skew
+from ocp.builders.task import Array, track_expression
+from ocp.builders.task_geometry import (
+    Bound,
+    angular_velocity,
+    cross_product,
+    derivative,
+    held_task,
+    holding_rows,
+    is_holonomic,
+    pose_error,
+    pose_in_reference,
+    reference_pose,
+    relative_twist,
+    rotation_of,
+    rows_of,
+    split_targets,
+    target_size,
+    turning_rows,
+    wanted_twist,
+)
+from ocp.builders.tip_task import ANGULAR, TipTask
+from ocp.errors import ProblemError
+
+__all__ = ["TaskEquations", "bind", "task_errors"]
+
+
+@dataclass(frozen=True, eq=False)
+class TaskEquations:
+    """The stacked equations of some tasks of a machine. Make it with `bind`.
+
+    Attributes:
+        machine: The machine.
+        bound: Its tasks.
+        size: Number of rows of all tasks.
+    """
+
+    machine: Machine
+    bound: tuple[Bound, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(part.task.size for part in self.bound)
+
+    def targets(self, time: Any) -> Any:
+        """What the tasks ask at a time, a column of expressions of the symbol `time`.
+
+        For each task: the velocity in its rows; or position and velocity (3, 3), rotation and angular velocity (9, 3),
+        direction and angular velocity (3, 3), as far as given, in its reference.
+
+        Raises:
+            ProblemError: Wrong sizes, not finite, or an expression of anything but the time.
+        """
+        parts = []
+        for task in (part.task for part in self.bound):
+            if task.velocity is not None:
+                parts.append(track_expression(task.velocity, time, (task.size, 1), "tip_velocity"))
+            if task.position is not None:
+                value = track_expression(task.position, time, (3, 1), "position")
+                rate = getattr(task.position, "rate", None)
+                given = (
+                    derivative(value, time) if rate is None else track_expression(rate, time, (3, 1), "position rate")
+                )
+                parts += [value, given]
+            if task.orientation is not None:
+                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation")
+                turn = rotation_of(value) if value.shape == (4, 1) else value
+                parts += [ca.vec(turn), angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))]
+            if task.direction is not None:
+                value = track_expression(task.direction, time, (3, 1), "direction")
+                unit = value / ca.norm_2(value)
+                parts += [unit, cross_product(unit, derivative(unit, time))]
+        return ca.densify(ca.vertcat(*parts))
+
+    @on_scalars
+    def jacobian(self, base: Any, joints: Any) -> Any:
+        """J, shape (size, joint_size)."""
+        rows = []
+        for part in self.bound:
+            relative = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), None)
+            rows.append(rows_of(part, base, joints, relative))
+        return ca.densify(ca.cse(ca.vertcat(*rows)) if _is_symbolic(base, joints) else ca.vertcat(*rows))
+
+    @on_scalars
+    def right(self, base: Any, joints: Any, targets: Any) -> Any:
+        """b: what the joint rates have to add to the drift so that the tasks are done. Shape (size, 1)."""
+        return -self.residual(base, joints, ca.DM(self.machine.joint_size, 1), targets)
+
+    @on_scalars
+    def residual(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
+        """J u - b. Shape (size, 1)."""
+        rows = []
+        for part, wanted in self._with_targets(targets):
+            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            if part.task.velocity is not None:
+                rows.append(rows_of(part, base, joints, twist) - wanted)
+            else:
+                rows.append(rows_of(part, base, joints, twist - wanted_twist(part, base, joints, wanted)))
+        return ca.densify(ca.vertcat(*rows))
+
+    @on_scalars
+    def error(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Pose wanted less pose found, in the tasks' rows, m and rad; zero for velocities. Shape (size, 1)."""
+        rows = []
+        for part, wanted in self._with_targets(targets):
+            if part.task.velocity is not None:
+                rows.append(ca.DM(part.task.size, 1))
+            else:
+                rows.append(rows_of(part, base, joints, pose_error(part, base, joints, wanted)))
+        return ca.densify(ca.vertcat(*rows))
+
+    @on_scalars
+    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Distance from the poses, one column, without the zeros that `error` has half a turn away.
+
+        m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad): for all turning of a frame the
+        differences of its axes over sqrt 2, for some rows of it those of the half-angle vector. Velocities have none.
+        """
+        rows: list[Any] = [ca.DM(0, 1)]
+        for part, wanted in self._with_targets(targets):
+            task = part.task
+            if not task.is_pose:
+                continue
+            place, turning = split_targets(task, wanted)
+            reference = reference_pose(part, base, joints)
+            turn = part.tip.tip_pose(base, joints).rotation
+            error = pose_error(part, base, joints, wanted)
+            if turning is not None:
+                goal = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
+                if task.direction is not None:
+                    rows.append(goal - ca.mtimes(turn, ca.DM(task.tool_axis)))
+                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(turning_rows(part)):
+                    rows.append(ca.vec(goal - turn) / np.sqrt(2))
+                else:
+                    cosine = (ca.trace(ca.mtimes(goal, turn.T)) - 1) / 2
+                    half = error[0:3] * ca.sqrt(2 / (1 + ca.fmax(cosine, -1 + 1e-9)))
+                    angular = [i for i, row in enumerate(task.chosen) if row in ANGULAR]
+                    rows.append(rows_of(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
+            if place is not None:
+                tilt = 0 if task.direction is None else 2
+                linear = [tilt + i for i, row in enumerate(task.chosen) if row not in ANGULAR]
+                rows.append(rows_of(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
+        return ca.densify(ca.vertcat(*rows))
+
+    def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
+        """Pose at (at_base, at_joints) less pose at (base, joints), in the rows of the velocity tasks.
+
+        Shape (rows of all velocity tasks, 1). For a start that is free but for the pose of its task.
+        """
+        rows: list[Any] = [ca.DM(0, 1)]
+        for part in self.bound:
+            if part.task.velocity is not None:
+                position, turn = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
+                held = part._replace(task=held_task(part.task))
+                targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(turn), ca.DM(3, 1))
+                rows.append(holding_rows(held, base, joints, targets))
+        return ca.vertcat(*rows)
+
+    def _with_targets(self, targets: Any) -> Iterator[tuple[Bound, Any]]:
+        at = 0
+        for part in self.bound:
+            size = target_size(part.task)
+            yield part, targets[at : at + size]
+            at += size
+
+    def function(self) -> Any:
+        """Casadi Function (base, joints, targets) -> (J, b, error, misfit)."""
+        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
+        targets = ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+        parts = [self.jacobian(base, joints)]
+        parts += [what(base, joints, targets) for what in (self.right, self.error, self.misfit)]
+        return ca.Function("task", [base, joints, targets], parts, {"cse": True})
+
+    def target_function(self) -> Any:
+        """Casadi Function time -> targets, on MX symbols where a track needs them."""
+        for symbols in (ca.SX, ca.MX):
+            time = symbols.sym("time")
+            try:
+                return ca.Function("targets", [time], [self.targets(time)])
+            except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
+                if symbols is ca.MX:
+                    raise
+        raise AssertionError
+
+    def closing(self, base: Array, joints: Array) -> Array:
+        """Directions of the task rows that a closed task closes without the joints returning. Shape (size, k).
+
+        Where the joints return to where they were after a closed task, some of these conditions follow from the task:
+        all of its rows on a fixed base; on a floating one, as many combinations of the rows as do not depend on the
+        pose of the base, given that the centre of mass stays. Rows whose integral depends on the way do not count.
+
+        Raises:
+            ProblemError: The centre of mass moves, and the joints cannot return.
+        """
+        chosen = np.concatenate([is_holonomic(part) for part in self.bound])
+        if self.machine.base_size == 0:
+            return np.eye(self.size)[:, chosen]
+        if not isinstance(self.machine, FreeFloating):
+            return np.zeros((self.size, 0))
+        rows = []
+        for part in self.bound:
+            by_base = relative_twist(part, base, joints, part.tip.jacobians(base, joints)[0], "base")  # type: ignore[attr-defined]
+            rows.append(np.array(ca.DM(rows_of(part, ca.DM(base), ca.DM(joints), by_base))))
+        frame = self.machine.world_from_base(base)
+        lever = center_of_mass(self.machine.robot, joints, frame) - frame.position
+        center = np.array(ca.DM(ca.horzcat(-skew(lever), ca.DM.eye(3))))[:, self.machine.twist_rows]
+        task = np.vstack(rows)[chosen]
+        closes = _combinations(np.vstack([task, center]), len(task))
+        linear = self.machine.twist_rows.index(3)  # the rows of the angular momentum come first
+        if np.any(np.asarray(self.machine.conserved_momentum)[linear:]):
+            alone = _combinations(task, len(task))
+            if alone.shape[1] < closes.shape[1]:
+                raise ProblemError(
+                    "cyclic: the linear momentum moves the centre of mass on, and the joints cannot return together "
+                    "with a tip that returns in the world; let the task be relative to the base"
+                )
+            closes = alone
+        free = np.zeros((self.size, closes.shape[1]))
+        free[chosen] = closes
+        return free
+
+
+def _combinations(by_base: Array, count: int) -> Array:
+    """Orthonormal combinations of the first `count` rows, with any of the others, that are zero. Shape (count, k)."""
+    left, values, _ = np.linalg.svd(by_base)
+    rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
+    of_task, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)
+    return np.asarray(of_task[:, : int(np.sum(shares > 1e-9))])
+
+
+def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
+    """The equations of a task, or of several stacked, for a machine.
+
+    Raises:
+        ProblemError: No task, something else than a task, an unknown link.
+    """
+    listed = [tasks] if isinstance(tasks, TipTask) else list(tasks)
+    if not listed:
+        raise ProblemError("task is an empty list; give a TipTask, or several")
+    bound = []
+    for task in listed:
+        if not isinstance(task, TipTask):
+            raise ProblemError(f"task must be a TipTask or a list of them, not {task!r}")
+        try:
+            tip = machine if task.link is None else with_tip(machine, task.link, task.point)
+            reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
+        except ModelError as error:
+            raise ProblemError(str(error)) from error
+        bound.append(Bound(task, tip, reference))
+    return TaskEquations(machine, tuple(bound))
+
+
+def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, base: Any, joints: Any) -> Array:
+    """Pose wanted less pose found along a motion, in the rows of the tasks, m and rad; zero for velocities.
+
+    Args:
+        t: Times, s. Shape (M,).
+        base: Shape (M, base_size), or None on a fixed base.
+        joints: Shape (M, joint_size).
+
+    Returns:
+        Shape (M, rows of all tasks).
+    """
+    equations = bind(machine, tasks)
+    times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
+    place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+    targets = equations.target_function().map(len(times))(times[None, :])
+    return np.array(equations.function().map(len(times))(place.T, angles.T, targets)[2]).reshape(-1, len(times)).T
+
+
+def _is_symbolic(*values: Any) -> bool:
+    return any(isinstance(value, ca.SX) for value in values)

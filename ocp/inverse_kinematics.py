@@ -1,0 +1,232 @@
+"""Joint positions for a pose: multi-start inverse kinematics under joint limits.
+
+Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, on bounds by projection: joints at a
+limit that a step would leave are held for that step. All starts share one mapped casadi function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import Machine
+from ocp.builders.task import Array, checked_configuration
+from ocp.builders.task_equations import TaskEquations, bind
+from ocp.builders.tip_task import TipTask
+from ocp.errors import ProblemError
+
+__all__ = ["Posture", "Unreachable", "inverse_kinematics"]
+
+SLIDE = 1.0  # m: spread of the starts of slides without limits
+GROW, SHRINK, LEAST, MOST = 4.0, 0.25, 1e-12, 1e8  # of the damping
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Joint positions that put the tip where it is wanted.
+
+    Attributes:
+        joints: Shape (joint_size,), rad or m.
+        quality: Manipulability of the task times the least distance of a joint from its limits, the latter as a share
+            of half its range: 0 at a limit or where the task is singular.
+        misfit: Distance that is left, m or rad, the greatest of all tasks.
+    """
+
+    joints: Array
+    quality: float
+    misfit: float
+
+
+class Unreachable(ProblemError):
+    """No joint positions were found for a pose.
+
+    Attributes:
+        joints: The nearest miss. Shape (joint_size,).
+        misfit: How far it is off, m or rad (2 sin(angle / 2)).
+    """
+
+    def __init__(self, message: str, joints: Array, misfit: float) -> None:
+        super().__init__(message)
+        self.joints = joints
+        self.misfit = misfit
+
+
+def inverse_kinematics(
+    machine: Machine,
+    task: TipTask | Sequence[TipTask],
+    *,
+    time: float = 0.0,
+    base: Any = None,
+    starts: int = 64,
+    near: Any = None,
+    seed: int = 0,
+    limits: bool = True,
+    tolerance: float = 1e-10,
+    apart: float = 1e-3,
+    iterations: int = 100,
+) -> list[Posture]:
+    """Different joint positions at which the machine is where its pose tasks want it, the best first.
+
+    Where the joints are more than the rows, solutions form families, of which each start gives one member.
+
+    Args:
+        machine: Any machine; a floating base stands at `base` meanwhile.
+        task: A TipTask with a pose, or several that hold at once; tasks of velocities are left out.
+        time: At which the tasks are taken, s.
+        base: Base configuration, shape (base_size,); the machine's base_home() if None.
+        starts: How many random starts, uniform between the limits, -pi .. pi where there are none.
+        near: Further starts, before the random ones. Shape (joint_size,) or (k, joint_size).
+        seed: Of the random starts.
+        limits: Whether the robot's position limits hold.
+        tolerance: Largest misfit of a solution, m and rad.
+        apart: Least distance between two solutions, in the greatest joint, angles modulo full turns.
+        iterations: Of each start, at most.
+
+    Returns:
+        The solutions, at least one, by falling quality.
+
+    Raises:
+        Unreachable: No start leads to the pose; with the nearest miss.
+        ProblemError: No pose among the tasks, wrong sizes or numbers.
+    """
+    equations = bind(machine, task)
+    posed = tuple(part for part in equations.bound if part.task.is_pose)
+    if not posed:
+        raise ProblemError("inverse kinematics need a pose: TipTask(position=..., orientation=... or direction=...)")
+    equations = TaskEquations(machine, posed)
+    for what, number in (("starts", starts), ("iterations", iterations)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < (what == "iterations"):
+            raise ProblemError(f"{what} must be a whole number, not {number!r}")
+    for what, value in (("tolerance", tolerance), ("apart", apart)):
+        if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
+            raise ProblemError(f"{what} must be a positive number, not {value!r}")
+    size = machine.joint_size
+    place = checked_configuration(machine, np.zeros(size), base)[1]
+    unbounded = np.full(size, np.inf)
+    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
+    first = _starts(machine, lower, upper, int(starts), near, seed)
+    targets = np.array(equations.target_function()(float(time))).ravel()
+    if not np.isfinite(targets).all():
+        raise ProblemError(f"the task's targets are not finite at {time:g} s")
+
+    q, misfit = _gauss_newton(_residual(equations, place, targets), first, lower, upper, tolerance, int(iterations))
+    turns = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
+    wrap = turns & ~np.isfinite(lower) & ~np.isfinite(upper)
+    random = slice(len(first) - int(starts), None)  # what is near a given start stays there
+    q[random, wrap] = np.remainder(q[random, wrap] + np.pi, 2 * np.pi) - np.pi
+    good = misfit <= tolerance
+    if not good.any():
+        raise _unreachable(machine, equations, q[int(misfit.argmin())], float(misfit.min()), lower, upper)
+    jacobian = _jacobian(equations, place)
+    found: list[Posture] = []
+    for joints, off in zip(q[good], misfit[good], strict=True):
+        values = np.linalg.svd(np.array(jacobian(joints)), compute_uv=False)
+        with np.errstate(invalid="ignore"):
+            share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
+        margin = float(np.min(share[np.isfinite(upper - lower) & (upper > lower)], initial=1.0))
+        found.append(Posture(joints, float(values.prod()) * max(margin, 0.0), float(off)))
+    found.sort(key=lambda posture: -posture.quality)
+    return _distinct(found, turns, apart)
+
+
+def _starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+    size = machine.joint_size
+    rng = np.random.default_rng(seed)
+    slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
+    span = np.where(slides, SLIDE, np.pi)
+    low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
+    high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
+    random = rng.uniform(low, high, size=(count, size))
+    if near is None:
+        given = np.zeros((0, size))
+    else:
+        given = np.atleast_2d(np.asarray(near, dtype=float))
+        if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
+            raise ProblemError(f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected")
+    both = np.vstack([given, random])
+    if not len(both):
+        raise ProblemError("starts = 0 and near = None leave no start")
+    return np.clip(both, lower, upper)
+
+
+def _residual(equations: TaskEquations, base: Array, targets: Array) -> Any:
+    """Casadi Function joints -> (misfit, its Jacobian)."""
+    q = ca.SX.sym("q", equations.machine.joint_size)
+    misfit = equations.misfit(ca.SX(ca.DM(base)), q, ca.SX(ca.DM(targets)))
+    return ca.Function("misfit", [q], [misfit, ca.densify(ca.jacobian(misfit, q))], {"cse": True})
+
+
+def _jacobian(equations: TaskEquations, base: Array) -> Any:
+    q = ca.SX.sym("q", equations.machine.joint_size)
+    return ca.Function("jacobian", [q], [equations.jacobian(ca.SX(ca.DM(base)), q)], {"cse": True})
+
+
+def _gauss_newton(
+    function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int
+) -> tuple[Array, Array]:
+    """Joints (K, n) and greatest misfits (K,) that the starts lead to."""
+    q = first.copy()
+    count, n = q.shape
+    mapped = function.map(count)
+
+    def evaluate(at: Array) -> tuple[Array, Array]:
+        residual, jacobian = (np.array(part) for part in mapped(at.T))
+        rows = len(residual)
+        return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
+
+    residual, jacobian = evaluate(q)
+    cost, damping = (residual**2).sum(axis=1), np.full(count, 1e-2)
+    for _ in range(iterations):
+        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < MOST)
+        if not busy.any():
+            break
+        gradient = np.einsum("kij,ki->kj", jacobian, residual)
+        held = ((q <= lower) & (gradient > 0)) | ((q >= upper) & (gradient < 0))
+        free = np.where(held[:, None, :], 0.0, jacobian)
+        normal = np.einsum("kij,kil->kjl", free, free) + damping[:, None, None] * np.eye(n)
+        step = -np.linalg.solve(normal, np.where(held, 0.0, gradient)[:, :, None])[:, :, 0]
+        trial = np.clip(q + np.clip(step, -1.0, 1.0), lower, upper)
+        trial[~busy] = q[~busy]
+        new_residual, new_jacobian = evaluate(trial)
+        new_cost = (new_residual**2).sum(axis=1)
+        better = busy & (new_cost < cost)
+        q[better], residual[better], jacobian[better] = trial[better], new_residual[better], new_jacobian[better]
+        cost[better] = new_cost[better]
+        damping = np.where(better, np.maximum(SHRINK * damping, LEAST), np.where(busy, GROW * damping, damping))
+    return q, np.abs(residual).max(axis=1)
+
+
+def _distinct(found: list[Posture], turns: Array, apart: float) -> list[Posture]:
+    """Of those nearer than `apart`, full turns not counted, the best."""
+    kept: list[Posture] = []
+    for posture in found:
+        for other in kept:
+            difference = posture.joints - other.joints
+            difference[turns] = np.remainder(difference[turns] + np.pi, 2 * np.pi) - np.pi
+            if np.abs(difference).max() < apart:
+                break
+        else:
+            kept.append(posture)
+    return kept
+
+
+def _unreachable(
+    machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
+) -> Unreachable:
+    names = [part.task.link or str(part.tip.robot.tip) for part in equations.bound]
+    at_limit = [
+        name
+        for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True)
+        if value <= low or value >= high
+    ]
+    where = f", with {at_limit} at their limits" if at_limit else ""
+    return Unreachable(
+        f"no joint positions put {names} where the task wants them: the nearest miss is {misfit:.3g} (m or rad) at "
+        f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, leave a row free, or raise starts",
+        joints,
+        misfit,
+    )

@@ -1,0 +1,138 @@
+"""Limits that hold between the points of a grid too.
+
+A transcription holds inequalities at its points; between them a plan may go beyond by a power of the width. Here each
+bound is drawn in, interval by interval, by what the plan exceeded it there, until nothing is exceeded any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.collocation import Collocation
+from ocp.errors import ProblemError, SolveError
+from ocp.formulation import Formulation
+from ocp.fragment import Fragment
+from ocp.shooting import MultipleShooting
+from ocp.solution import Solution
+from ocp.solve import Prepared
+
+__all__ = ["tighten"]
+
+FINER = 10  # places looked at for each degree of the plan's polynomials in an interval
+ROUNDS = 20
+FURTHER = 1.2  # share of the excess that a bound is drawn in by: the plan follows it in part only
+
+
+def tighten(
+    problem: Any,
+    method: Collocation | MultipleShooting,
+    *,
+    tolerance: float = 1e-6,
+    parameters: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    options: Mapping[str, Any] | None = None,
+    guess: Solution | Mapping[str, Any] | None = None,
+) -> Solution:
+    """Solve so that every inequality holds between the points of the grid as well.
+
+    The plan is the optimum under bounds that are drawn in where it would have exceeded them, so it costs a little more
+    than that of :func:`ocp.solve`; finer grids close the gap. Equalities are not touched: refine the grid for them.
+
+    Args:
+        problem, parameters, solver, options, guess: As for :func:`ocp.solve`.
+        method: Collocation or MultipleShooting.
+        tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
+
+    Raises:
+        ProblemError: tolerance not positive, another method.
+        SolveError: A solve failed, or the excess does not fall under the tolerance; says what remains and where.
+    """
+    if not isinstance(method, Collocation | MultipleShooting):
+        raise ProblemError(f"tighten: Collocation(...) or MultipleShooting(...) is expected, not {method!r}")
+    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
+        raise ProblemError(f"tighten: tolerance must be positive and finite, not {tolerance!r}")
+    prepared = Prepared(problem, method, solver, options or {}, False)
+    form, fragment = prepared.formulation, prepared.fragment
+    p = form.parameter_vector(dict(parameters or {}))
+    bounds = form.bound_values(p)
+    where = _places(form, fragment)
+    moves = {key: np.zeros(len(where[key[-1]][0])) for key in ("lbx", "ubx", "lbg", "ubg")}
+    for _ in range(ROUNDS):
+        solution = prepared.solve(parameters, guess, tighter=moves)
+        beyond, times = _excess(form, solution, p, bounds)
+        if max(part.max(initial=0.0) for part in beyond) <= tolerance:
+            return solution
+        for side, part in zip(("l", "u"), beyond, strict=True):
+            for kind, (entry, left, right) in where.items():
+                most = np.where(entry >= 0, np.maximum(part[left, entry], part[right, entry]), 0.0)
+                moves[f"{side}b{kind}"] += np.where(most > tolerance / 2, FURTHER * most, 0.0)
+        guess = solution
+    labels = [*form.state_labels, *form.control_labels, *form.path.labels]
+    either = np.maximum(*beyond)
+    k, i = np.unravel_index(int(np.argmax(either)), either.shape)
+    raise SolveError(
+        f"problem {form.name!r}: after {ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
+        f"between {times[k]:.4g} and {times[k + 1]:.4g} s; take more intervals",
+        solution,
+    )
+
+
+def _places(form: Formulation, fragment: Fragment) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of variables ("x") and rows ("g"): which state, control or path row, else -1, and the intervals it stands in."""
+    entry_of = np.full(max(int(index.max(initial=0)) for index in form.bounds.places.values()) + 1, -1)
+    offsets = {"state": 0, "initial": 0, "terminal": 0, "control": form.nx, "path": form.nx + form.nu}
+    for kind, offset in offsets.items():
+        index = form.bounds.places[kind]
+        entry_of[index] = offset + np.arange(len(index))
+    found, n = {}, len(fragment.mesh) - 1
+    for kind, index, at in (
+        ("x", fragment.variable_bounds, fragment.variable_fraction),
+        ("g", fragment.row_bounds, fragment.row_fractions),
+    ):
+        left = np.clip(np.searchsorted(fragment.mesh, at - 1e-12) - 1, 0, n - 1)
+        right = np.clip(np.searchsorted(fragment.mesh, at + 1e-12) - 1, 0, n - 1)
+        found[kind] = (entry_of[index], left, right)
+    return found
+
+
+def _excess(
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Largest excess below and above the bounds in every interval, (N, nx + nu + path) each; ends of intervals, s."""
+    breaks = solution.control_interpolant.breaks
+    n = len(breaks) - 1
+    pieces = (len(solution.state_interpolant.breaks) - 1) // n
+    count = FINER * (len(solution.state_interpolant.nodes) - 1) * pieces
+    place = np.linspace(0.0, 1.0, count + 1)
+    owner = np.repeat(np.arange(n), len(place))
+    s = breaks[owner] + np.diff(breaks)[owner] * np.tile(place, n)
+    x = solution.state_interpolant(s)
+    u = solution.control_interpolant.within(owner, np.tile(place, n))
+    rows = ca.Function("rows", [form.x, form.u, form.t, form.T, form.p], [form.path.expression])
+    m, horizon = len(s), solution.horizon
+    ones = np.ones((1, m))
+    inputs = (x.T, u.T, horizon * s[None, :], horizon * ones, p[:, None] * ones)
+    g = np.asarray(rows.map(m, "serial").call([ca.DM(value) for value in inputs])[0].full()).T
+    index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
+    low, high = bounds[0][index], bounds[1][index]
+    given = np.where(low < high, 1.0, np.nan)  # equalities are not looked at
+    values = np.hstack([x, u, g]) * given
+    below, above = (
+        _peaks(np.where(np.isfinite(part), part, -np.inf).reshape(n, len(place), -1)).clip(min=0.0)
+        for part in (low - values, values - high)
+    )
+    return (below, above), breaks * horizon
+
+
+def _peaks(values: np.ndarray) -> np.ndarray:
+    """Largest values of sampled curves (N, K, m), between the samples too, by parabolas. Shape (N, m)."""
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rise = (after - before) ** 2 / (8 * (2 * here - before - after))
+    top = np.isfinite(rise) & (here >= before) & (here >= after)
+    between = np.where(top, here + np.where(top, rise, 0.0), -np.inf).max(axis=1, initial=-np.inf)
+    return np.asarray(np.maximum(values.max(axis=1), between))

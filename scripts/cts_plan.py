@@ -1,0 +1,147 @@
+"""Roll over the paper's whole sweep at once, beside the best roll of each target by itself: limits and an obstacle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.clearance import Box, Surroundings, clearances
+from models.cts import INCH, Rig, Tunnel, inverse
+from models.cts_optimal import optimal_inverse
+from models.cts_roll import index_harmonics
+from models.parts import Array
+from ocp import Collocation, solve
+from ocp.builders.cts import roll_plan
+from scripts.drawing import COLORS, DASHES, sheet
+
+__all__ = ["RollPlan", "draw_plan", "plan_summary", "plan_sweep"]
+
+HORIZON = 10.0  # s, the paper's sweep
+RATE_LIMIT, ACCELERATION_LIMIT = 0.37, 0.4  # rad/s, rad/s^2
+RATE_WEIGHT, ACCELERATION_WEIGHT = 0.05, 0.02  # s^2, s^4
+CLEARANCE = 0.05  # m
+METHOD = Collocation(intervals=120, degree=3)
+
+
+@dataclass(frozen=True)
+class Course:
+    """A roll over time and what it costs.
+
+    Attributes:
+        roll, rate: rad, rad/s. Shape (samples,).
+        index: I1. Shape (samples,).
+        clearance: Least distance of the rig to the obstacle, m. Shape (samples,).
+    """
+
+    roll: Array
+    rate: Array
+    index: Array
+    clearance: Array
+
+
+@dataclass(frozen=True)
+class RollPlan:
+    """The plan and the roll of each target by itself, at the same times t, s; and whether the plan's audit passed."""
+
+    t: Array
+    plan: Course
+    single: Course
+    cost: float
+    passed: bool
+    audit: str
+
+
+def targets(t: Any) -> list[Any]:
+    """The paper's sweep, z from -15 to 15 in at 3 in/s."""
+    return [100 * INCH, 6 * INCH, (-15 + 3 * t) * INCH, 0.0, 0.0]
+
+
+def obstacle() -> Surroundings:
+    """A block beside the path of the goose-neck; chosen."""
+    return Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 3.0]), INCH * np.array([3.0, 2.0, 2.0])),))
+
+
+def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
+    """Solve and audit the plan; evaluate it and the roll of each target by itself on a fine grid."""
+    problem = roll_plan(
+        rig,
+        tunnel,
+        targets,
+        HORIZON,
+        rate_weight=RATE_WEIGHT,
+        acceleration_weight=ACCELERATION_WEIGHT,
+        rate_limit=RATE_LIMIT,
+        acceleration_limit=ACCELERATION_LIMIT,
+        surroundings=obstacle(),
+        clearance=CLEARANCE,
+        symbols=ca.SX,
+    )
+    solution = solve(problem, METHOD)
+    audit = solution.audit()
+    t = np.linspace(0, HORIZON, 401)
+    rows = np.array([np.broadcast_to(part, len(t)) for part in targets(t)])
+    dense = solution.at(t)
+    planned = np.asarray(dense["roll"]).ravel(), np.asarray(dense["rate"]).ravel()
+    single = np.array(optimal_inverse(rig, tunnel).map(len(t))(rows, np.zeros((1, len(t))))[0])[5]
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    gaps = clearances(rig, inverse(rig, x, phi)[0], obstacle())
+    cost = index_harmonics(rig, tunnel, x).value(ca.cos(phi), ca.sin(phi))
+    measure = ca.Function("measure", [x, phi], [cost, ca.mmin(ca.vertcat(*gaps.values()))]).map(len(t))
+
+    def course(roll: Array, rate: Array) -> Course:
+        index, gap = (np.array(part)[0] for part in measure(rows, roll[None]))
+        return Course(roll, rate, index, gap)
+
+    kept = course(*planned)
+    alone = course(single, np.gradient(single, t))
+    return RollPlan(t, kept, alone, solution.cost, audit.passed, str(audit))
+
+
+def plan_summary(found: RollPlan) -> dict[str, Any]:
+    """The numbers that matter."""
+
+    def of(course: Course) -> dict[str, float]:
+        integral = float(np.trapezoid(course.index, found.t))
+        return {
+            "index_integral_s": integral,
+            "rate_max_rad_s": float(np.abs(course.rate).max()),
+            "least_clearance_m": float(course.clearance.min()),
+        }
+
+    return {
+        "plan": of(found.plan),
+        "each_target_by_itself": of(found.single),
+        "cost": found.cost,
+        "audit_passed": found.passed,
+        "rate_limit_rad_s": RATE_LIMIT,
+        "acceleration_limit_rad_s2": ACCELERATION_LIMIT,
+        "clearance_m": CLEARANCE,
+    }
+
+
+def draw_plan(path: Path, found: RollPlan) -> None:
+    """Roll, roll rate, I1 and clearance of the plan and of each target by itself."""
+    note = (
+        f"Least integral of $I_1$ + {RATE_WEIGHT:g} rate$^2$ + {ACCELERATION_WEIGHT:g} acceleration$^2$ over the "
+        f"paper's sweep; rate at most {RATE_LIMIT:g} rad/s, acceleration {ACCELERATION_LIMIT:g} rad/s$^2$. Limits, "
+        "weights and the obstacle, a block beside the goose-neck, are chosen; so are the link lengths."
+    )
+    names = ("roll", "rate", "index", "clearance")
+    labels = ("roll $q_6$, rad", "roll rate, rad/s", "index $I_1$", "clearance of the rig, m")
+    with sheet(path, rows=2, columns=2, size=(8.2, 5.0), note=note, sharex=True) as (_, axes):
+        for ax, name, label in zip(axes.flat, names, labels, strict=True):
+            ax.plot(found.t, getattr(found.single, name), ls=DASHES[1], color=COLORS["orange"], label="each by itself")
+            ax.plot(found.t, getattr(found.plan, name), color=COLORS["blue"], label="whole trajectory")
+            ax.set_ylabel(label)
+        limits = ((axes[0, 1], RATE_LIMIT, "limit"), (axes[1, 1], CLEARANCE, "least allowed"))
+        for ax, limit, label in limits:
+            ax.axhline(limit, color=COLORS["grey"], ls=DASHES[2], label=label)
+        for ax in (axes[0, 0], axes[0, 1], axes[1, 1]):
+            ax.legend(loc="best")
+        axes[1, 1].set_ylim(0, None)
+        for ax in axes[1]:
+            ax.set_xlabel("time, s")

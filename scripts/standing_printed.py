@@ -1,0 +1,68 @@
+"""The null-space law (22) of Yoo et al. 2004 with the sign of C as it is printed: a likely cause of its Figure 4.
+
+The corrected law is ocp.acceleration_laws' "null_space". With -C the zero moment point is not held where it is asked
+to be, and the machine does not fall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from models.standing import Standing
+from models.standing_motion import StandingMotion, standing_motion
+from ocp.builders.tip_path import Path, linear_rows, path_derivatives
+from ocp.local import least_rates
+
+__all__ = ["printed_law"]
+
+STEP = 1e-3  # s
+
+
+def printed_law(
+    machine: Standing, tip_path: Path, rows: Sequence[int], start_joints: np.ndarray, horizon: float, sign: float = -1.0
+) -> tuple[StandingMotion, float]:
+    """Simulate q'' = J^+ (u'' - h) + P [J_m P]^+ (sign C - J_m J^+ (u'' - h) - q'^T H_m q') from rest by RK4.
+
+    Args:
+        sign: Of C: -1 as printed, +1 corrected.
+
+    Returns:
+        The motion, and the greatest distance of the tip from its path, m.
+    """
+    n, axes = machine.joint_size, list(machine.moving_axes)
+    time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
+    jacobian = ca.densify(machine.tip_jacobian((), q))[list(rows), :]
+    position, _, acceleration = path_derivatives(tip_path, time, len(rows))
+    task = acceleration - ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
+    inverse = least_rates(jacobian, ca.DM.eye(len(rows)))
+    free = ca.DM.eye(n) - ca.mtimes(inverse, jacobian)
+    balance = machine.zmp_rows(q, qd, machine.most_stable_point)
+    motion_rows, constant = balance.jacobian[axes, :], balance.right[axes]
+    needed = balance.needed(qd)[axes] + (sign - 1) * constant
+    first = ca.mtimes(inverse, task)
+    second = least_rates(ca.mtimes(motion_rows, free), needed - ca.mtimes(motion_rows, first))
+    gap = ca.norm_2(machine.tip_pose((), q).position[linear_rows(rows)] - position)
+    law = ca.Function("printed", [time, q, qd], [first + second, gap], {"cse": True})
+
+    steps = int(np.ceil(horizon / STEP))
+    h = horizon / steps
+    state, at = ca.MX.sym("state", 2 * n), ca.MX.sym("at")
+
+    def rate(t: ca.MX, x: ca.MX) -> ca.MX:
+        return ca.vertcat(x[n:], law(t, x[:n], x[n:])[0])
+
+    k1 = rate(at, state)
+    k2 = rate(at + h / 2, state + h / 2 * k1)
+    k3 = rate(at + h / 2, state + h / 2 * k2)
+    k4 = rate(at + h, state + h * k3)
+    step = ca.Function("step", [state, at], [state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    start = np.concatenate([start_joints, np.zeros(n)])
+    times = np.linspace(0.0, horizon, steps + 1)
+    states = np.vstack([start, np.array(step.mapaccum("steps", steps)(start, times[None, :-1])).T])
+    joints, velocities = states[:, :n], states[:, n:]
+    accelerations, gaps = law.map(steps + 1)(times[None, :], joints.T, velocities.T)
+    motion = standing_motion(machine, times, joints, velocities, np.array(accelerations).T, rows=rows)
+    return motion, float(np.max(np.array(gaps)))

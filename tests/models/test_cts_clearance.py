@@ -1,0 +1,101 @@
+"""Roll of a target among obstacles: clearance as a constraint and in the index, against a dense grid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models.clearance import Box, Surroundings, clearances, soft_minimum
+from models.cts import HOME, INCH, inverse, reference_rig, reference_tunnel
+from models.cts_clearance import clear_inverse
+from models.cts_optimal import optimal_inverse
+from models.cts_roll import ACTIVE, STATUS
+from models.cts_table import solve_table
+from models.errors import ModelError
+from tests.models.cts_oracle import Array, index_by_geometry, joints_by_geometry
+
+RIG, TUNNEL = reference_rig(), reference_tunnel()
+AROUND = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))
+TARGETS = np.array([[100 * INCH, 6 * INCH, z * INCH, yaw, 0.1] for z, yaw in ((-12, 0), (-6, 0.1), (0, 0), (7, -0.1))])
+
+
+def grid_costs(weight: float, width: float, rate_weight: float = 0.0) -> tuple[Array, Array]:
+    """Cost (inf out of reach) and least distance on a dense grid of rolls about 0. Shapes (targets, rolls)."""
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    gaps = list(clearances(RIG, inverse(RIG, x, phi, HOME)[0], AROUND).values())
+    gap = ca.Function("gap", [x, phi], [soft_minimum(gaps, 2e-3)])
+    rolls = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
+    costs, distances = [], []
+    for row in TARGETS:
+        rows = np.repeat(row[:, None], len(rolls), axis=1)
+        inside = joints_by_geometry(RIG, rows, rolls, HOME)[1]
+        distance = np.array(gap.map(len(rolls))(rows, rolls[None]))[0]
+        cost = index_by_geometry(RIG, TUNNEL, rows, rolls) + weight * np.exp(-distance / width)
+        cost += rate_weight / (2 * np.pi) * rolls**2
+        costs.append(np.where(inside, cost, np.inf))
+        distances.append(distance)
+    return np.array(costs), np.array(distances)
+
+
+@pytest.mark.parametrize(
+    ("clearance", "weight", "rate_weight"), [(0.15, 0.0, 0.0), (-np.inf, 0.3, 0.0), (0.1, 0.05, 0.5)]
+)
+def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: float, rate_weight: float) -> None:
+    function = clear_inverse(
+        RIG, TUNNEL, AROUND, clearance=clearance, weight=weight, width=0.1, rate_weight=rate_weight
+    )
+    costs, distances = grid_costs(weight, 0.1, rate_weight)
+    for row, cost, distance in zip(TARGETS, costs, distances, strict=True):
+        joints, found, _, status, gap = function(row, 0.0)
+        assert int(status) == 0
+        assert float(gap) >= clearance
+        assert float(found) <= np.where(distance >= clearance, cost, np.inf).min() + 1e-9
+        roll = float(joints[5])
+        nearest = np.abs(np.linspace(-np.pi, np.pi, 1440, endpoint=False) - roll).argmin()
+        assert float(found) == pytest.approx(cost[nearest], abs=5e-3)
+
+
+def test_the_constraint_that_holds_the_roll_is_named() -> None:
+    table = solve_table(RIG, TUNNEL, TARGETS, surroundings=AROUND, clearance=0.15)
+    free = solve_table(RIG, TUNNEL, TARGETS)
+    assert table.status == ("ok",) * 4
+    assert table.active[2] == "clearance"
+    assert (table.cost >= free.cost - 1e-12).all()
+
+
+def test_far_from_everything_it_is_the_closed_form() -> None:
+    far = Surroundings(solids=(Box((80.0, 0, 0), (1.0, 1, 1)),))
+    function, closed = clear_inverse(RIG, TUNNEL, far, clearance=0.1), optimal_inverse(RIG, TUNNEL)
+    for row in TARGETS:
+        np.testing.assert_allclose(np.array(function(row, 0.3)[0]), np.array(closed(row, 0.3)[0]), atol=1e-7)
+
+
+def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() -> None:
+    rows = np.vstack([TARGETS, [[np.nan] * 5], [[9.0, 9, 9, 0, 0]]])
+    shut = Surroundings(walls=Box((0, 0, 0), (np.inf, 0.01, 0.01)))
+    assert solve_table(RIG, TUNNEL, TARGETS, surroundings=shut, clearance=0.0).status == ("clearance",) * 4
+    table = solve_table(RIG, TUNNEL, rows, surroundings=AROUND, clearance=0.1)
+    assert table.status == ("ok",) * 4 + ("not a number", "pitch link out of reach")
+    assert np.isnan(table.joints[4:]).all()
+    assert STATUS[-1] == ACTIVE[-1] == "clearance"
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"weight": -1.0}, "weight"),
+        ({"width": 0.0}, "width"),
+        ({"clearance": np.nan}, "clearance"),
+        ({"samples": 3}, "samples"),
+        ({"rate_weight": np.inf}, "rate_weight"),
+        ({"softness": 0.0}, "width"),
+    ],
+)
+def test_what_cannot_be_asked_is_named(options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ModelError, match=reason):
+        clear_inverse(RIG, TUNNEL, AROUND, **options)
+    with pytest.raises(ModelError, match="empty"):
+        clear_inverse(RIG, TUNNEL, Surroundings())

@@ -1,0 +1,123 @@
+"""Lines, arcs and their chain: geometry from first principles, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import ModelError
+from models.paths import Arc, Line, Path, smooth
+from tests.models.task_paths import seeds, turned
+
+
+def points_of(arc: Arc, count: int = 101) -> Any:
+    return Path((arc,)).at(np.zeros(count, dtype=int), np.linspace(0, arc.length, count))[0]
+
+
+@given(seeds)
+def test_an_arc_goes_through_its_three_points_on_a_circle_in_their_plane(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.normal(size=(3, 3)) * 10 ** rng.uniform(-2, 2)
+    arc = Arc.through(a, b, c)
+    size = float(np.linalg.norm(c - a))
+    normal = np.cross(b - a, c - a)
+    points = points_of(arc)
+    assert arc.start == pytest.approx(a, abs=0)
+    assert arc.end == pytest.approx(c, abs=1e-12 * (arc.radius + size))
+    assert np.linalg.norm(points - arc.center, axis=1) == pytest.approx(arc.radius, rel=1e-12)
+    assert (points - a) @ (normal / np.linalg.norm(normal)) == pytest.approx(0, abs=1e-9 * arc.radius)
+    # b is on the way: the angle from a to b about the axis is less than the sweep
+    first, to_b = a - arc.center, b - arc.center
+    angle = np.arctan2(arc.axis @ np.cross(first, to_b), first @ to_b) % (2 * np.pi)
+    assert np.linalg.norm(to_b) == pytest.approx(arc.radius, rel=1e-9)
+    assert 0 < angle < arc.sweep
+
+
+@pytest.mark.parametrize("height", 10.0 ** -np.arange(1, 9))
+def test_an_arc_that_is_nearly_a_line_ends_at_its_end_to_rounding(height: float) -> None:
+    a, c = np.array([0.3, -0.2, 0.7]), np.array([-0.4, 0.5, 0.1])
+    across = np.cross(c - a, [1.0, 2.0, 3.0])
+    via = (a + c) / 2 + height * across / np.linalg.norm(across)
+    arc = Arc.through(a, via, c)
+    assert np.linalg.norm(arc.end - c) < 1e-14
+    sagitta, chord = height, float(np.linalg.norm(c - a))
+    assert arc.radius == pytest.approx(sagitta / 2 + chord**2 / (8 * sagitta), rel=1e-7)
+
+
+@given(seeds, st.floats(-1, 1))
+def test_an_arc_about_a_center_turns_by_its_sweep(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    sweep = 2 * np.pi * share if abs(share) > 1e-3 else 2 * np.pi
+    center, axis = rng.normal(size=3), rng.normal(size=3)
+    across = np.cross(axis, rng.normal(size=3))
+    arc = Arc.about(center + across, center, axis, sweep)
+    unit = axis / np.linalg.norm(axis)
+    # Rodrigues
+    expected = center + across * np.cos(sweep) + np.cross(unit, across) * np.sin(sweep)
+    assert arc.end == pytest.approx(expected, abs=1e-12 * (1 + arc.radius))
+    assert arc.length == pytest.approx(abs(sweep) * np.linalg.norm(across), rel=1e-14)
+
+
+def test_a_full_circle_closes_and_joins_its_neighbours() -> None:
+    circle = Arc.about((1.0, 0.0, 0.0), (1.0, 0.3, 0.0), (0.0, 0.0, 1.0), 2 * np.pi)
+    assert circle.end == pytest.approx([1.0, 0.0, 0.0], abs=1e-15)
+    path = smooth(Path((Line((0, 0, 0), (1, 0, 0)), circle, Line((1, 0, 0), (2, 0, 0.5)))), 0.05)
+    assert path.length == pytest.approx(1 + 0.6 * np.pi + np.hypot(1, 0.5), abs=0.02)
+    assert path.curvature_jumps().max() < 1e-9
+
+
+@given(seeds)
+def test_the_path_of_a_segment_has_the_derivatives_of_its_position(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = Path((Arc.through(*rng.normal(size=(3, 3))),))
+    s, h = rng.uniform(0.1, 0.9, 5) * path.length, 1e-5 * path.length
+    index = np.zeros(5, dtype=int)
+    before, here, after = (path.at(index, s + k * h) for k in (-1, 0, 1))
+    for order in range(3):
+        difference = (after[order] - before[order]) / (2 * h)
+        assert difference == pytest.approx(here[order + 1], abs=1e-7 * np.abs(here[order + 1]).max())
+
+
+NAN = float("nan")
+STEP = Line((0, 0, 0), (1, 0, 0))
+TILTED = turned((1.0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Line((0, 0, 0), (0, 0, 0)), "length 0 m"),
+        (lambda: Line((0, 0, 0), (NAN, 0, 0)), "not finite"),
+        (lambda: Line((0, 0), (1, 0, 0)), "shape"),
+        (lambda: Line((0, 0, 0), (1, 0, 0), (2, 0, 0, 0)), "norm 2"),
+        (lambda: Line((0, 0, 0), (1, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0)), "180 deg"),
+        (lambda: Arc.through((0, 0, 0), (1, 0, 0), (2, 0, 0)), "on a line"),
+        (lambda: Arc.through((0, 0, 0), (1, 0, 0), (0, 0, 0)), "full circle"),
+        (lambda: Arc.through((0, 0, 0), (NAN, 0, 0), (0, 1, 0)), "not finite"),
+        (lambda: Arc.about((1, 0, 0), (1, 0, 0), (0, 0, 1), 1.0), "radius"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 0), 1.0), "no direction"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (1, 0, 1), 1.0), "perpendicular"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 0.0), "sweep 0"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 7.0), "sweep 7"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), NAN), "not finite"),
+        (lambda: Path(()), "no segment"),
+        (lambda: Path(3), "no sequence"),  # type: ignore[arg-type]
+        (lambda: Path(("line",)), "segment 0"),  # type: ignore[arg-type]
+        (lambda: Path((STEP, Line((1, 0, 1e-6), (2, 0, 0)))), "gap of 1e-06"),
+        (lambda: Path((STEP, Line((1, 0, 0), (0.5, 0, 0)))), "180 deg"),
+        (lambda: Path((STEP, Arc.about((1, 0, 0), (1, 1, 0), (0, 0, -1), 1.0))), "180 deg"),
+        (lambda: Path((STEP, Line((1, 0, 0), (1, 1, 0), TILTED))), "orientation jumps by 57.3 deg"),
+        (lambda: Path.through([(0, 0, 0)]), "at least two"),
+        (lambda: Path.through([(0, 0, 0), (1, 0, 0), (1, 0, 0)]), "length 0 m"),
+        (lambda: Path.through([(0, 0, 0), (1, 0, 0), (0, 0, 0)]), "180 deg"),
+        (lambda: Path.through("points"), "not numeric"),
+    ],
+)
+def test_what_is_no_path_is_a_named_error(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        make()

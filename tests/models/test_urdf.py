@@ -1,0 +1,329 @@
+from __future__ import annotations
+
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import FreeFloating, ModelError, Robot, center_of_mass, link_frames, robot_inertia
+from models.urdf import read_urdf
+from tests.models.pinocchio_robots import Peer, random_state, urdf_file
+from tests.models.trees import few, numeric, numeric_poses, random_robot, seeds
+from tests.models.urdf_text import urdf_of
+
+BODY = '<inertial><mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+ENDS = '<parent link="a"/><child link="b"/>'
+
+
+def text(joint: str = f'<joint name="j" type="fixed">{ENDS}</joint>', links: str = "", robot: str = "robot") -> str:
+    return f'<{robot} name="r"><link name="a">{BODY}</link><link name="b"/>{links}{joint}</{robot}>'
+
+
+def moving(inside: str = "", kind: str = "revolute", name: str = "j") -> str:
+    return f'<joint name="{name}" type="{kind}">{ENDS}{inside}</joint>'
+
+
+def chain(kinds: str = "rrr", extra: dict[int, str] | None = None) -> str:
+    """Links l0, l1.., joints j1, j2.. of the given kinds."""
+    names = {"r": "revolute", "c": "continuous", "p": "prismatic", "f": "fixed", "F": "floating"}
+    links = "".join(f'<link name="l{i}">{BODY}</link>' for i in range(len(kinds) + 1))
+    joints = "".join(
+        f'<joint name="j{i + 1}" type="{names[kind]}"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f"{(extra or {}).get(i + 1, '')}</joint>"
+        for i, kind in enumerate(kinds)
+    )
+    return f'<robot name="chain">{links}{joints}</robot>'
+
+
+@given(seeds, st.integers(1, 8))
+@few
+def test_a_robot_written_as_urdf_is_read_again_here_and_by_pinocchio(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size)
+    source = urdf_of(robot, rng)
+    again = Robot.from_urdf(source, tip=robot.tip)
+    state = random_state(again, rng)
+    order = [again.joint_names.index(name) for name in robot.joint_names]
+    frames = numeric_poses(robot, state.q[order], (state.rotation, state.position))
+    peer = pinocchio.buildModelFromXML(source, pinocchio.JointModelFreeFlyer())
+    data, configuration = peer.createData(), Peer(peer, again).configuration(state)
+    pinocchio.framesForwardKinematics(peer, data, configuration)
+    for name, (turn, position) in numeric_poses(again, state.q, (state.rotation, state.position)).items():
+        np.testing.assert_allclose(turn, frames[name][0], atol=1e-13)
+        np.testing.assert_allclose(position, frames[name][1], atol=1e-13)
+        theirs = data.oMf[peer.getFrameId(name, pinocchio.FrameType.BODY)]
+        np.testing.assert_allclose(turn, theirs.rotation, atol=1e-13)
+        np.testing.assert_allclose(position, theirs.translation, atol=1e-13)
+    whole = numeric(robot_inertia(again, state.q))
+    np.testing.assert_allclose(whole, numeric(robot_inertia(robot, state.q[order])), atol=1e-11)
+    assert again.total_mass == pytest.approx(robot.total_mass, rel=1e-14)
+    for joint in robot.joints:
+        assert (again.joint(joint.name).kind, again.joint(joint.name).parent) == (joint.kind, joint.parent)
+
+
+COLLECTION = sorted(file for file in distribution("example-robot-data").files or [] if file.suffix == ".urdf")
+
+
+@pytest.mark.parametrize("path", COLLECTION, ids=lambda path: f"{path.parts[-3]}/{path.name}")
+def test_every_robot_of_the_collection_is_read_as_pinocchio_reads_it(path: Any) -> None:
+    source = Path(str(path.locate()))
+    if source.name == "ur3.urdf":
+        with pytest.raises(ModelError, match="has no <link>"):
+            Robot.from_urdf(source)
+        return
+    first = read_urdf(source, inertia="as_given").links[0].name
+    robot = Robot.from_urdf(source, tip=first, mimic="free", inertia="as_given")
+    peer = Peer.of(source, robot)
+    state = random_state(robot, np.random.default_rng(7))
+    place = (state.rotation, state.position)
+    pinocchio.framesForwardKinematics(peer.model, peer.data, peer.configuration(state))
+    middle = pinocchio.centerOfMass(peer.model, peer.data)
+    for name, frame in link_frames(robot, state.q, place).items():
+        theirs = peer.data.oMf[peer.model.getFrameId(name, pinocchio.FrameType.BODY)]
+        np.testing.assert_allclose(numeric(frame.rotation), theirs.rotation, atol=1e-13)
+        np.testing.assert_allclose(numeric(frame.position).ravel(), theirs.translation, atol=1e-13)
+    np.testing.assert_allclose(numeric(center_of_mass(robot, state.q, place)).ravel(), middle, atol=1e-12)
+
+
+def test_a_text_a_string_path_and_a_path_give_the_same_robot(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text('<?xml version="1.0" encoding="utf-8"?>\n' + chain(), encoding="utf-8")
+    content = file.read_text(encoding="utf-8")
+    found = {str(Robot.from_urdf(source)) for source in (content, "\ufeff\n  " + content, file, str(file))}
+    assert len(found) == 1
+    assert found.pop().startswith("chain of 4 links, 3 degrees of freedom, 8 kg, tip on l3")
+
+
+def test_what_is_left_out_has_the_meaning_of_the_format() -> None:
+    robot = Robot.from_urdf(text(moving()))
+    joint = robot.joints[0]
+    np.testing.assert_array_equal(joint.axis, [1, 0, 0])
+    np.testing.assert_array_equal(joint.translation, np.zeros(3))
+    np.testing.assert_array_equal(joint.rotation, np.eye(3))
+    assert (joint.lower, joint.upper, joint.velocity, joint.effort) == (-np.inf, np.inf, np.inf, np.inf)
+    assert (robot.link("b").mass, robot.link("b").inertia.any()) == (0.0, False)
+    np.testing.assert_array_equal(robot.link("a").center_of_mass, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("inside", "kind", "limits"),
+    [
+        ('<limit lower="-1" upper="2" velocity="3" effort="4"/>', "revolute", (-1, 2, 3, 4)),
+        ('<limit upper="2" velocity="3" effort="4"/>', "prismatic", (0, 2, 3, 4)),
+        ('<limit lower="-2"/>', "revolute", (-2, 0, np.inf, np.inf)),
+        ('<limit velocity="3" effort="4"/>', "revolute", (-np.inf, np.inf, 3, 4)),
+        ('<limit lower="-1" upper="1" velocity="3" effort="4"/>', "continuous", (-np.inf, np.inf, 3, 4)),
+        ('<safety_controller soft_lower_limit="-0.5" k_velocity="1"/>', "revolute", (-np.inf, np.inf, np.inf, np.inf)),
+    ],
+)
+def test_limits(inside: str, kind: str, limits: tuple[float, ...]) -> None:
+    joint = Robot.from_urdf(text(moving(inside, kind))).joints[0]
+    assert (joint.lower, joint.upper, joint.velocity, joint.effort) == limits
+
+
+def test_an_inertia_is_turned_with_its_origin() -> None:
+    inertial = (
+        '<inertial><origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/><mass value="2"/>'
+        '<inertia ixx="1" ixy="0.1" ixz="0" iyy="2" iyz="0" izz="2.5"/></inertial>'
+    )
+    link = Robot.from_urdf(f'<robot name="r"><link name="a">{inertial}</link></robot>').link("a")
+    np.testing.assert_allclose(link.inertia, [[2, -0.1, 0], [-0.1, 1, 0], [0, 0, 2.5]], atol=1e-15)
+    np.testing.assert_array_equal(link.center_of_mass, [1, 2, 3])
+
+
+def test_elements_that_say_nothing_of_motion_are_passed_over() -> None:
+    others = (
+        '<gazebo reference="a"><link name="c"/></gazebo><material name="grey"/><joint_like name="x"/>'
+        '<transmission name="t"><joint name="nowhere"><hardwareInterface>E</hardwareInterface></joint></transmission>'
+    )
+    joint = moving('<axis xyz="0 0 0"/><dynamics damping="1"/><calibration rising="0"/>', "fixed")
+    robot = Robot.from_urdf(text(joint, others))
+    assert [link.name for link in robot.links] == ["a", "b"]
+    namespaced = text().replace("<robot ", '<robot xmlns="http://www.ros.org" xmlns:xacro="http://ros.org/wiki/xacro" ')
+    assert Robot.from_urdf(namespaced).tip == "b"
+
+
+def test_a_floating_joint_below_a_massless_root_says_that_the_robot_floats() -> None:
+    source = chain("Frr").replace(f'<link name="l0">{BODY}</link>', '<link name="l0"/>')
+    robot = Robot.from_urdf(source)
+    assert (robot.root, robot.joint_names) == ("l1", ("j2", "j3"))
+    for elsewhere in (chain("Frr"), chain("rFr")):
+        with pytest.raises(ModelError, match=r"joint 'j[12]' is floating, which is supported only"):
+            Robot.from_urdf(elsewhere)
+
+
+def test_followers_are_refused_held_or_free() -> None:
+    source = chain("rpp", {2: '<mimic joint="j1" multiplier="2" offset="0.5"/>', 3: '<mimic joint="j2" offset="1"/>'})
+    with pytest.raises(ModelError, match=r"'j2' \(2 x 'j1'\), 'j3' \(1 x 'j2'\).*lock=.*mimic='lock'.*mimic='free'"):
+        Robot.from_urdf(source)
+    assert Robot.from_urdf(source, mimic="free").joint_names == ("j1", "j2", "j3")
+    held = Robot.from_urdf(source, mimic="lock")
+    assert held.joint_names == ("j1",)
+    np.testing.assert_allclose(held.joint("j2").translation, [0.5, 0, 0])
+    np.testing.assert_allclose(held.joint("j3").translation, [1.5, 0, 0])
+    with_leader = Robot.from_urdf(source, lock={"j1": 0.25})
+    assert with_leader.dof == 0
+    np.testing.assert_allclose(with_leader.joint("j2").translation, [1.0, 0, 0])
+    np.testing.assert_allclose(with_leader.joint("j3").translation, [2.0, 0, 0])
+    by_hand = Robot.from_urdf(source, lock={"j2": 3.0})
+    assert by_hand.joint_names == ("j1",)
+    np.testing.assert_allclose(by_hand.joint("j3").translation, [4.0, 0, 0])
+    fixed = chain("fp", {2: '<mimic joint="j1" offset="0.5"/>'})
+    np.testing.assert_allclose(Robot.from_urdf(fixed).joint("j2").translation, [0.5, 0, 0])
+
+
+@pytest.mark.parametrize("root", ["l0", "l1", "l3"])
+def test_another_root_and_tip_are_chosen_by_name(root: str) -> None:
+    robot = Robot.from_urdf(
+        chain("rpc"), root=root, tip="l0", tip_translation=(0, 0, 1), tip_rotation=np.diag([1, -1, -1])
+    )
+    assert (robot.root, robot.tip, robot.name) == (root, "l0", "chain")
+    assert sorted(robot.joint_names) == ["j1", "j2", "j3"]
+    np.testing.assert_array_equal(robot.tip_translation, [0, 0, 1])
+    np.testing.assert_array_equal(robot.tip_rotation, np.diag([1, -1, -1]))
+
+
+def test_the_tree_is_printed_with_masses_and_limits(capsys: pytest.CaptureFixture[str]) -> None:
+    path = urdf_file("example-robot-data", "panda_description/urdf/panda.urdf")
+    Robot.from_urdf(path, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02}).print()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "panda of 13 links, 7 degrees of freedom, 17.4519 kg, tip on panda_hand_tcp"
+    assert lines[2] == (
+        "└─ panda_joint1 (revolute, -2.8973 .. 2.8973 rad, 2.175 rad/s, 87 N m) -> panda_link1  4.97068 kg"
+    )
+    assert len(lines) == 14
+
+
+def test_a_chain_of_a_thousand_links_is_read_and_printed() -> None:
+    robot = Robot.from_urdf(chain("c" * 1100))
+    assert robot.dof == 1100
+    assert len(str(robot).splitlines()) == 1102
+
+
+BAD = BODY.replace('izz="1"', 'izz="3"')
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "<robot name='r'>\n<link name='a'>\n</robot>",
+            "the given text is not well-formed XML: mismatched tag, line 3",
+        ),
+        ("\n\n<robot name='r'>\n<link name='a'>\n</robot>", "mismatched tag, line 5"),
+        ("<robot><xacro:property name='m' value='1'/></robot>", "unbound prefix.*this is xacro.*expand it first"),
+        (
+            "<robot xmlns:xacro='http://ros.org/wiki/xacro'>\n<xacro:include filename='x'/></robot>",
+            "element <include>: this is xacro",
+        ),
+        (
+            text().replace('value="2"', 'value="${m}"'),
+            r"link 'a': value='\$\{m\}' of <mass> is not numeric: this is xacro",
+        ),
+        ("<sdf/>", "not URDF: its root element is <sdf>"),
+        ("<robot name='r'/>", "'r' has no <link>"),
+        ("no/such.urdf", "file 'no/such.urdf' cannot be read: No such file.*begins with '<'"),
+        ("", "cannot be read"),
+        ("x" * 5000, "cannot be read"),
+        ("a\0b", "cannot be read"),
+        (3, "a URDF source is a text or a path, not int"),
+        (b"<robot/>", "not bytes"),
+        (text().replace('name="b"', ""), "a <link> of children .* has no attribute 'name'"),
+        (
+            text(f'<joint type="fixed">{ENDS}</joint>'),
+            "a <joint> of children .*'parent', 'child'.* no attribute 'name'",
+        ),
+        (text(f'<joint name="j">{ENDS}</joint>'), "joint 'j': <joint> has no attribute 'type'"),
+        (text('<joint name="j" type="fixed"><parent link="a"/></joint>'), "joint 'j': <joint> has no <child>"),
+        (text(moving().replace('<child link="b"/>', "<child/>")), "joint 'j': <child> has no attribute 'link'"),
+        (text().replace('<mass value="2"/>', ""), "link 'a': <inertial> has no <mass>"),
+        (text().replace('<mass value="2"/>', "<mass/>"), "link 'a': <mass> has no attribute 'value'"),
+        (text().replace('ixz="0" ', ""), "link 'a': <inertia> has no attribute 'ixz'"),
+        (text().replace('value="2"', 'value="two"'), "link 'a': value='two' of <mass> is not numeric"),
+        (text().replace('value="2"', 'value="2_0"'), "value='2_0' of <mass> is not numeric"),
+        (text().replace('value="2"', 'value="1 2"'), "has 2 numbers, not 1"),
+        (text().replace('value="2"', 'value="nan"'), "link 'a': mass nan is not finite"),
+        (text().replace('value="2"', 'value="-2"'), "link 'a': mass -2.0 kg is negative"),
+        (text().replace(BODY, 2 * BODY), "link 'a' has 2 <inertial> elements"),
+        (text().replace(BODY, BAD), "link 'a': principal moments 1, 1, 3 kg m.2 violate.*inertia='as_given'"),
+        (text(moving('<origin xyz="1 2"/>')), "joint 'j': xyz='1 2' of <origin> has 2 numbers, not 3"),
+        (text(moving('<origin rpy="0,0,0"/>')), "rpy='0,0,0' of <origin> is not numeric"),
+        (text(moving('<axis xyz="0 0 0"/>')), "joint 'j': axis .* has no direction"),
+        (text(moving('<origin rpy="0 nan 0"/>')), "joint 'j': rpy='0 nan 0' of <origin> is not finite"),
+        (text(moving("<axis/>")), "joint 'j': <axis> has no attribute 'xyz'"),
+        (text(moving('<limit lower="1" upper="-1"/>')), "joint 'j': lower limit 1.0 is above upper limit -1.0"),
+        (text(moving('<limit velocity="-1"/>')), "joint 'j': velocity limit -1.0 is negative"),
+        (text(moving(kind="planar")), "joint 'j' is of the type 'planar', which is not supported"),
+        (text(moving(kind="Revolute")), "joint 'j' is of the type 'Revolute'"),
+        (text(moving().replace('child link="b"', 'child link="B"')), "child link 'B' does not exist; did you mean 'b'"),
+        (text(moving() + moving(name="k")), "link 'b' is the child of joints 'j' and 'k': a loop"),
+        (text(moving().replace('"a"', '"c"').replace('"b"', '"a"').replace('"c"', '"b"') + moving(name="k")), "loop"),
+        (text(links='<link name="c"/>'), r"links \['a', 'c'\] have no parent joint"),
+        (text(links='<link name="a"/>'), "link name 'a' is used more than once"),
+        (chain("rr").replace('"j2"', '"j1"'), "joint name 'j1' is used more than once"),
+        (
+            chain("rr", {2: '<mimic joint="k1"/>'}),
+            "joint 'j2': <mimic> of the joint 'k1' does not exist; did you mean 'j1'",
+        ),
+        (chain("rr", {2: "<mimic/>"}), "joint 'j2': <mimic>: <mimic> has no attribute 'joint'"),
+        (
+            chain("rr", {1: '<mimic joint="j2"/>', 2: '<mimic joint="j1"/>'}),
+            r"\['j1', 'j2'\] mimic each other in a ring",
+        ),
+        (
+            chain("rr", {2: '<mimic joint="j1" multiplier="x"/>'}),
+            "joint 'j2': multiplier='x' of <mimic> is not numeric",
+        ),
+    ],
+)
+def test_what_is_no_robot_is_refused(source: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        Robot.from_urdf(source)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tip": "l33"}, "tip link 'l33' does not exist; did you mean 'l3'"),
+        ({"tip": "elbow"}, r"tip link 'elbow' does not exist; there are \['l0', 'l1', 'l2', 'l3'\]"),
+        ({"root": "L2"}, "root link 'L2' does not exist; did you mean 'l2'"),
+        ({"lock": {"J1": 0.0}}, "joint 'J1' does not exist; did you mean 'j1'"),
+        ({"lock": {"j3": 0.0}}, "joint 'j3' is fixed; only a joint that moves can be locked"),
+        ({"lock": {"j1": np.nan}}, "joint 'j1': locked position nan is not finite"),
+        ({"mimic": "both"}, "unknown mimic rule 'both'; use 'error', 'lock' or 'free'"),
+        ({"inertia": "fix"}, "unknown inertia rule 'fix'; use 'error' or 'as_given'"),
+        ({"tip_translation": (1, 2)}, "tip_translation has shape"),
+        ({"tip_rotation": np.ones((3, 3))}, "tip_rotation .* not a rotation"),
+    ],
+)
+def test_what_does_not_fit_the_robot_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        Robot.from_urdf(chain("rrf"), **options)
+
+
+def test_every_impossible_inertia_is_named_and_can_be_taken_as_given() -> None:
+    path = urdf_file("example-robot-data", "tiago_description/robots/tiago.urdf")
+    with pytest.raises(ModelError, match=r"base_antenna_left_link.*negative.*base_antenna_right_link.*as_given"):
+        Robot.from_urdf(path, tip="wrist_ft_tool_link")
+    robot = Robot.from_urdf(path, tip="wrist_ft_tool_link", inertia="as_given")
+    doubtful = [link.name for link in robot.links if link.any_inertia]
+    assert doubtful == ["base_antenna_left_link", "base_antenna_right_link"]
+
+
+def test_a_configuration_of_a_wrong_length_names_the_joints() -> None:
+    with pytest.raises(ModelError, match=r"q has shape \(2, 1\), expected \(3, 1\).*'j1', 'j2', 'j3'"):
+        link_frames(Robot.from_urdf(chain()), [0.0, 0.0])
+
+
+def test_a_robot_without_inertials_does_not_float() -> None:
+    robot = Robot.from_urdf(chain().replace(BODY, ""))
+    assert robot.total_mass == 0
+    with pytest.raises(ModelError, match="no mass"):
+        FreeFloating(robot)
+    with pytest.raises(ModelError, match="no mass"):
+        center_of_mass(robot, np.zeros(3))

@@ -1,0 +1,276 @@
+"""Minimum time along a path as an optimal control problem: closed forms, limits between the points, and schedules."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from models.paths import Line, Path, SmoothPath, smooth
+from models.scara import Scara
+from models.scara_path import ScaraPath, scara_along
+from ocp import Collocation, ProblemError, solve
+from ocp.builders import path_reference
+from ocp.builders.path_tables import largest_demand, table
+from ocp.builders.path_timing import Fastest, minimum_time, timing_problem
+from ocp.schedule import JointLimits, Limits, Schedule, joint_motion, peak_acceleration, schedule
+from tests.models.test_paths import example
+
+INTERVALS = 100
+JOINTS = JointLimits([3.0, 3.0, 1.0, 6.0], [15.0, 15.0, 5.0, 30.0], [300.0, 300.0, 200.0, 800.0])
+ACCELERATION = peak_acceleration(5.0, 1.0, 200.0)
+
+
+class Case(NamedTuple):
+    path: SmoothPath
+    limits: Limits
+    joints: ScaraPath | None
+    plan: Schedule
+    best: Fastest
+
+
+def straight(length: float = 1.0) -> SmoothPath:
+    return smooth(Path((Line((0.0, 0.0, 0.0), (length, 0.0, 0.0)),)), 0.1)
+
+
+def random_path(seed: int) -> tuple[SmoothPath, Limits]:
+    rng = np.random.default_rng(seed)
+    points = np.cumsum(rng.normal(size=(int(rng.integers(3, 8)), 3)) * 10.0 ** rng.uniform(-3, 0), axis=0)
+    path = smooth(Path.through(points), 0.3 * float(np.linalg.norm(np.diff(points, axis=0), axis=1).min()))
+    speed, acceleration = path.length * 10 ** rng.uniform(-0.5, 0.5), path.length * 10 ** rng.uniform(-0.5, 1)
+    return path, Limits(speed, acceleration, path.length * 10 ** rng.uniform(0, 3), acceleration * rng.uniform(0.3, 2))
+
+
+@pytest.fixture(scope="module")
+def arm() -> ScaraPath:
+    return scara_along(Scara(0.4, 0.4), example("quintic"), "right")
+
+
+@pytest.fixture(scope="module")
+def limited(arm: ScaraPath) -> Case:
+    """The paper's example with a SCARA's limits."""
+    limits = Limits(1.0, ACCELERATION, 200.0, 5.0, JOINTS)
+    plan = schedule(arm.path, limits, joints=arm)
+    return Case(arm.path, limits, arm, plan, minimum_time(arm.path, limits, arm, guess=plan, intervals=INTERVALS))
+
+
+def worst(case: Case) -> float:
+    """Largest demand at ten times the grid and more, the demands being those of the test's own formulas."""
+    profile = case.best.schedule.profile
+    inside = (np.arange(30) + 0.5) / 30
+    motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
+    limits, s = case.limits, motion.distance
+    found = [
+        float((motion.speed / np.max(limits.speed)).max()),
+        float(np.abs(motion.acceleration).max() / limits.acceleration),
+        float(np.abs(motion.jerk).max() / limits.jerk),
+        float((motion.speed**2 * case.path.curvature(s)).max() / limits.centripetal),
+    ]
+    if case.joints is not None:
+        moved = joint_motion(case.joints, motion)[1:]
+        found += [float((np.abs(v) / b).max()) for v, b in zip(moved, limits.of_joints(4), strict=True)]
+    return max(found)
+
+
+# ---- closed forms --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "jerk", "duration"),
+    [
+        (1.0, 5.0, 200.0, 1.0 + 0.2 + 5.0 / 200),  # seven phases: L/v + v/a + a/j
+        (1.0, 5.0, 20.0, 1.0 + 2 * np.sqrt(1 / 20)),  # the acceleration is not reached: L/v + 2 sqrt(v/j)
+        (9.0, 9.0, 20.0, 4 * (1 / 40) ** (1 / 3)),  # nor the speed: 4 (L/(2 j))^(1/3)
+    ],
+)
+def test_a_line_takes_the_closed_form_whatever_the_guess(
+    speed: float, acceleration: float, jerk: float, duration: float
+) -> None:
+    path, limits = straight(), Limits(speed, acceleration, jerk)
+    assert schedule(path, limits).duration == pytest.approx(duration, rel=1e-9)
+    best = minimum_time(path, limits, intervals=INTERVALS)
+    assert best.duration == pytest.approx(duration, rel=1e-6)
+    # a guess that knows nothing of the optimum: its nodes are elsewhere, and the jerk held on them costs time
+    slow = schedule(path, Limits(0.3, 1.0, 10.0))
+    other = minimum_time(path, limits, guess=slow, intervals=2 * INTERVALS)
+    assert slow.duration > 2 * duration
+    assert -1e-6 < other.duration / duration - 1 < 1e-4
+    assert other.demand < 1.001
+
+
+def test_without_a_jerk_limit_to_speak_of_a_line_takes_bang_bang_acceleration() -> None:
+    best = minimum_time(straight(), Limits(10.0, 5.0, 1e6), intervals=INTERVALS)
+    assert best.duration == pytest.approx(2 * np.sqrt(1 / 5.0), rel=1e-4)
+    assert best.demand < 1.001
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_unit_of_length_does_not_matter(scale: float) -> None:
+    def best(unit: float) -> float:
+        corner = Path.through(unit * np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.5, 0.0)]))
+        limits = Limits(unit, 5 * unit, 200 * unit, 5 * unit)
+        return minimum_time(smooth(corner, 0.1 * unit), limits, intervals=50).duration
+
+    assert best(scale) == pytest.approx(best(1.0), rel=1e-6)
+
+
+# ---- limits and schedules ------------------------------------------------------------------------------------
+
+
+def test_the_example_keeps_every_limit_between_the_points(limited: Case) -> None:
+    assert worst(limited) < 1.001
+    assert limited.best.demand < 1.001
+    motion = limited.best.schedule.sample(1e-3)
+    demands = largest_demand(limited.path, limited.limits, limited.joints, motion)
+    # as fast as it goes: something binds nearly everywhere
+    assert np.median(demands) > 0.98
+
+
+def test_the_motion_of_the_example_is_a_motion(limited: Case) -> None:
+    profile = limited.best.schedule.profile
+    t = np.diff(profile.t)
+    v, a, j = profile.speed[:-1], profile.acceleration[:-1], profile.jerk
+    assert (t > 0).all()
+    assert profile.distance[-1] == pytest.approx(limited.path.length, rel=1e-12)
+    assert np.diff(profile.distance) == pytest.approx(t * (v + t * (a / 2 + t * j / 6)), rel=1e-5, abs=1e-9)
+    assert profile.speed[1:] == pytest.approx(v + t * (a + t * j / 2), abs=1e-5)
+    assert profile.acceleration[1:] == pytest.approx(a + t * j, abs=1e-5)
+    assert profile.duration == pytest.approx(limited.best.solution.cost, rel=1e-6)
+
+
+def test_the_schedule_is_never_faster_than_the_optimum(limited: Case) -> None:
+    assert limited.best.duration < limited.plan.duration * (1 + 1e-6)
+
+
+def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_with_joints(path: Any, limits: Limits, *, joints: Any = None) -> Schedule:
+        if limits.joints is not None:
+            raise ProblemError("no schedule found")
+        return schedule(path, limits, joints=joints)
+
+    monkeypatch.setattr(path_reference, "schedule", none_with_joints)
+    other = minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
+    # held jerks lose time in proportion to the intervals' width
+    assert other.duration == pytest.approx(limited.best.duration, rel=3e-3)
+    assert other.demand < 1.001
+
+
+@pytest.mark.parametrize("kind", ["cubic", "quintic"])
+def test_centripetal_acceleration_is_kept_where_the_curvature_jumps_too(kind: str) -> None:
+    path = example(kind)
+    limits = Limits(1.0, ACCELERATION, 200.0, 5.0)
+    plan = schedule(path, limits)
+    case = Case(path, limits, None, plan, minimum_time(path, limits, guess=plan, intervals=INTERVALS))
+    assert worst(case) < 1.001
+    assert case.best.duration < plan.duration
+
+
+def test_speeds_of_segments_are_kept() -> None:
+    path = example("quintic")
+    limits = Limits(np.array([1.0, 0.4, 0.7]), 5.0, 200.0)
+    plan = schedule(path, limits)
+    best = minimum_time(path, limits, guess=plan, intervals=INTERVALS)
+    motion = best.schedule.sample(1e-3)
+    assert largest_demand(path, limits, None, motion).max() < 1.001
+    assert best.duration < plan.duration * (1 + 1e-6)
+    assert motion.speed[np.argmin(np.abs(motion.distance - 0.7))] == pytest.approx(0.4, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_paths_are_solved_and_bracketed(seed: int) -> None:
+    path, limits = random_path(seed)
+    plan = schedule(path, limits)
+    best = minimum_time(path, limits, guess=plan, intervals=60)
+    assert worst(Case(path, limits, None, plan, best)) < 1.001
+    # no motion beats the line alone, without its curvature
+    alone = schedule(path, Limits(limits.speed, limits.acceleration, limits.jerk)).duration
+    assert alone * (1 - 1e-6) < best.duration < plan.duration * (1 + 1e-6)
+
+
+def test_tight_joint_limits_far_below_the_asked_speed_are_solved(arm: ScaraPath) -> None:
+    limits = Limits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0))
+    plan = schedule(arm.path, limits, joints=arm)
+    case = Case(arm.path, limits, arm, plan, minimum_time(arm.path, limits, arm, guess=plan, intervals=60))
+    assert worst(case) < 1.001
+    assert case.best.duration < plan.duration
+
+
+# ---- audit ---------------------------------------------------------------------------------------------------
+
+
+def test_the_audit_confirms_the_plan_but_not_the_stationarity_of_held_jerks(limited: Case) -> None:
+    """Jerks held over intervals are not stationary at every instant; the audit says so, and only that."""
+    audit = limited.best.solution.audit()
+    assert {finding.name for finding in audit.failures} == {"stationarity, relative"}
+    assert audit["cost, relative"].value < 1e-4
+
+
+def test_free_jerks_at_the_points_are_faster_than_held_ones_and_break_limits_between(limited: Case) -> None:
+    """Why held jerks: with any other control the limits hold at the points alone."""
+    timing = limited.best.timing
+    free = solve(timing.problem, Collocation(len(timing.mesh) - 1, 3, mesh=timing.mesh))
+    assert free.cost < limited.best.duration
+    assert not free.audit()["bounds of jerk"].passed
+    with pytest.raises(ProblemError, match="held"):
+        timing.profile(free)
+
+
+# ---- tables and errors ---------------------------------------------------------------------------------------
+
+
+def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
+    def columns(x: Any) -> Any:
+        return np.column_stack([np.sin(20 * x) + (x >= 0.3), 1e6 / (1e-3 + (x - 0.7) ** 2), np.abs(x - 0.3)])
+
+    function = table(columns, np.array([0.0, 0.3, 1.0]))
+    x = np.linspace(0, 1, 4001)
+    found = np.array(function.map(len(x))(x[None])).T
+    assert (np.abs(found - columns(x)).max(axis=0) < 2e-8 * np.abs(columns(x)).max(axis=0)).all()
+    assert np.array(function(0.3))[0, 0] == pytest.approx(np.sin(6.0) + 1, abs=4e-8)
+    assert np.array(function(0.3 - 1e-12))[0, 0] == pytest.approx(np.sin(6.0), abs=4e-8)
+
+
+class Joints(NamedTuple):
+    """Two joints that are the same broken array everywhere."""
+
+    value: float
+    number: int
+    names: tuple[str, ...] = ("a", "b")
+
+    def at(self, distance: Any) -> Any:
+        values = np.ones((len(distance), self.number))
+        values[distance > 0.5] = self.value
+        return type("Rates", (), dict.fromkeys(("position", "first", "second", "third"), values))()
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        (None, "joint limits need"),
+        (Joints(np.nan, 2), "not finite"),
+        (Joints(np.inf, 2), "not finite"),
+        (Joints(1.0, 3), "shape"),
+    ],
+)
+def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
+    with pytest.raises(ProblemError, match=words):
+        minimum_time(example("quintic"), Limits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
+
+
+def test_a_joint_jerk_limit_on_a_path_whose_curvature_jumps_is_refused() -> None:
+    path = example("cubic")
+    along = scara_along(Scara(0.4, 0.4), path, "right")
+    limits = Limits(1.0, 5.0, 200.0, joints=JOINTS)
+    with pytest.raises(ProblemError, match="curvature jumps"):
+        minimum_time(path, limits, along)
+    with pytest.raises(ProblemError, match="curvature jumps"):
+        minimum_time(path, limits, along, guess=schedule(path, Limits(1.0, 5.0, 200.0)))
+
+
+def test_a_guess_of_another_path_and_too_few_intervals_are_refused() -> None:
+    limits = Limits(1.0, 5.0, 200.0)
+    with pytest.raises(ProblemError, match="guess is for a path"):
+        timing_problem(straight(), limits, guess=schedule(straight(2.0), limits))
+    with pytest.raises(ProblemError, match="intervals"):
+        timing_problem(straight(), limits, intervals=5)
