@@ -1,8 +1,9 @@
 """Roll of least index that keeps clear of the surroundings: clearance as a constraint, in the index, or both.
 
-With links and obstacles in it the index has no closed form any more. The rolls of a fixed grid are compared, together
-with the best roll of the closed form, and the best is refined by a pattern search whose step shrinks: a fixed number
-of operations. What is between two rolls of the grid and better than both sides may be missed; a finer grid finds it.
+With links and obstacles in it the index has no closed form any more. The rolls of a fixed grid are compared, those that
+fall short of the clearance with a penalty, and the least minima among them, together with the best roll of the closed
+form, are refined by a pattern search whose step shrinks: a fixed number of operations. A minimum that no roll of the
+grid is drawn to may be missed; a finer grid finds it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,11 @@ from models.cts_roll import ACTIVE, STATUS, index_harmonics, verdict
 from models.errors import ModelError
 from models.spatial import Expression
 
-STEPS, SHRINK = 34, 0.62
+TURN = 2 * np.pi
+STEPS, SHRINK = 44, 0.62
+BASINS = 4  # minima of the grid that are refined
+DEAR = 1e3  # 1/m; of a clearance that falls short, in what the search compares
+INSET = 1e-10  # m; how far inside the least clearance the search aims
 AT_LIMIT = 1e-6  # m; nearer to the least clearance than this counts as held by it
 
 
@@ -85,57 +90,71 @@ def clear_inverse(
     meets = verdict(rig, target, posture, c, s)
     held = ca.logic_and(meets.relaxed(), meets.slide())
     fine = ca.logic_and(held, gap >= clearance)
-    value = ca.Function("value", [target, previous, angle], ca.cse([ca.if_else(fine, cost, ca.inf)]))
-    place = ca.Function("place", [target, previous, angle], ca.cse([joints, gap]))
+    given = [target, previous, angle]
+    value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))
+    short: Any = ca.fmax(clearance + INSET - gap, 0) if np.isfinite(clearance) else 0.0
+    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + DEAR * short, ca.inf)]))
+    place = ca.Function("place", given, ca.cse([joints, gap]))
 
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
     closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
     reached = closed_status == 0
     free = ca.if_else(reached, closed[5], 0.0)
     grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
-    values = value.map(samples)(x, before, grid)
-    best_angle, best_cost = free, value(x, before, free)
-    from_closed: Any = 1
-    choice = ca.Function("choice", *_choice(samples))
-    at, least = choice(values)
-    better = least < best_cost
-    best_angle, best_cost = ca.if_else(better, at, best_angle), ca.if_else(better, least, best_cost)
-    from_closed = ca.logic_not(better)
-
-    step = _pattern(value)
-    refined = step.mapaccum(STEPS)(
-        ca.vertcat(best_angle, best_cost, 2 * np.pi / samples), ca.repmat(ca.vertcat(x, before), 1, STEPS)
-    )[:, -1]
-    moved = refined[1] < best_cost
-    from_closed = ca.logic_and(from_closed, ca.logic_not(moved))
-    q, distance = place(x, before, refined[0])
-    found = refined[1] < ca.inf
-    status = ca.if_else(reached, ca.if_else(found, 0, STATUS.index("clearance")), closed_status)
+    starts = ca.Function("starts", *_starts(samples))(merit.map(samples)(x, before, grid))
+    states = ca.horzcat(starts, ca.vertcat(free, merit(x, before, free), TURN / samples))
+    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, BASINS + 1))
+    angles = ca.horzcat(free, refined[0, :])
+    values = value.map(BASINS + 2)(x, before, angles)
+    best, least, from_closed = ca.Function("choice", *_choice(BASINS + 2))(angles, values)
+    q, distance = place(x, before, best)
+    status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
     spoilt = ca.if_else(status == 0, 0, np.nan)
     active = ca.if_else(from_closed, closed_active, 0)
     active = ca.if_else(distance - clearance < AT_LIMIT, ACTIVE.index("clearance"), active)
-    outputs = [q + spoilt, refined[1] + spoilt, active, status, distance + spoilt]
+    outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
     labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
     return ca.Function("clear_inverse", [x, before], outputs, *labels)
 
 
-def _choice(samples: int) -> tuple[list[Any], list[Any]]:
-    """Inputs and outputs of the function (values of the grid) -> (angle of the least, the least)."""
-    values = ca.SX.sym("values", 1, samples)
-    at, least = ca.SX(0), ca.SX(ca.inf)
-    for k, angle in enumerate(np.linspace(-np.pi, np.pi, samples, endpoint=False)):
+def _starts(samples: int) -> tuple[list[Any], list[Any]]:
+    """Inputs and outputs of the function (merits of the grid) -> columns (angle, merit, step) of its least minima."""
+    merits = ca.SX.sym("merits", 1, samples)
+    angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
+    left = []
+    for k in range(samples):
+        low = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
+        left.append(ca.if_else(low, merits[k], ca.inf))
+    columns = []
+    for _ in range(BASINS):
+        at, least = ca.SX(0), ca.SX(ca.inf)
+        for angle, merit in zip(angles, left, strict=True):
+            at, least = ca.if_else(merit < least, angle, at), ca.fmin(merit, least)
+        left = [ca.if_else(at == angle, ca.inf, merit) for angle, merit in zip(angles, left, strict=True)]
+        columns.append(ca.vertcat(at, least, TURN / samples))
+    return [merits], [ca.horzcat(*columns)]
+
+
+def _choice(count: int) -> tuple[list[Any], list[Any]]:
+    """Inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
+    angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
+    at, least, first = angles[0], values[0], ca.SX(1)
+    for k in range(1, count):
         better = values[k] < least
-        at, least = ca.if_else(better, angle, at), ca.if_else(better, values[k], least)
-    return [values], [at, least]
+        at, least = ca.if_else(better, angles[k], at), ca.fmin(values[k], least)
+        first = ca.if_else(better, 0, first)
+    return [angles, values], [at, least, first]
 
 
-def _pattern(value: Any) -> Any:
-    """Function (state, given) -> state: one step of the search; state (angle, cost, step), given target, previous."""
+def _pattern(merit: Any) -> Any:
+    """Function (states, given) -> states: a search about each state (angle, merit, step); given target, previous."""
     state, given = ca.MX.sym("state", 3), ca.MX.sym("given", 6)
-    angle, cost, step = ca.vertsplit(state)
+    angle, least, step = ca.vertsplit(state)
     for side in (-0.5, 0.5):
         at = state[0] + side * step
-        found = value(given[:5], given[5], at)
-        better = found < cost
-        angle, cost = ca.if_else(better, at, angle), ca.if_else(better, found, cost)
-    return ca.Function("pattern", [state, given], [ca.vertcat(angle, cost, step * SHRINK)])
+        found = merit(given[:5], given[5], at)
+        better = found < least
+        angle, least = ca.if_else(better, at, angle), ca.if_else(better, found, least)
+    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * SHRINK)])
+    all_steps = once.mapaccum(STEPS)(state, ca.repmat(given, 1, STEPS))[:, -1]
+    return ca.Function("pattern", [state, given], [all_steps]).map(BASINS + 1)

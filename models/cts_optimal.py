@@ -8,6 +8,7 @@ they can matter (cts_search).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -45,6 +46,11 @@ def optimal_inverse(
     gain = checked_gain(rate_weight)
     if gain and not limits:
         raise ModelError("limits=False is for the closed form of I1; with a rate weight leave limits on")
+    return _built(rig, tunnel, branch, gain, limits)
+
+
+@lru_cache(maxsize=32)  # rig and tunnel are frozen; a function asked for again is the same
+def _built(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) -> Any:
     search = Search(rig, tunnel, branch, gain)
     target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
     result, done, state, rows = search.direct()(target, previous)

@@ -16,15 +16,12 @@ from models.cts import HALF_PI, Branch, Posture, Rig, Tunnel, corner_circle, pos
 from models.harmonics import (
     Harmonics,
     Point,
-    Series,
     Slope,
     first_square,
     minus,
     polish,
-    product,
     roots,
     scaled,
-    series_roots,
 )
 from models.spatial import Expression
 
@@ -209,49 +206,6 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
     return [polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_REACH) for p in roots(f, steps=0)]
 
 
-def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Function of the target -> ends of the reachable arcs by one limit of joint 1, and points that mean nothing.
-
-    Output shape (2, 8): rows cosine and sine of the roll.
-    """
-    t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-    sharper = _sharper(yaw_chart(rig, branch), t, 2, slide_limit(rig, upper))
-    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), sharper)) for k in range(8)]
-    polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
-    target = ca.MX.sym("target", 5)
-    found = polished(target, slide_points(rig, upper)(target))
-    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
-
-
-def slide_limit(rig: Rig, upper: bool) -> float:
-    """Position of joint 1 just inside one of its limits, m."""
-    return float((rig.upper if upper else rig.lower)[0] + (-1 if upper else 1) * ANGLE_INSET)
-
-
-def slide_points(rig: Rig, upper: bool) -> Any:
-    """Function of the target -> points near the ends of arcs by one limit of joint 1. Output shape (2, 8)."""
-    limit = slide_limit(rig, upper)
-    t = ca.SX.sym("target", 5)
-    axle, e_c, e_s = corner_circle(rig, t)
-    s_yaw, c_yaw = ca.sin(t[3]), ca.cos(t[3])
-    lg = rig.goose_neck
-
-    def first(constant: Expression, row: int) -> Series:
-        return [(constant, 0.0), (lg * e_c[row], lg * e_s[row])]
-
-    x = first(axle[0] - rig.yaw_link_2 * c_yaw + rig.yaw_offset * s_yaw - limit, 0)
-    y = first(axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw, 1)
-    height = product(first(axle[2], 2), first(axle[2], 2))
-    stretched = _sum([(rig.pitch_link**2, 0.0)], height, -1)
-    known = _sum(_sum(product(x, x), product(y, y)), _sum(stretched, [(rig.yaw_link_1**2, 0.0)], -1))
-    along = _sum([(c_yaw * a, c_yaw * b) for a, b in x], [(s_yaw * a, s_yaw * b) for a, b in y])
-    f = _sum(product(known, known), product(stretched, product(along, along)), -4)
-    outputs = ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])
-    coefficients = ca.Function("slide", [t], outputs)
-    target = ca.MX.sym("target", 5)
-    return ca.Function("slide_points", [target], [series_roots(4)(coefficients(target))], ["target"], ["points"])
-
-
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
     """Values of sin q4 at which an arc may end."""
     found: list[tuple[Expression, int]] = []
@@ -300,7 +254,7 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 def sharp_point(chart: Any, target: Expression, output: int, value: Expression, point: Point) -> Point:
     """A point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
-    return polish(point, _sharper(chart, target, output, value))
+    return polish(point, sharper(chart, target, output, value))
 
 
 def sharp_level(rig: Rig, chart: Any, target: Expression, value: Expression, above: Any, point: Point) -> Point:
@@ -312,10 +266,12 @@ def sharp_level(rig: Rig, chart: Any, target: Expression, value: Expression, abo
     c, s = sharp_point(chart, target, 0, value, point)
     cos4 = ca.fabs(chart(target, c, s)[4])
     margin = ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
-    return polish((c, s), _sharper(chart, target, 0, value + above * margin), 1)
+    return polish((c, s), sharper(chart, target, 0, value + above * margin), 1)
 
 
-def _sharper(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
+def sharper(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
+    """Output 0 or 2 of the chart less a value, and its derivative by roll, to polish with."""
+
     def function(c: Expression, s: Expression) -> Point:
         found = chart(target, c, s)
         return found[output] - value, found[output + 1]
@@ -330,10 +286,3 @@ def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: 
 
 def _not_zero(x: Expression) -> Expression:
     return x + ca.if_else(ca.fabs(x) < 1e-150, 1e-150, 0.0)
-
-
-def _sum(f: Series, g: Series, factor: float = 1) -> Series:
-    zero: Series = [(0.0, 0.0)]
-    size = max(len(f), len(g))
-    longer = [f + zero * (size - len(f)), g + zero * (size - len(g))]
-    return [(a + factor * c, b + factor * d) for (a, b), (c, d) in zip(*longer, strict=True)]

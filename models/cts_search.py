@@ -16,7 +16,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.cts import Branch, Rig, Tunnel, corner_circle, joints_of, posture_at
+from models.cts import Branch, Rig, Tunnel, posture_at
+from models.cts_answer import SIZE, answer, finish, reason
 from models.cts_convex import convex_minima, unrolled
 from models.cts_roll import (
     ANGLE_INSET,
@@ -27,18 +28,13 @@ from models.cts_roll import (
     sharp_level,
     sharp_point,
     simple_ends,
-    slide_limit,
-    slide_points,
     verdict,
     yaw_chart,
     yaw_levels,
 )
+from models.cts_slide import slide_limit, slide_points
 from models.harmonics import Harmonics, Point, least_point, polish, roots
 from models.spatial import Expression
-
-SIZE = 6
-"""Entries of a state: cost, cosine, sine and code of the best roll, and the least costs of rolls that meet everything
-but the lower, or upper, limit of joint 1."""
 
 NO_TABLE = ca.DM([[ca.inf] * 4, [1] * 4, [0] * 4, [0] * 4, [0] * 4, [0] * 4])
 NOTHING = ca.DM([ca.inf, 1, 0, 0, ca.inf, ca.inf])
@@ -75,7 +71,7 @@ class Search:
         status = ca.if_else(ca.logic_and(meets.slide(), meets.angles()), 0, 4)
         status = ca.if_else(meets.pitch, ca.if_else(meets.yaw, status, 3), 2)
         status = ca.if_else(_number(target, previous), status, 1)
-        result = self.result(target, previous, c, s, cost, 0, status)
+        result = answer(self.rig, self.branch, target, previous, c, s, cost, 0, status)
         return ca.Function("direct", [target, previous], ca.cse([result, status <= 1, state, rows]))
 
     def _direct_by_descent(self) -> Any:
@@ -89,7 +85,7 @@ class Search:
         state, rows, least = self.compare(target, previous, points, NOTHING)
         number = _number(target, previous)
         status = ca.if_else(number, 0, 1)
-        result = self.result(target, previous, state[1], state[2], state[0], state[3], status)
+        result = answer(self.rig, self.branch, target, previous, state[1], state[2], state[0], state[3], status)
         done = ca.logic_or(ca.logic_and(least >= state[0], state[0] < ca.inf), ca.logic_not(number))
         settle = ca.Function("settle", [target, previous, rolls], ca.cse([result, done, state, rows]))
         x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
@@ -112,7 +108,8 @@ class Search:
             if np.isfinite((self.rig.upper if upper else self.rig.lower)[0]):
                 slide = self._slide(chart, upper)
                 best = choose(slide, (SIZE, 1))(best[row] >= best[0], best, target, previous, best)
-        result = choose(self.reason(), (9, 1))(best[0] < ca.inf, self.finish()(target, previous, best), target)
+        found = finish(self.rig, self.branch)(target, previous, best)
+        result = choose(reason(self.rig, self.branch), (9, 1))(best[0] < ca.inf, found, target)
         return ca.Function("thorough", [target, previous, state, rows], [result])
 
     # ---- candidates ------------------------------------------------------------------------------------------
@@ -278,52 +275,6 @@ class Search:
             code = ca.if_else(better, point.code, code)
         state = ca.vertcat(cost, c, s, code, below, above)
         return state, ca.horzcat(*rows) if rows else ca.SX(2, 0), least
-
-    # ---- results ---------------------------------------------------------------------------------------------
-
-    def finish(self) -> Any:
-        """Function (target, previous, state) -> result of the best roll."""
-        target, previous, state = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("state", SIZE)
-        cost, c, s, code = ca.vertsplit(state[:4])
-        result = self.result(target, previous, c, s, cost, code, 0)
-        return ca.Function("finish", [target, previous, state], ca.cse([result]))
-
-    def reason(self) -> Any:
-        """Function (target) -> result where no roll will do: without joints, with the status that tells why."""
-        target = ca.SX.sym("target", 5)
-        rig, branch = self.rig.unlimited(), self.branch
-        axle, e_c, _ = corner_circle(rig, target)
-        pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
-        points: list[Point] = [(1.0, 0.0)]
-        points += [(end.c, end.s) for end in simple_ends(rig, target, branch)]
-        chart = yaw_chart(rig, branch)
-        for level in yaw_levels(rig, target, branch):
-            rough, above = level_points(rig, target, level.cosine), 1 if level.above else -1
-            points += [sharp_level(rig, chart, target, level.cosine, above, point) for point in rough]
-        yaw: Expression = 0
-        for c, s in points:
-            posture = posture_at(rig, target, c, s, branch)
-            yaw = ca.logic_or(yaw, verdict(rig, target, posture, c, s).relaxed())
-        status = ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
-        result = ca.vertcat(ca.DM.ones(7) * np.nan, 0, status)
-        return ca.Function("reason", [target], ca.cse([result]))
-
-    def result(
-        self,
-        target: Expression,
-        previous: Expression,
-        c: Expression,
-        s: Expression,
-        cost: Expression,
-        code: Expression,
-        status: Expression,
-    ) -> Expression:
-        """Joints and index, nan unless the status is 0, code of ACTIVE and of STATUS. Shape (9, 1)."""
-        roll = unrolled(self.rig, c, s, previous)
-        posture = posture_at(self.rig, target, c, s, self.branch)
-        joints = joints_of(self.rig, target, roll, posture)
-        spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
-        return ca.vertcat(joints + spoilt, cost + spoilt, code, status)
 
 
 def _number(target: Expression, previous: Expression) -> Expression:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,8 @@ from models.cts import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
 from models.cts_clearance import clear_inverse
 from models.cts_iterations import checked_targets
 from models.cts_optimal import optimal_inverse
-from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
+from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, verdict
+from models.cts_slide import slide_ends
 from models.errors import ModelError
 from models.parts import Array, ArrayInput
 
@@ -194,6 +196,7 @@ def reachable_arcs(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[
     return arcs
 
 
+@lru_cache(maxsize=16)  # a rig is frozen; one asked again is the same
 def arc_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     """Functions (target) -> points that hold all ends of arcs, rows cosine, sine, code; (target, roll) -> 1 or 0."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")

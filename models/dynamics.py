@@ -120,6 +120,13 @@ def external_wrench(
     return ca.densify(sum((wrench for _, wrench in given), start=ca.DM(6, 1)))
 
 
+def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
+    """`wrenches` as a tuple; ModelError unless it is a list of them."""
+    if not isinstance(wrenches, list | tuple) or not all(isinstance(one, Wrench) for one in wrenches):
+        raise ModelError(f"wrenches must be a list of Wrench(...), not {wrenches!r}")
+    return tuple(wrenches)
+
+
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
     """Moment, force and point of every wrench in a column of its own. Shape (9, k).
 
@@ -127,7 +134,7 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
         ModelError: An unknown link.
     """
     columns = []
-    for wrench in wrenches:
+    for wrench in checked_wrenches(wrenches):
         robot.link(wrench.link)
         columns.append(ca.vertcat(wrench.moment, wrench.force, wrench.point))
     return ca.horzcat(ca.DM(9, 0), *columns)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -29,13 +29,12 @@ from models.kinematics import (
     joint_vector,
     point_jacobian,
     robot_inertia,
-    subtree_moments,
     tip_frame,
 )
 from models.kinematics import momentum_matrix as joint_momentum_matrix
-from models.linear import solve_spd
 from models.machine import TWIST_SIZE, jacobian_manipulability, require_joints
 from models.parts import Array, ArrayInput, Link, checked_array
+from models.reaction import Reaction, reaction, require_inertia, require_planar
 from models.robot import Robot, planar_chain
 from models.spatial import (
     Expression,
@@ -49,7 +48,6 @@ from models.spatial import (
     quaternion_product,
     rotation,
     rotation_from_quaternion,
-    skew,
 )
 
 BaseKind: TypeAlias = Literal["planar", "spatial"]
@@ -59,18 +57,6 @@ PLANAR_ROWS = [2, 3, 4]
 
 Rotation about z, translation along x and y.
 """
-
-
-class _Reaction(NamedTuple):
-    """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each.
-
-    The latter with what the conserved momentum adds.
-    """
-
-    base_angular: Expression
-    base_linear: Expression
-    tip_angular: Expression
-    tip_linear: Expression
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +88,8 @@ class FreeFloating:
             raise ModelError(f"unknown kind of base {self.base!r}; use 'planar' or 'spatial'")
         require_joints(self.robot)
         if self.base == "planar":
-            _require_planar(self.robot)
-        _require_inertia(self.robot, self.twist_rows)
+            require_planar(self.robot)
+        require_inertia(self.robot, self.twist_rows)
         given = np.zeros(len(self.twist_rows)) if self.conserved_momentum is None else self.conserved_momentum
         momentum = checked_array(
             given, (len(self.twist_rows),), f"{self.base} free-floating base", "conserved_momentum"
@@ -251,7 +237,7 @@ class FreeFloating:
         """Of the generalized Jacobian, as jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
-    def _tip_motion(self, base: Expression, reaction: _Reaction) -> Expression:
+    def _tip_motion(self, base: Expression, reaction: Reaction) -> Expression:
         turn = self.world_from_base(base).rotation
         angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
         return ca.densify(ca.vertcat(angular, linear))
@@ -271,39 +257,14 @@ class FreeFloating:
         center = center_of_mass(self.robot, q, self.world_from_base(base))
         return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
-    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> _Reaction:
-        """Reaction to unit rate of each joint (n columns), or to the given joint rates (one column).
-
-        The latter needs the base's pose, in whose axes the conserved momentum is not constant.
-        """
-        frames, axes = frames_and_axes(self.robot, q)
-        moments = subtree_moments(self.robot, frames)
-        columns = [moments[joint.child].momentum(*axes[joint.name]) for joint in self.robot.moving_joints]
-        momentum: Expression = ca.horzcat(*(ca.vertcat(*column) for column in columns))
-        tip = tip_frame(self.robot, frames).position
-        joints = point_jacobian(self.robot, axes, str(self.robot.tip), tip)
-        if joint_rates is not None:
-            momentum, joints = ca.mtimes(momentum, joint_rates), ca.mtimes(joints, joint_rates)
-
+    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> Reaction:
+        """As `models.reaction.reaction`, with the conserved momentum in the base's axes where rates are given."""
+        carried = None
         if joint_rates is not None and self._moves_by_itself:
             turn = self.world_from_base(base).rotation
             angular, push = (ca.mtimes(turn.T, part) for part in self._spatial_momentum())
-            about_base = angular + cross(moments[self.robot.root].first, push) / self.robot.total_mass
-            momentum = momentum - ca.vertcat(about_base, push)
-
-        total = moments[self.robot.root]
-        center = total.first / total.mass
-        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
-        inertia = total.second - total.mass * arm  # about the centre of mass
-        about_center = momentum[0:3, :] - ca.mtimes(skew(center), momentum[3:6, :])
-        if self.base == "planar":
-            turning = ca.vertcat(ca.DM(2, about_center.shape[1]), -about_center[2, :] / inertia[2, 2])
-        else:
-            turning = -solve_spd(inertia, about_center)
-        # The centre of mass stands still: P = 0 fixes the velocity of the base's origin.
-        linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
-        tip_linear = ca.mtimes(skew(center - tip), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
-        return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
+            carried = angular, push
+        return reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar")
 
 
 def paper_example() -> FreeFloating:
@@ -317,34 +278,3 @@ def paper_example() -> FreeFloating:
     base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
     robot = planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
     return FreeFloating(robot, base="planar")
-
-
-def _require_planar(robot: Robot) -> None:
-    _, axes = frames_and_axes(robot, np.zeros(robot.dof))
-    for joint in robot.moving_joints:
-        angular, linear = (np.array(part).ravel() for part in axes[joint.name])
-        if joint.kind == "prismatic" and abs(linear[2]) > 1e-9:
-            raise ModelError(
-                f"joint {joint.name!r} moves along {linear.tolist()} of the base link, out of the plane of "
-                "a planar base; use base='spatial'"
-            )
-        if joint.kind != "prismatic" and np.hypot(angular[0], angular[1]) > 1e-9:
-            raise ModelError(
-                f"joint {joint.name!r} turns about {angular.tolist()} of the base link, not about z as a "
-                "planar base needs; use base='spatial'"
-            )
-
-
-def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    if robot.total_mass == 0:
-        raise ModelError("the robot has no mass: a free-floating base needs links with mass")
-    # A stretched chain of point masses can lack inertia about one axis in one configuration: try others too.
-    spread = np.linspace(0.3, 1.1, robot.dof)
-    for q in (np.zeros(robot.dof), spread, -2 * spread[::-1]):
-        inertia = np.array(ca.DM(robot_inertia(robot, q)))[np.ix_(rows, rows)]
-        if np.linalg.cond(inertia) < 1e12:
-            return
-    raise ModelError(
-        f"the links {[link.name for link in robot.links]} have no rotational inertia about some axis, "
-        "so that the momentum does not fix the motion of the base; give the base link an inertia"
-    )

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from models.errors import ModelError
-from models.parts import Array
+from models.parts import Array, massless
 from models.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, rotation, skew
 
@@ -64,7 +64,10 @@ def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
 
 def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Expression:
     """`value` as a column of `size`; ModelError naming `what` and `meaning` otherwise."""
-    value = expression(value)
+    try:
+        value = expression(value)
+    except (TypeError, ValueError, NotImplementedError) as error:
+        raise ModelError(f"{what} {value!r} is not numeric; ({size}, 1) expected: {meaning}") from error
     if value.shape != (size, 1) and not (size == 0 and value.numel() == 0):
         raise ModelError(f"{what} has shape {tuple(value.shape)}, expected ({size}, 1): {meaning}")
     return value
@@ -99,7 +102,7 @@ def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | Non
         ModelError: The robot has no mass.
     """
     if robot.total_mass == 0:
-        raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
+        raise massless("hence no centre of mass")
     frames = link_frames(robot, q, world_from_base)
     moment = sum(link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass)
     return ca.densify(moment / robot.total_mass)
@@ -148,7 +151,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
     if robot.total_mass == 0:
-        raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
+        raise massless("hence no centre of mass")
     return momentum_matrix(robot, q, world_from_base)[3:6, :] / robot.total_mass
 
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from models.errors import ModelError
 from models.kinematics import Placement, checked_vector, frames_and_axes, joint_vector
-from models.parts import Link
+from models.parts import Link, massless
 from models.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars
 
@@ -63,7 +62,7 @@ def center_of_mass_motion(
         ModelError: The robot has no mass; wrong sizes.
     """
     if robot.total_mass == 0:
-        raise ModelError("the robot has no mass, hence no centre of mass; give its links masses")
+        raise massless("hence no centre of mass")
     return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))
 
 

@@ -147,6 +147,11 @@ class Joint:
         return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
 
 
+def massless(consequence: str) -> ModelError:
+    """The error that says a robot has no mass, what that makes impossible, and what URDF has for it."""
+    return ModelError(f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>")
+
+
 def frozenchecked_array(array: Array) -> Array:
     array.setflags(write=False)
     return array

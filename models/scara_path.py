@@ -147,7 +147,7 @@ def _turns(along: ScaraPath) -> Array:
 
 
 def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
-    if not (np.isfinite(clearance) and clearance >= 0):
+    if not isinstance(clearance, int | float) or not (np.isfinite(clearance) and clearance >= 0):
         raise ModelError(f"scara: clearance {clearance!r} m must not be negative")
     s = path.dense(8, 32)
 

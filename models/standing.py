@@ -14,11 +14,11 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
+from models.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.errors import ModelError
 from models.kinematics import checked_vector
 from models.machine import FixedBase
-from models.parts import Array, ArrayInput, checked_array
+from models.parts import Array, ArrayInput, checked_array, massless
 from models.rebuild import simplified
 from models.robot import Robot, planar_chain
 from models.spatial import Expression, expression
@@ -26,6 +26,16 @@ from models.support import Support, rectangle
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 """Wrenches from outside as a function of time (s) and the tip's position in the world (3, 1)."""
+
+
+def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
+    """What `external` gives, () if None; ModelError unless it is a function that returns a list of wrenches."""
+    if external is None:
+        return ()
+    if not callable(external):
+        raise ModelError(f"external must be a function of time and tip position, not {external!r}")
+    return checked_wrenches(external(time, tip))
+
 
 PAPER_START = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
 """Joint angles at the start of the tasks of Tables 1 and 2, rad."""
@@ -67,7 +77,7 @@ class Standing(FixedBase):
             (2,), m.
 
     Raises:
-        ModelError: No moving joint, no mass, wrong sizes, a gravity or a half-width that is not positive.
+        ModelError: No moving joint, no mass, no Support, wrong sizes, a gravity or a half-width that is not positive.
     """
 
     support: Support
@@ -78,8 +88,10 @@ class Standing(FixedBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         owner = "standing machine"
+        if not isinstance(self.support, Support):
+            raise ModelError(f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}")
         if self.robot.total_mass == 0:
-            raise ModelError(f"{owner}: the robot has no mass, nothing presses it on the ground; give its links masses")
+            raise massless("nothing presses its foot on the ground")
         gravity = checked_array(self.gravity, (), owner, "gravity").item()
         if gravity <= 0:
             raise ModelError(f"{owner}: gravity {gravity} m/s^2 is not positive; nothing would hold the foot down")
@@ -102,7 +114,7 @@ class Standing(FixedBase):
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
         """The robot with one link for each moving joint, and those on which wrenches act: the same dynamics, sooner."""
-        keep = frozenset(self.robot.link(wrench.link).name for wrench in wrenches)
+        keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplified(self.robot, keep)
         return self._bodies[keep]

@@ -11,9 +11,9 @@ import numpy as np
 
 from models.errors import ModelError
 from models.kinematics import center_of_mass
-from models.parts import Array, ArrayInput
+from models.parts import Array, ArrayInput, checked_array
 from models.posture import joint_excess, joint_limit_index
-from models.standing import External, Standing, center_of_pressure
+from models.standing import External, Standing, center_of_pressure, wrenches_at
 
 SLACK = 1e-9
 """How far beyond a limit rounding may carry a motion that stands exactly at it; m, rad, N."""
@@ -157,14 +157,17 @@ def standing_motion(
         rows: Of the tip's twist, whose manipulability is reported.
 
     Raises:
-        ModelError: Shapes that do not match.
+        ModelError: No times, shapes that do not match, nan.
     """
-    times = np.atleast_1d(np.asarray(t, dtype=float))
-    parts = [np.asarray(part, dtype=float) for part in (joints, joint_velocities, joint_accelerations)]
+    count = np.size(t)
+    if count == 0:
+        raise ModelError("motion: there are no times")
+    times = checked_array(np.ravel(t), (count,), "motion", "t")
     names = ("joints", "joint_velocities", "joint_accelerations")
-    for name, part in zip(names, parts, strict=True):
-        if part.shape != (len(times), machine.joint_size):
-            raise ModelError(f"motion: {name} has shape {part.shape}, expected {(len(times), machine.joint_size)}")
+    parts = [
+        np.asarray(checked_array(part, (count, machine.joint_size), "motion", name, finite=False))
+        for name, part in zip(names, (joints, joint_velocities, joint_accelerations), strict=True)
+    ]
     found = evaluate(motion_function(machine, external, rows), times, *parts)
     return StandingMotion(times, *parts, **found)
 
@@ -182,7 +185,7 @@ def _motion_function(machine: Standing, external: External | None, rows: Sequenc
     n, robot, placement = machine.joint_size, machine.robot, machine.world_from_base()
     time, q, qd, qdd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("qdd", n)
     tip = machine.tip_pose((), q).position
-    wrenches = tuple(external(time, tip)) if external is not None else ()
+    wrenches = wrenches_at(external, time, tip)
     reaction = machine.ground_reaction(q, qd, qdd, wrenches)
     point = center_of_pressure(reaction)
     outside: Any = sum((ca.densify(wrench.force) for wrench in wrenches), start=ca.DM.zeros(3))

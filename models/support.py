@@ -33,7 +33,10 @@ class Support:
     vertices: ArrayInput
 
     def __post_init__(self) -> None:
-        count = np.shape(self.vertices)[0] if np.ndim(self.vertices) == 2 else 0
+        try:
+            count = np.shape(self.vertices)[0] if np.ndim(self.vertices) == 2 else 0
+        except ValueError:  # points of different sizes
+            count = 0
         if count < 3:
             raise ModelError(f"support: vertices must be at least three points (k, 2), not {self.vertices!r}")
         corners = np.array(checked_array(self.vertices, (count, 2), "support", "vertices"))

@@ -138,6 +138,8 @@ def parsed(source: Source) -> ElementTree.Element:
         text = source.lstrip("\ufeff \t\r\n")
         above = source[: len(source) - len(text)].count("\n")
     try:
+        if isinstance(source, str) and not text:
+            raise ModelError("an empty text cannot be read as URDF; give the XML or the path of a file")
         if text.startswith("<"):
             where = "the given text"
             tree = ElementTree.fromstring(text)

@@ -16,8 +16,9 @@ import numpy as np
 from models.machine import jacobian_manipulability
 from models.motion import center_of_mass_motion, momentum
 from models.posture import joint_limit_index
-from models.standing import External, Standing
+from models.standing import External, Standing, wrenches_at
 from ocp.builders.tip_path import Path, path_derivatives
+from ocp.builders.zmp_rules import is_finite
 from ocp.errors import ProblemError
 from ocp.local import least_rates
 
@@ -48,7 +49,7 @@ class Layer:
             raise ProblemError(f"layer: unknown index {self.index!r}; use 'joint_limits' or 'manipulability'")
         if self.form not in ("assigned", "gradient"):
             raise ProblemError(f"layer: unknown form {self.form!r}; use 'assigned' or 'gradient'")
-        if not np.isfinite(self.demand):
+        if not is_finite(self.demand):
             raise ProblemError(f"layer {self.index!r}: demand must be a number, not {self.demand!r}")
 
 
@@ -70,10 +71,11 @@ class Stabiliser:
     gradient: float = 0.0
 
     def __post_init__(self) -> None:
-        if len(self.poles) != 3 or not all(np.isfinite(pole) and pole > 0 for pole in self.poles):
+        poles = self.poles if isinstance(self.poles, Sequence | np.ndarray) else ()
+        if len(poles) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
             raise ProblemError(f"stabiliser: poles must be three positive numbers, not {self.poles!r}")
         for what in ("damping", "gradient"):
-            if not (np.isfinite(getattr(self, what)) and getattr(self, what) >= 0):
+            if not (is_finite(getattr(self, what)) and getattr(self, what) >= 0):
                 raise ProblemError(f"stabiliser: {what} must not be negative, it is {getattr(self, what)!r}")
 
 
@@ -100,8 +102,10 @@ def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequen
     """Raise ProblemError for an unknown law, or one that asks for more than the machine has joints."""
     if law not in get_args(Law):
         raise ProblemError(f"unknown law {law!r}; use one of {', '.join(get_args(Law))}")
-    if not (np.isfinite(damping) and damping >= 0):
+    if not (is_finite(damping) and damping >= 0):
         raise ProblemError(f"null_damping must be a finite number, zero or above, not {damping!r}")
+    if not isinstance(layers, list | tuple) or not all(isinstance(layer, Layer) for layer in layers):
+        raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}")
     axes = len(machine.moving_directions)
     tasks = {"the tip": len(rows), "the zero moment point": 0 if law == "pseudo_inverse" else axes}
     tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
@@ -141,7 +145,7 @@ def accelerations(
     """
     chosen, directions = list(rows), ca.DM(machine.moving_directions)
     tip = machine.tip_pose((), q).position
-    wrenches = tuple(external(time, tip)) if external is not None else ()
+    wrenches = wrenches_at(external, time, tip)
     jacobian = ca.densify(machine.tip_jacobian((), q))[chosen, :]
     bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
     task = path_derivatives(tip_path, time, len(chosen))[2] - bias

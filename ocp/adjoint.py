@@ -20,6 +20,7 @@ from ocp.solution import Solution
 
 __all__ = ["Adjoint", "adjoint"]
 
+IMMATERIAL = 1e-7  # share of the cost
 ACTIVE = 1e-5  # a bound nearer than this, relative to its scale, is active
 
 
@@ -35,7 +36,7 @@ class Adjoint:
         transversality: Largest entry that no multiplier of an end condition explains, in cost per unit of the state; a
             bound that is active at an end explains what has the sign of its multiplier.
         horizon: H(T) + dPhi/dT where the final time is free, in cost per second; 0 where it is given.
-        scale: Largest costate.
+        scale: Largest costate, or where all are immaterial the size at which they would not be.
     """
 
     t: np.ndarray
@@ -61,7 +62,7 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
     costates = solution.costate_interpolant
     plan = costates(costates.breaks)
     size = float(np.max(np.abs(costates.values), initial=1.0 if form.indifferent else 0.0))
-    scale = size if size > 0 else 1.0
+    scale = max(size, immaterial(solution)) or 1.0
     ends = end_residuals(form, solution, p, bounds)
     reason = obstacle(form, solution, bounds)
     integrated = None
@@ -78,6 +79,12 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
             everywhere[k] = lam
         integrated = everywhere[np.searchsorted(breaks, costates.breaks - 1e-12)]
     return Adjoint(costates.breaks * solution.horizon, integrated, plan, reason, *ends, scale)
+
+
+def immaterial(solution: Solution) -> float:
+    """Size of costates that, times the way of the states, are nothing beside the cost: they may be rounding alone."""
+    way = max((float(np.ptp(values, axis=0).max(initial=0.0)) for values in solution.states.values()), default=0.0)
+    return IMMATERIAL * abs(solution.cost) / way if way > 0 else 0.0
 
 
 def costate_pieces(form: Formulation, solution: Solution, p: np.ndarray) -> tuple[Any, np.ndarray]:

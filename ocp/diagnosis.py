@@ -103,7 +103,10 @@ def conflict_lines(built: Built, outcome: Outcome, arguments: dict[str, np.ndarr
     if found is None:
         return []
     if not found:
-        return ["all constraints can hold together at the points of this grid: take another guess or raise max_iter"]
+        return [
+            "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
+            "another guess or grid, or raise max_iter"
+        ]
     return ["not all constraints can hold together near the guess; with the dynamics and the given ends held,"] + [
         f"  {conflict}" for conflict in found[:WORST]
     ]

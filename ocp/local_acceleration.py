@@ -20,6 +20,7 @@ from models.standing_motion import StandingMotion, evaluate, motion_function
 from ocp.acceleration_laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.builders.task import Array, checked_start
 from ocp.builders.tip_path import Path, check_path, linear_rows, path_derivatives
+from ocp.builders.zmp_rules import checked_place, is_finite
 from ocp.errors import ProblemError
 
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]
@@ -35,7 +36,8 @@ class Stop:
 
     Attributes:
         reason: ``lift_off``: the ground would have to pull. ``divergence``: a joint is faster than the speed limit.
-            ``breakdown``: the accelerations or the integration are not finite: a task cannot be done there.
+            ``breakdown``: the accelerations, the integration or the forces are not finite: a task cannot be done
+            there, or `external` gives no number.
         time: When, s.
         message: The same in words, with the numbers.
     """
@@ -136,18 +138,26 @@ def resolve_accelerations(
         ProblemError: Something does not fit the machine, or the task cannot be done even at the start.
     """
     start = checked_start(machine, rows, start_joints, horizon, None)
+    rows = start.rows
     linear_rows(rows)
     checked_law(machine, rows, law, layers, null_damping)
     for what, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
-        if not (np.isfinite(number) and number > 0):
+        if not (is_finite(number) and number > 0):
             raise ProblemError(f"{what} must be a positive number, not {number!r}")
     if integrator not in ("rk4", "cvodes"):
         raise ProblemError(f"unknown integrator {integrator!r}; use 'rk4' or 'cvodes'")
     check_path(machine, tip_path, rows, start.joints, start.base, start.horizon)
     n = machine.joint_size
-    velocities = np.zeros(n) if start_velocities is None else np.asarray(start_velocities, dtype=float).ravel()
-    if velocities.shape != (n,) or not np.isfinite(velocities).all():
-        raise ProblemError(f"start_velocities must be {n} numbers, one for each joint, not {start_velocities!r}")
+    velocities = np.zeros(n)
+    if start_velocities is not None:
+        try:
+            velocities = np.array(start_velocities, dtype=float).ravel()
+        except (TypeError, ValueError):
+            velocities = np.zeros(0)
+        if velocities.shape != (n,) or not np.isfinite(velocities).all():
+            raise ProblemError(f"start_velocities must be {n} numbers, one for each joint, not {start_velocities!r}")
+    if not isinstance(stabiliser, Stabiliser | None):
+        raise ProblemError(f"stabiliser must be a Stabiliser(...), not {stabiliser!r}")
     place = _target(machine.most_stable_point if zmp is None else zmp)
 
     def law_function(symbols: Any) -> Any:
@@ -194,11 +204,9 @@ def resolve_accelerations(
 
 def _target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
     if callable(zmp):
-        return lambda time: ca.vertcat(*given) if isinstance(given := zmp(time), list | tuple) else given
-    point = np.asarray(zmp, dtype=float).ravel()
-    if point.shape != (2,) or not np.isfinite(point).all():
-        raise ProblemError(f"zmp must be two numbers (x, y) or a function of time, not {zmp!r}")
-    return lambda time: ca.DM(point)
+        return lambda time: checked_place(zmp(time), "zmp")
+    point = checked_place(zmp, "zmp")
+    return lambda time: point
 
 
 class _Simulation:
@@ -264,7 +272,7 @@ class _Watch:
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
         found = evaluate(self._motion, times, q, qd, qdd)
-        lost = ~np.isfinite(np.hstack([states, qdd])).all(axis=1)
+        lost = ~np.isfinite(np.hstack([states, qdd, found["ground_force"]])).all(axis=1)
         vertical = found["ground_force"][:, 2]
         speed = np.abs(qd).max(axis=1)
         fast = speed > self._speed_limit
@@ -279,7 +287,7 @@ class _Watch:
             return None
         at = float(times[end])
         if lost[end]:
-            words = f"breaks down at {at:.4g} s: the accelerations that do the tasks are not finite"
+            words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
             return Stop("breakdown", at, words)
         if lifted[end]:
             words = f"lifts off at {at:.4g} s: the vertical ground force falls to {vertical[end]:.4g} N"

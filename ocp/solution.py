@@ -40,6 +40,10 @@ class Sample(Mapping[str, np.ndarray]):
     def __contains__(self, name: object) -> bool:
         return name in self.arrays
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """The value by that name, or the default."""
+        return self.arrays.get(name, default)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.arrays)
 

@@ -19,6 +19,8 @@ from scripts.drawing import COLORS, STYLE, add_note, gif, sheet
 __all__ = ["draw_animation", "draw_findings"]
 
 FRAME = 0.04  # s
+ROUNDING = 1e-11
+"""Errors below it, exact zeros too, are drawn here."""
 
 
 def draw_findings(folder: Path, results: Results) -> None:
@@ -43,7 +45,7 @@ def _mapping(folder: Path, results: Results) -> None:
                     for period, dash, marker in zip((1, 2, 4), LINES, "osD", strict=False):
                         wanted = {"blend": kind, "mapping": mapping, "period_ms": period}
                         mine = [r for r in results.small_blends if all(r[k] == v for k, v in wanted.items())]
-                        x, y = [r["remaining_mm"] for r in mine], [abs(r[key]) for r in mine]
+                        x, y = [r["remaining_mm"] for r in mine], [max(abs(r[key]), ROUNDING) for r in mine]
                         style = {"ls": dash, "marker": marker, "ms": 3.5, "color": COLORS[color]}
                         ax.loglog(x, y, **style, label=f"{name}, {period} ms")
         ticks = sorted({row["remaining_mm"] for row in results.small_blends})

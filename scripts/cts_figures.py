@@ -181,5 +181,6 @@ def _animate(path: Path, results: Results) -> None:
                     spot.set_data(places[row : row + 1, i], places[row : row + 1, k])
                 figure.suptitle(f"{time:.2f} s, slowed down", fontsize=9)
                 yield figure
+                figure.set_layout_engine("none")  # as it was laid out for the first frame
 
         gif(path, frames(), seconds=0.08)

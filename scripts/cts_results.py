@@ -27,7 +27,8 @@ __all__ = ["NOTE", "PAPER_TIMES", "REFERENCE", "Release", "Results", "compute", 
 PAPER_TIMES = {"jacobian": 0.2376, "combined": 0.0281}  # Table 6, s
 REFERENCE = {-15.0: 0.331364, -7.5: 0.682290, 0.0: np.pi / 2, 7.5: 2.459303, 15.0: 2.810229}
 RATE_WEIGHT = 5.0
-RANDOM, DENSE = 4000, 720
+RANDOM, DENSE = 4000, 360
+LONG = 0.5  # s; a longer run is timed once: what disturbs it is small beside it
 GAINS = (1.0, 20.0)
 INTERVAL = 0.05  # s between two targets, Table 5
 SCALE, FALL = 0.25, 0.45  # size of the model; seconds of free fall
@@ -176,6 +177,8 @@ def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float]:
         began = time.perf_counter()
         result = work()
         times.append(time.perf_counter() - began)
+        if times[-1] > LONG:
+            break
     return result, min(times)
 
 

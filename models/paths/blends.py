@@ -120,8 +120,9 @@ def _check_corner(shape: float, angle: float, remaining: float = 1.0) -> None:
         ("angle", angle, 0.0, np.pi),
         ("remaining distance", remaining, 0.0, np.inf),
     ):
-        if not (least < value <= most and np.isfinite(value)):
-            raise ModelError(f"{name} {value:g} of a corner must be above 0 and at most {most:.6g}")
+        number = isinstance(value, int | float | np.integer | np.floating)
+        if not (number and least < value <= most and np.isfinite(value)):
+            raise ModelError(f"{name} {value!r} of a corner must be above 0 and at most {most:.6g}")
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:

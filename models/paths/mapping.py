@@ -13,9 +13,12 @@ import casadi as ca
 import numpy as np
 
 from models.errors import ModelError
-from models.parts import Array, ArrayInput
+from models.parts import Array, ArrayInput, checked_array
 
 __all__ = ["gauss_newton", "march", "predictor_corrector"]
+
+NODES = (2, 3, 4, 8)
+"""Twice the time of the paper's 3 corrections; on a 90 deg corner of 5 mm, at 1 m/s and 2 ms, a drift of 2e-9 mm."""
 
 
 @lru_cache(maxsize=16)
@@ -42,17 +45,20 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 
 
 @lru_cache(maxsize=16)
-def gauss_newton(degree: int = 3, corrections: int = 2, nodes: int = 3) -> Any:
+def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = NODES) -> Any:
     """The default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
 
-    Arguments and results as of predictor_corrector; `nodes` are those of the quadrature over one step.
+    Arguments and results as of predictor_corrector, but for `nodes`: of the quadrature over one control step, for each
+    Newton step. The first ones need few, since they only lead near; the last one decides the drift.
     """
     state, coefficients, steps, rate = _symbols(degree)
+    if not nodes or not all(isinstance(n, int) and n > 0 for n in nodes):
+        raise ModelError(f"quadrature nodes {nodes!r} must be positive whole numbers, one for each Newton step")
     u, step = state[1], steps[1]
-    points, weights = np.polynomial.legendre.leggauss(nodes)
-    points, weights = (points + 1) / 2, weights / 2
     guess = _predicted(state, steps, rate(u))
-    for _ in range(corrections):
+    for number in nodes:
+        points, weights = np.polynomial.legendre.leggauss(number)
+        points, weights = (points + 1) / 2, weights / 2
         width = guess - u
         mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(points, weights, strict=True))
         guess = guess - (width * mean - step) / rate(guess)
@@ -66,9 +72,21 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
         mapping: Of predictor_corrector or gauss_newton.
         coefficients: Of one blend. Shape (6, 3).
         distances: Shape (M,), m.
+
+    Raises:
+        ModelError: Wrong shapes, nan, distances that do not increase from 0.
     """
-    given = np.diff(np.asarray(distances, dtype=float), prepend=0.0)
-    entries = np.asarray(coefficients, dtype=float).ravel()[: mapping.numel_in(1)]
+    try:
+        places = np.asarray(distances, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"distances {distances!r} are not numeric") from error
+    given = np.diff(np.atleast_1d(places), prepend=0.0)
+    if places.ndim != 1 or not (np.isfinite(places).all() and (given >= 0).all()):
+        raise ModelError(f"distances of shape {places.shape} must be finite and increase from 0, in one row")
+    curve = checked_array(coefficients, (6, 3), "blend", "coefficients")
+    if not places.size:
+        return places
+    entries = curve.ravel()[: mapping.numel_in(1)]
     steps = np.stack([np.concatenate([[0.0], given[:-1]]), given])
     along = mapping.mapaccum(len(given))
     states = along(np.zeros(2), np.repeat(entries[:, None], len(given), axis=1), steps)

@@ -131,8 +131,8 @@ class SmoothPath:
     def blend(self, vertex: int) -> Blend:
         """The blend at a vertex, 0 being the end of the first segment; ModelError when there is none."""
         count = len(self.remaining)
-        if not 0 <= vertex < count:
-            raise ModelError(f"vertex {vertex} does not exist; the path has {count}")
+        if not isinstance(vertex, int | np.integer) or not 0 <= vertex < count:
+            raise ModelError(f"vertex {vertex!r} does not exist; the path has {count}")
         piece = int(self.blend_starts[vertex])
         return Blend(
             self.path.start[vertex + 1],
@@ -232,7 +232,10 @@ class SmoothPath:
 
     def checked_distance(self, distance: ArrayInput) -> Array:
         """`distance` as an array within the path; ModelError when it is not."""
-        s = np.atleast_1d(np.asarray(distance, dtype=float))
+        try:
+            s = np.atleast_1d(np.asarray(distance, dtype=float))
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"distance {distance!r} is not numeric") from error
         slack = 1e-9 * self.length
         if s.ndim != 1 or not (np.isfinite(s).all() and (s >= -slack).all() and (s <= self.length + slack).all()):
             wrong = s[~((s >= -slack) & (s <= self.length + slack))] if s.ndim == 1 else s

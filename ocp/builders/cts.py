@@ -19,6 +19,8 @@ from models.cts_clearance import nearness
 from models.cts_iterations import checked_targets
 from models.cts_optimal import optimal_inverse
 from models.cts_roll import index_harmonics
+from models.parts import Array
+from ocp.builders.cts_guess import least_course
 from ocp.errors import ProblemError
 from ocp.guess import Samples
 from ocp.problem import Problem
@@ -27,6 +29,9 @@ __all__ = ["roll_plan", "spline_targets"]
 
 Targets = Callable[[Any], Any]
 REACH = 1 - 1e-9
+GUESS_TIMES = 65
+DEAR = 1e3  # of a violation in the guess: per m, rad or unit of a sine
+GUESS_MARGIN = 2.0  # widths of the smooth minimum that the guess keeps beyond the clearance asked for
 
 
 def spline_targets(times: Any, targets: Any) -> Targets:
@@ -93,7 +98,7 @@ def roll_plan(
         symbols: casadi.MX, or casadi.SX where the targets are plain expressions.
 
     Returns:
-        The problem; its guess is the global optimum of I1 of each target by itself, unwound.
+        The problem; its guess is the course of least cost on a grid of rolls and times, see cts_guess.
 
     Raises:
         ProblemError: Weights or limits that are negative, a horizon that is not positive, a target on the way that
@@ -114,54 +119,94 @@ def roll_plan(
         raise ProblemError(f"roll_plan: clearance {clearance} m must be a finite distance or -inf for none")
     if not (np.isfinite(horizon) and horizon > 0):
         raise ProblemError(f"roll_plan: horizon {horizon} s must be positive and finite")
-    guess = _guess(rig, tunnel, targets, horizon, branch, start_roll, symbols)
-
-    problem = Problem("roll plan", symbols=symbols)
-    roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=guess)
-    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=0.0)
-    pull = problem.control("acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0)
-    problem.horizon(horizon)
-    problem.dynamics(roll, rate)
-    problem.dynamics(rate, pull)
-    target = targets(problem.time)
-    target = ca.vertcat(*target) if isinstance(target, list | tuple) else target
+    if start_roll is not None and not np.isfinite(start_roll):
+        raise ProblemError(f"roll_plan: start_roll {start_roll} rad must be finite")
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
     posture = posture_at(rig, x, c, s, branch)
     joints = joints_of(rig, x, phi, posture)
-    index = ca.Function("index", [x, phi], [index_harmonics(rig, tunnel, x).value(c, s)])
-    reach = ca.Function("reach", [x, phi], [ca.vertcat(posture.sin4, posture.cos2)])
-    problem.path("reach", reach(target, roll), -REACH, REACH)
     held = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
-    if held:
-        limited = ca.Function("joints", [x, phi], [ca.vertcat(*[joints[k] for k in held])])
-        problem.path("limits", limited(target, roll), rig.lower[held], rig.upper[held])
+    limited = ca.vertcat(*[joints[k] for k in held])
+    reached = ca.vertcat(posture.sin4, posture.cos2)
+    index = index_harmonics(rig, tunnel, x).value(c, s)
     near: Any = 0.0
+    short = _beyond(reached, -REACH, REACH) + _beyond(limited, rig.lower[held], rig.upper[held])
     if surroundings is not None:
-        least = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
-        gap = ca.Function("gap", [x, phi], [least])(target, roll)
-        if np.isfinite(clearance):
-            problem.path("clearance", gap, clearance)
+        gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
         near = nearness(gap, clearance_weight, clearance_width)
-    problem.minimize(running=index(target, roll) + near + rate_weight * rate**2 + acceleration_weight * pull**2)
+        if np.isfinite(clearance):
+            short += ca.fmax(clearance + GUESS_MARGIN * softness - gap, 0)
+    curve = _curve(targets, symbols)
+    price = index + ca.fmin(near, DEAR) + DEAR * short
+    start, speed = _guess(
+        rig,
+        tunnel,
+        branch,
+        curve,
+        ca.Function("price", [x, phi], [ca.cse(price)]),
+        np.linspace(0, horizon, GUESS_TIMES),
+        start=start_roll,
+        rate_weight=rate_weight,
+        acceleration_weight=acceleration_weight,
+        rate_limit=rate_limit,
+    )
+
+    problem = Problem("roll plan", symbols=symbols)
+    roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=start)
+    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=speed)
+    pull = problem.control("acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0)
+    problem.horizon(horizon)
+    problem.dynamics(roll, rate)
+    problem.dynamics(rate, pull)
+    target = _column(targets(problem.time))
+
+    def along(name: str, value: Any) -> Any:
+        """The value on the way."""
+        return ca.Function(name, [x, phi], [value])(target, roll)
+
+    problem.path("reach", along("reach", reached), -REACH, REACH)
+    if held:
+        problem.path("limits", along("joints", limited), rig.lower[held], rig.upper[held])
+    if surroundings is not None and np.isfinite(clearance):
+        problem.path("clearance", along("gap", gap), clearance)
+    running = along("index", index + near)
+    problem.minimize(running=running + rate_weight * rate**2 + acceleration_weight * pull**2)
     return problem
 
 
-def _guess(
-    rig: Rig, tunnel: Tunnel, targets: Targets, horizon: float, branch: Branch, start: float | None, symbols: Any
-) -> Samples:
-    """Roll of least I1 at each time by itself, each in the turn nearest to the one before."""
+def _column(target: Any) -> Any:
+    return ca.vertcat(*target) if isinstance(target, list | tuple) else target
+
+
+def _curve(targets: Targets, symbols: Any) -> Any:
+    """Function of time -> target."""
     time = symbols.sym("time")
-    target = targets(time)
-    target = ca.vertcat(*target) if isinstance(target, list | tuple) else target
-    function = ca.Function("target", [time], [target])
-    best = optimal_inverse(rig, tunnel, branch)
-    t = np.linspace(0, horizon, 101)
-    rolls, last = [], 0.0 if start is None else float(start)
-    for at in t:
-        joints, _, _, status = best(function(at), last)
-        if int(status):
-            raise ProblemError(f"roll_plan: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
-        last = float(joints[5])
-        rolls.append(last)
-    return Samples(t, np.array(rolls)[:, None])
+    return ca.Function("target", [time], [_column(targets(time))])
+
+
+def _beyond(value: Any, lower: Any, upper: Any) -> Any:
+    """By how much the entries are outside their bounds, in total."""
+    return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
+
+
+def _guess(
+    rig: Rig,
+    tunnel: Tunnel,
+    branch: Branch,
+    curve: Any,
+    cost: Any,
+    t: Array,
+    **options: Any,
+) -> tuple[Samples, Samples]:
+    """Roll and rate over time by dynamic programming on a grid; see cts_guess."""
+    rows = np.array(curve.map(len(t))(t[None]))
+    status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
+    if status.any():
+        at = t[int(np.flatnonzero(status)[0])]
+        raise ProblemError(f"roll_plan: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
+
+    def costs(times: Any, rolls: Any) -> Array:
+        return np.asarray(np.array(cost.map(len(rolls))(rows[:, times], rolls[None]))[0])
+
+    roll = least_course(costs, t, lower=float(rig.lower[5]), upper=float(rig.upper[5]), **options)
+    return Samples(t, roll[:, None]), Samples(t, np.gradient(roll, t)[:, None])

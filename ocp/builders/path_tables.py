@@ -13,8 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath, Limits, PathLike, joint_demands, line_demands
+from ocp.schedule.limits import JointPath, Limits, PathLike, curvature_along, joint_demands, line_demands, rates_along
 from ocp.schedule.profile import Array, Motion, SpeedProfile
 
 __all__ = ["Columns", "asked_speed", "demand_of_pieces", "largest_demand", "path_columns", "table"]
@@ -86,23 +85,12 @@ def path_columns(path: PathLike, limits: Limits, joints: JointPath | None, s: Ar
     Raises:
         ProblemError: A curvature or a joint that is not finite, joints of a wrong shape.
     """
-    found = [asked_speed(path, limits, s)[:, None]]
-    found.append(np.asarray(path.curvature(s))[:, None] if np.isfinite(limits.centripetal) else np.zeros((len(s), 1)))
-    if joints is not None:
-        along = joints.at(s)
-        shape = (len(s), len(joints.names))
-        for kind, value in (("first", along.first), ("second", along.second), ("third", along.third)):
-            if np.shape(value) != shape:
-                raise ProblemError(f"joints along the path: {kind} has shape {np.shape(value)}, expected {shape}")
-            found.append(np.asarray(value))
-    values = np.concatenate(found, axis=1)
-    wrong = ~np.isfinite(values).all(axis=1)
-    if wrong.any():
-        raise ProblemError(
-            f"curvature or joint derivatives are not finite at {s[wrong][0]:g} m of the path; keep it away from "
-            "singular arms and cusps"
-        )
-    return values
+    limited = np.isfinite(limits.centripetal)
+    found = [asked_speed(path, limits, s), curvature_along(path, s) if limited else np.zeros(len(s))]
+    if joints is None:
+        return np.column_stack(found)
+    rates = rates_along(joints, s)
+    return np.column_stack([*found, rates.first, rates.second, rates.third])
 
 
 def largest_demand(path: PathLike, limits: Limits, joints: JointPath | None, motion: Motion) -> Array:

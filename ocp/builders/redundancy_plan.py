@@ -9,18 +9,21 @@ from typing import Any
 import numpy as np
 
 from models import Machine
+from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.tip_task import one_of
 from ocp.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
-from ocp.local import resolve
+from ocp.local import LocalSolution, resolve
 from ocp.solution import Solution
 from ocp.solve import solve
 
 __all__ = ["plan_minimum_velocity"]
 
-OPTIONS = {"max_iter": 150, "mumps_pivtol": 1e-3}
-"""Of IPOPT. MUMPS' own pivots lose the sign of eigenvalues on spatial machines, for which IPOPT then regularises."""
+OPTIONS = {"max_iter": 150}
+"""Of IPOPT."""
 LOCAL = ("tip_velocity", "rows", "task", "start_joints", "horizon", "start_base", "weights")
+LOOKS = 51
 WORSE = 1e-6
 GAP = 1e-6
 """Largest way, m and rad, that a cyclic task may give so that the joints close."""
@@ -48,7 +51,8 @@ def plan_minimum_velocity(
 
     Raises:
         SolveError: No guess leads to a plan that passes; says what became of each.
-        ProblemError: As minimum_velocity.
+        ProblemError: As minimum_velocity; Unreachable, which is one, where a machine on a fixed base cannot reach what
+            its tasks ask (see ocp.builders.reach).
     """
     if not len(dampings):
         raise ProblemError("dampings are empty: there is no guess to start from")
@@ -56,7 +60,9 @@ def plan_minimum_velocity(
         raise ProblemError("give dampings=(...,) instead of guess_damping")
     how = method or Collocation(intervals=50, degree=4)
     settings = {**OPTIONS, **(options or {})}
-    local = _local_cost(machine, asked)
+    local = _local_motion(machine, asked)
+    _check_reach(machine, asked, local)
+    target = _comparable_cost(asked, local)
     passed: list[Solution] = []
     reasons: list[str] = []
     last: Solution | None = None
@@ -64,11 +70,16 @@ def plan_minimum_velocity(
         problem, guess, mesh = minimum_velocity(machine, guess_damping=damping, **asked), None, how
         for _ in range(2):
             name = f"damping {damping:g}, {mesh.intervals} intervals"
+            final = damping == dampings[-1] and not passed  # what conflicts is looked for once: it takes long
             try:
-                solution = solve(problem, mesh, options=settings, guess=guess)
+                solution = solve(problem, mesh, options=settings, guess=guess, check=final)
             except SolveError as error:
                 last = error.solution or last
-                reasons.append(f"{name}: {str(error).splitlines()[0]}")
+                reasons.append(f"{name}: {error}")
+                break
+            if not solution.success:
+                last = solution
+                reasons.append(f"{name}: ipopt ended with {solution.status.split(':')[0]}")
                 break
             audit = solution.audit()
             gap = float(np.abs(solution["closure"]).max()) * solution.horizon if "closure" in solution.states else 0.0
@@ -79,19 +90,32 @@ def plan_minimum_velocity(
             why = f"the audit fails, {worst.name} {worst.value:.2g}" if worst else f"the task gives way by {gap:.2g}"
             reasons.append(f"{name}: {why}")
             last, guess, mesh = solution, solution, replace(mesh, intervals=2 * mesh.intervals, mesh=None)
-        if passed and passed[-1].cost <= local * (1 + WORSE):
+        if passed and passed[-1].cost <= target * (1 + WORSE):
             return passed[-1]
     if not passed:
         raise SolveError("no plan of minimum velocity passes its audit:\n" + "\n".join(reasons), last)
     return min(passed, key=lambda solution: solution.cost)
 
 
-def _local_cost(machine: Machine, asked: Mapping[str, Any]) -> float:
-    """Cost of the pseudo-inverse from the same start; infinite where it stops early, or the start is singular."""
-    if asked.get("free_start") or asked.get("cyclic"):
-        return np.inf  # it answers another question
+def _local_motion(machine: Machine, asked: Mapping[str, Any]) -> LocalSolution | None:
+    """The pseudo-inverse from the same start; None where the start is singular or not given."""
     try:
-        local = resolve(machine, **{name: asked[name] for name in LOCAL if name in asked}, samples=2)
+        return resolve(machine, **{name: asked[name] for name in LOCAL if name in asked}, samples=LOOKS)
     except ProblemError:
+        return None
+
+
+def _comparable_cost(asked: Mapping[str, Any], local: LocalSolution | None) -> float:
+    """Cost of the pseudo-inverse where it answers the same question and reaches the end; else infinite."""
+    if local is None or local.stopped or asked.get("free_start") or asked.get("cyclic"):
         return np.inf
-    return np.inf if local.stopped else float(local.cost[-1])
+    return float(local.cost[-1])
+
+
+def _check_reach(machine: Machine, asked: Mapping[str, Any], local: LocalSolution | None) -> None:
+    """Raise Unreachable where the task is out of reach; looked for only where the local motion hints at it."""
+    limits = asked.get("limits", True)
+    if local is None or (local.stopped is None and not (limits and leaves_limits(machine, local))):
+        return
+    tasks = one_of(asked.get("tip_velocity"), asked.get("rows"), asked.get("task"))
+    check_reach(machine, tasks, local.joints[0], float(asked["horizon"]), limits, local.joints[:: LOOKS // 5])

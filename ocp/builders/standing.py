@@ -11,7 +11,9 @@ tip_level "position": for controls held over intervals, `MultipleShooting(..., c
     constraint then belong to one end of an interval: the audit's stationarity, taken inside it, does not fit.
 tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
     tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
-    nearer to the optimum for the same number of intervals, and certified by the audit. Not for plans that switch, as
+    nearer to the optimum for the same number of intervals, and certified by the audit. The one to take where slides
+    move the tip in straight lines: there a tip on its path at the nodes alone swings between them, or comes to no rest
+    on the grid (try one interval more). Not for plans that switch, as
     those of least time do: between the points of an interval with a switch the polynomials swing far.
 
 Either way limits hold at the points of the grid; `ocp.tighten(problem, method)` in place of `ocp.solve` makes those of
@@ -32,11 +34,11 @@ import numpy as np
 
 from models.dynamics import Wrench
 from models.posture import joint_limit_index
-from models.standing import External, Standing, center_of_pressure
+from models.standing import External, Standing, center_of_pressure, wrenches_at
 from models.standing_motion import StandingMotion
 from ocp.builders.standing_guess import local_guess
 from ocp.builders.standing_options import FreeTime, Limits, Weights
-from ocp.builders.standing_start import check_loads, inside_limits, tip_demand
+from ocp.builders.standing_start import check_freedom, check_loads, check_slope, inside_limits, tip_demand
 from ocp.builders.task import Array, checked_start
 from ocp.builders.tip_path import Path, check_path, check_rest, linear_rows, path_derivatives
 from ocp.builders.zmp_rules import (
@@ -48,6 +50,7 @@ from ocp.builders.zmp_rules import (
     ZmpRule,
     check_rule,
     foot_rows,
+    index_rows,
 )
 from ocp.errors import ProblemError
 from ocp.problem import Problem
@@ -90,8 +93,8 @@ def standing_plan(
     States "joints", "velocities" (and "accelerations" where the jerk is the control); controls "accelerations" or
     "jerks". Where the path is a function of a parameter, states "path" 0..1 and "path_rate" >= 0, control
     "path_acceleration". Path constraints "tip"; "zero moment point" (m; inside a foot the distance from its edges, less
-    the margin); "vertical force", N; "friction", the square of the force the ground holds less that it gives, over the
-    squared weight; "torques".
+    the margin); "foot", the distance from edges that another rule leaves open; "vertical force", N; "friction", the
+    square of the force the ground holds less that it gives, over the squared weight; "torques".
 
     Args:
         machine: What stands.
@@ -117,26 +120,34 @@ def standing_plan(
     Raises:
         ProblemError: Sizes, rows or options that do not fit, a start outside the limits, a path that does not begin at
             the tip, is longer than the arm, or moves where the joints are to rest; a start from rest at which torques,
-            vertical force or zero moment point are beyond what may be whatever the joints do.
+            vertical force or zero moment point are beyond what may be whatever the joints do; a zero moment point
+            that is asked out of the support; no freedom left to come to rest; a singular start whose manipulability
+            the cost would need.
     """
     zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
+    if not (isinstance(machine, Standing) and isinstance(weights, Weights) and isinstance(limits, Limits)):
+        given = [type(one).__name__ for one in (machine, weights, limits)]
+        raise ProblemError(f"standing_plan takes a Standing machine, Weights and Limits, not {', '.join(given)}")
     _check_options(control=control, along=along, tip_level=tip_level, start=start, end=end)
     if tip_level == "acceleration" and control == "jerk":
         raise ProblemError("tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'")
     duration = horizon.guess if isinstance(horizon, FreeTime) else horizon
     begin = checked_start(machine, rows, start_joints, duration, None)
+    rows = begin.rows
     bounds = limits.bounds(machine)
     begin = replace(begin, joints=inside_limits(machine, begin.joints, *bounds["joints"]))
     check_rule(machine, zmp, begin.horizon)
+    check_freedom(machine, rows, zmp, along, tip_level, end)
+    check_slope(machine, rows, begin.joints, weights.manipulability)
     last = 1.0 if along == "parameter" else begin.horizon
     check_path(machine, tip_path, rows, begin.joints, begin.base, last)
     if along == "time":
-        check_rest(tip_path, len(begin.rows), 0.0 if start == "rest" else None, last if end == "rest" else None)
+        check_rest(tip_path, len(rows), 0.0 if start == "rest" else None, last if end == "rest" else None)
     if start == "rest":
         tip = np.array(ca.DM(machine.tip_pose((), begin.joints).position))
-        acting = tuple(external(ca.DM(0.0), ca.DM(tip))) if external is not None else ()
+        acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
         held = tip_level == "acceleration"  # else the tip is on its path at the nodes alone
-        demand = tip_demand(machine, tip_path, begin.rows, begin.joints, along == "parameter") if held else None
+        demand = tip_demand(machine, tip_path, rows, begin.joints, along == "parameter") if held else None
         check_loads(machine, begin.joints, acting, zmp, limits.least_force(machine), bounds, demand)
     guess = local_guess(machine, tip_path, rows, begin.joints, begin.horizon, along == "parameter", external)
 
@@ -157,7 +168,7 @@ def standing_plan(
         "velocities",
         machine.joint_size,
         initial=at_rest["initial"],
-        terminal=_rest(machine, begin.rows, guess["joints"].values[-1], end, tip_level),
+        terminal=_rest(machine, rows, guess["joints"].values[-1], end, tip_level),
         lower=-speed,
         upper=speed,
         guess=guess["velocities"],
@@ -190,7 +201,7 @@ def standing_plan(
     else:
         states, rates = [*states, progress], [*rates, 1]
     position = machine.tip_pose((), joints).position
-    gap = position[linear_rows(rows)] - path_derivatives(tip_path, progress, len(begin.rows))[0]
+    gap = position[linear_rows(rows)] - path_derivatives(tip_path, progress, len(rows))[0]
     if tip_level == "acceleration":
         moving = ca.jtimes(gap, ca.vertcat(*states), ca.vertcat(*rates))
         if start == "free":
@@ -198,7 +209,7 @@ def standing_plan(
         gap = ca.jtimes(moving, ca.vertcat(*states), ca.vertcat(*rates))
     problem.path("tip", gap, lower=0, upper=0)
 
-    wrenches = tuple(external(problem.time, position)) if external is not None else ()
+    wrenches = wrenches_at(external, problem.time, position)
     _ground(problem, machine, (joints, velocities, accelerations), wrenches, zmp, limits)
     effort = bounds["torques"]
     if np.isfinite(effort).any():
@@ -284,7 +295,7 @@ def _ground(
     point = center_of_pressure(reaction)
     if isinstance(zmp, IndexAtLeast):
         low, high = zmp.region(machine)
-        rows = [axis for axis in (0, 1) if ca.symvar(point[axis])]
+        rows = index_rows(machine, zmp, point, bool(wrenches))
         problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows])
     elif isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))

@@ -1,4 +1,4 @@
-"""What may be asked of a standing plan besides its rule for the zero moment point: limits, weights, the time it takes."""
+"""What may be asked of a standing plan besides its task: limits, weights, the time it takes."""
 
 from __future__ import annotations
 

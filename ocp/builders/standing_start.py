@@ -15,7 +15,7 @@ from ocp.builders.tip_path import Path, path_derivatives
 from ocp.builders.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 from ocp.errors import ProblemError
 
-__all__ = ["check_loads", "inside_limits"]
+__all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "tip_demand"]
 
 ROUNDING = 1e-8
 """How far beyond a limit a start may be, rad or m: what rounding and inverse kinematics leave."""
@@ -39,6 +39,33 @@ def inside_limits(machine: Standing, joints: Array, lower: Array, upper: Array) 
         if not low < high:
             raise ProblemError(f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there")
     return np.clip(joints, lower, upper)
+
+
+def check_freedom(machine: Standing, rows: Sequence[int], zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:
+    """Raise ProblemError where tip and zero moment point ask for all joints, and these are to come to rest besides."""
+    pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
+    fixed = len(rows) + pinned - (along == "parameter")
+    left = machine.joint_size - fixed
+    follows = tip_level == "acceleration" and not pinned  # joints that the tip takes along to its rest
+    if left < 0 or (left == 0 and end == "rest" and not follows):
+        asked = f"the tip's {len(rows)} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
+        if left < 0:
+            raise ProblemError(f"{asked} are more than {machine.joint_size} joints can do; ask for less")
+        raise ProblemError(
+            f"{asked} leave the {machine.joint_size} joints no freedom to come to rest at the end; say end='free', "
+            + ("or pin the point less" if pinned else "or tip_level='acceleration'")
+        )
+
+
+def check_slope(machine: Standing, rows: Sequence[int], joints: Array, weight: float) -> None:
+    """Raise ProblemError where the manipulability has no slope at the start, which the cost needs."""
+    q = ca.SX.sym("q", machine.joint_size)
+    slope = ca.Function("slope", [q], [ca.gradient(machine.manipulability((), q, rows), q)])
+    if weight and not np.isfinite(np.array(slope(joints))).all():
+        raise ProblemError(
+            f"start_joints {np.round(joints, 4).tolist()}: the task's rows are singular there, and the manipulability "
+            "in the cost has no slope; start elsewhere, or say Weights(manipulability=0)"
+        )
 
 
 def check_loads(

@@ -26,6 +26,7 @@ __all__ = [
     "checked_place",
     "foot_edges",
     "foot_rows",
+    "index_rows",
     "is_finite",
 ]
 
@@ -38,7 +39,7 @@ SAMPLES = 201  # times at which a reference is looked at
 
 def is_finite(value: Any) -> bool:
     """Whether it is a single finite number."""
-    return isinstance(value, Real) and bool(np.isfinite(value))
+    return isinstance(value, Real) and bool(np.isfinite(float(value)))
 
 
 @dataclass(frozen=True)
@@ -173,6 +174,27 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, pushed: bool) -> Any:
                 "the joints do: put the foot below the machine"
             )
     return rows[free]
+
+
+def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, pushed: bool) -> list[int]:
+    """Coordinates of the zero moment point that a motion can bring out of the region of the index.
+
+    Args:
+        point, pushed: As foot_rows.
+
+    Raises:
+        ProblemError: The other coordinate is out of the region.
+    """
+    rows = [i for i in (0, 1) if (pushed or i in machine.moving_axes) and ca.symvar(point[i])]
+    low, high = zmp.region(machine)
+    here = machine.nearest_reachable(machine.most_stable_point)
+    for i in {0, 1} - set(rows):
+        if not low[i] - ROUNDING <= here[i] <= high[i] + ROUNDING:
+            raise ProblemError(
+                f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {here[i]:.4g} m whatever the "
+                f"joints do, outside {low[i]:.4g} .. {high[i]:.4g} m: put the foot below the machine"
+            )
+    return rows
 
 
 def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:

@@ -25,7 +25,6 @@ class Attempt:
         grid: Where they are looked at.
         speed, acceleration, jerk: Limits of each interval. Shape (G - 1,).
         ramp_cause: Row of `cause_names` that made a ramp gentler there, or -1. Shape (G - 1,).
-        gentler: Ramps of the whole path are this much slower in time.
         memory: Motions of zones already found.
         passed: Phases that are known to keep the joint limits: distance, speed, acceleration, jerk, duration.
         profile: The plan.
@@ -36,7 +35,6 @@ class Attempt:
     acceleration: Array
     jerk: Array
     ramp_cause: NDArray[np.intp]
-    gentler: float = 1.0
     memory: Memory = field(default_factory=dict)
     passed: set[tuple[float, ...]] = field(default_factory=set)
     profile: SpeedProfile = field(init=False)

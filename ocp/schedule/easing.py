@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.schedule.attempt import TOLERANCE, Attempt
-from ocp.schedule.limits import JointPath, Limits, joint_demands
+from ocp.schedule.limits import JointPath, Limits, joint_demands, rates_along
 from ocp.schedule.profile import Array, Motion, SpeedProfile
 
 __all__ = ["Broken", "broken_ramps", "ease_ramps"]
@@ -54,13 +54,13 @@ def broken_ramps(state: Attempt, limits: Limits, joints: JointPath) -> Broken | 
     if not fresh.size:
         return None
     phase, motion = _samples(state, fresh)
-    whole, steady = joint_demands(limits, joints.at(motion.distance), motion)
+    whole, steady = joint_demands(limits, rates_along(joints, motion.distance), motion)
     passing = np.setdiff1d(fresh, phase[(whole > 1 + TOLERANCE).any(axis=0)])
     if passing.size:
         # a peak may lie between two samples
         finer, more = _between(profile, phase, motion.t, np.where(np.isin(phase, passing), whole, 0.0))
         if len(finer):
-            demands = joint_demands(limits, joints.at(more.distance), more)
+            demands = joint_demands(limits, rates_along(joints, more.distance), more)
             whole, steady = (np.concatenate(pair, axis=1) for pair in zip((whole, steady), demands, strict=True))
             phase = np.concatenate([phase, finer])
             motion = Motion(*(np.concatenate(pair) for pair in zip(motion, more, strict=True)))
@@ -73,9 +73,7 @@ def broken_ramps(state: Attempt, limits: Limits, joints: JointPath) -> Broken | 
         return None
     share = np.take_along_axis(steady, row[None], axis=0)[0]
     ramp = np.concatenate([[0], np.cumsum(np.diff(np.sign(np.diff(profile.speed))) != 0)])
-    return Broken(
-        ramp, phase[over], motion.distance[over], motion.speed[over], demand[over], share[over], row[over]
-    )
+    return Broken(ramp, phase[over], motion.distance[over], motion.speed[over], demand[over], share[over], row[over])
 
 
 def ease_ramps(state: Attempt, limits: Limits, joints: JointPath) -> bool:
@@ -86,34 +84,37 @@ def ease_ramps(state: Attempt, limits: Limits, joints: JointPath) -> bool:
     # ramps whose stretches overlap must not lower each other's limits again and again in one round
     before = state.acceleration.copy(), state.jerk.copy()
     for one in np.unique(broken.ramp[broken.phase]):
-        mine = np.flatnonzero(broken.ramp[broken.phase] == one)
-        _ease(state, Broken(broken.ramp, *(values[mine] for values in broken[1:])), before, len(joints.names))
+        _ease(state, broken, int(one), before, len(joints.names))
     return True
 
 
-def _ease(state: Attempt, broken: Broken, before: tuple[Array, Array], number: int) -> None:
+def _ease(state: Attempt, broken: Broken, ramp: int, before: tuple[Array, Array], number: int) -> None:
     """Make one ramp gentler, and lower the speed where a steady one alone takes most of a limit."""
     profile = state.profile
-    worst = int(broken.demand.argmax())
-    steady = np.minimum(broken.steady, STEADY_SHARE)
-    factor = float(np.clip(0.99 * np.min((1 - steady) / (broken.demand - steady)), 0.3, 0.98))
-    phases = np.flatnonzero(broken.ramp == broken.ramp[broken.phase[0]])
-    begin, end = profile.distance[phases[0]], profile.distance[phases[-1] + 1]
+    mine = broken.ramp[broken.phase] == ramp
+    demand, steady, row = broken.demand[mine], broken.steady[mine], broken.row[mine]
+    distance, speed = broken.distance[mine], broken.speed[mine]
+    worst = int(demand.argmax())
+    share = np.minimum(steady, STEADY_SHARE)
+    factor = float(np.clip(0.99 * np.min((1 - share) / (demand - share)), 0.3, 0.98))
+    phases = np.flatnonzero(broken.ramp == ramp)
+    first, last = phases[0], phases[-1] + 1
+    begin, end = profile.distance[first], profile.distance[last]
     longer = (end - begin) * (1 / factor - 1)
-    rising = profile.speed[phases[-1] + 1] > profile.speed[phases[0]]
+    rising = profile.speed[last] > profile.speed[first]
     low, high = (begin, end + longer) if rising else (begin - longer, end)
     stretch = slice(state.interval(low), state.interval(high) + 1)
-    at = state.interval(float(broken.distance[worst]))
+    at = state.interval(float(distance[worst]))
     acceleration, jerk = factor * before[0][at], factor * before[1][at]
     changed = state.acceleration[stretch] > acceleration
-    state.ramp_cause[stretch] = np.where(changed, 1 + number + broken.row[worst], state.ramp_cause[stretch])
+    state.ramp_cause[stretch] = np.where(changed, 1 + number + row[worst], state.ramp_cause[stretch])
     np.minimum(state.acceleration[stretch], acceleration, out=state.acceleration[stretch])
     np.minimum(state.jerk[stretch], jerk, out=state.jerk[stretch])
-    hot = broken.steady > STEADY_SHARE
+    hot = steady > STEADY_SHARE
     if hot.any():
-        power = np.where(broken.row[hot] < number, 2, 3)
-        ceiling = float(np.min(broken.speed[hot] * (STEADY_SHARE / broken.steady[hot]) ** (1 / power)))
-        places = [state.interval(float(s)) for s in broken.distance[hot]]
+        power = np.where(row[hot] < number, 2, 3)
+        ceiling = float(np.min(speed[hot] * (STEADY_SHARE / steady[hot]) ** (1 / power)))
+        places = [state.interval(float(s)) for s in distance[hot]]
         reached = slice(max(min(places) - 1, 0), max(places) + 2)
         np.minimum(state.speed[reached], ceiling, out=state.speed[reached])
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names, line_demands
+from ocp.schedule.limits import JointPath, Limits, PathLike, curvature_along, line_demands, rates_along
 from ocp.schedule.profile import Array
 
 __all__ = ["Grid", "make_grid"]
@@ -80,18 +80,12 @@ def make_grid(path: PathLike, limits: Limits, joints: JointPath | None) -> Grid:
 
 
 def _permitted(path: PathLike, limits: Limits, joints: JointPath | None, s: Array) -> tuple[Array, NDArray[np.intp]]:
-    curvature = path.curvature(s) if np.isfinite(limits.centripetal) else None
-    demand, power = line_demands(limits, curvature, None if joints is None else joints.at(s))
+    curvature = curvature_along(path, s) if np.isfinite(limits.centripetal) else None
+    demand, power = line_demands(limits, curvature, None if joints is None else rates_along(joints, s))
     with np.errstate(divide="ignore"):
         speeds = (1 / demand) ** (1 / power[:, None])
     cause = speeds.argmin(axis=0)
     permitted = np.take_along_axis(speeds, cause[None], axis=0)[0]
-    if not (permitted > 0).all():  # nan too
-        at = int((~(permitted > 0)).argmax())
-        name = cause_names(joints.names if joints is not None else ())[int(cause[at])]
-        raise ProblemError(
-            f"at {s[at]:g} m the {name} limit permits no speed at all, the arm is singular there; keep the path away"
-        )
     return permitted, cause
 
 

@@ -19,8 +19,10 @@ __all__ = [
     "Limits",
     "PathLike",
     "cause_names",
+    "curvature_along",
     "joint_demands",
     "line_demands",
+    "rates_along",
 ]
 
 
@@ -122,6 +124,43 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
         raise ProblemError(f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}")
 
 
+def rates_along(joints: JointPath, distance: Array) -> JointRates:
+    """Joints at distances (M,), checked.
+
+    Raises:
+        ProblemError: Shapes that are not (M, n), a value that is not finite.
+    """
+    rates = joints.at(distance)
+    shape = (len(distance), len(joints.names))
+    for kind in ("position", "first", "second", "third"):
+        try:
+            value = np.asarray(getattr(rates, kind), dtype=float)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ProblemError(f"joints along the path: {kind} is missing or not numeric: {error}") from error
+        if value.shape != shape:
+            raise ProblemError(f"joints along the path: {kind} has shape {value.shape}, expected {shape}")
+        finite = np.isfinite(value)
+        if not finite.all():
+            at, joint = np.argwhere(~finite)[0]
+            what = "position" if kind == "position" else f"{kind} derivative"
+            raise ProblemError(
+                f"the {what} of joint {joints.names[joint]!r} is {value[at, joint]:g}, not finite, at "
+                f"{distance[at]:g} m, the arm is singular there; keep the path away"
+            )
+    return rates
+
+
+def curvature_along(path: PathLike, distance: Array) -> Array:
+    """Curvature at distances, shape (M,), 1/m; ProblemError for another shape or what is not finite."""
+    value = np.asarray(path.curvature(distance), dtype=float)
+    if value.shape != np.shape(distance):
+        raise ProblemError(f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}")
+    if not np.isfinite(value).all():
+        at = int((~np.isfinite(value)).argmax())
+        raise ProblemError(f"the path's curvature is {value[at]:g}, not finite, at {distance[at]:g} m: a cusp")
+    return value
+
+
 def cause_names(joint_names: Sequence[str]) -> tuple[str, ...]:
     """What may bind: the rows of line_demands and joint_demands."""
     of_joints = [f"joint {name!r} {kind}" for kind in ("velocity", "acceleration", "jerk") for name in joint_names]
@@ -143,8 +182,7 @@ def line_demands(
         number = rates.first.shape[1]
         bounds = limits.of_joints(number)
         for order, derivative in enumerate((rates.first, rates.second, rates.third)):
-            with np.errstate(invalid="ignore"):  # inf over inf, at a singular arm
-                rows.append(np.abs(derivative.T) / bounds[order][:, None])
+            rows.append(np.abs(derivative.T) / bounds[order][:, None])
             powers += [order + 1.0] * number
     return np.concatenate(rows), np.array(powers)
 

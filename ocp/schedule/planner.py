@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import ProblemError
 from ocp.schedule.attempt import TOLERANCE, Attempt
@@ -26,7 +27,8 @@ class Dip:
         start, end: Distances along the path, m.
         cause: The limit that binds, for example "centripetal acceleration" or "joint 'elbow' velocity".
         asked, speed: Asked line speed and lowest one permitted there, m/s.
-        acceleration: Line acceleration permitted there, m/s^2; below the limit where a ramp breaks a joint limit.
+        acceleration, jerk: Of the line speed, permitted there, m/s^2 and m/s^3; below the limits where a ramp would
+            break a joint limit.
     """
 
     start: float
@@ -35,11 +37,13 @@ class Dip:
     asked: float
     speed: float
     acceleration: float
+    jerk: float
 
     def __str__(self) -> str:
+        slow = f"permits {self.speed:.4g} of {self.asked:.4g} m/s" if self.speed < self.asked else "binds on a ramp"
         return (
-            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} permits {self.speed:.4g} of {self.asked:.4g} m/s, "
-            f"line acceleration {self.acceleration:.4g} m/s^2"
+            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {slow}, "
+            f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
         )
 
 
@@ -80,7 +84,7 @@ class Schedule:
         Raises:
             ProblemError: A period that is not positive, or nan.
         """
-        if not (np.isfinite(period) and period > 0):
+        if not isinstance(period, int | float | np.floating) or not (np.isfinite(period) and period > 0):
             raise ProblemError(f"sample period {period!r} s must be positive and finite")
         times = np.arange(int(np.ceil(self.duration / period * (1 - 1e-12)))) * period
         return self.at(np.append(times, self.duration))
@@ -108,6 +112,11 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
         ProblemError: Joint limits without joints, or a limit that would be broken at the asked speed, if strict;
             limits that no schedule keeps.
     """
+    missing = [name for name in ("length", "bounds", "by_piece", "curvature", "dense") if not hasattr(path, name)]
+    if missing:
+        raise ProblemError(f"the path {path!r} has no {missing[0]}; give a SmoothPath, as models.paths.smooth makes it")
+    if not isinstance(limits, Limits):
+        raise ProblemError(f"limits {limits!r} must be a Limits")
     if limits.joints is not None and joints is None:
         raise ProblemError(
             "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
@@ -127,34 +136,43 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
 
 def _dips(state: Attempt, limits: Limits, names: tuple[str, ...]) -> tuple[Dip, ...]:
     grid = state.grid
-    acceleration = limits.acceleration / state.gentler**2
-    slow = (state.speed < grid.asked * (1 - TOLERANCE)) | (state.acceleration < acceleration * (1 - TOLERANCE))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(np.int8), [0]])))
+    cause = _causes(state, limits)
+    edges = np.flatnonzero(np.diff(cause, prepend=-1, append=-1))
     dips = []
-    if state.gentler > 1:
-        fastest, ends = float(grid.asked.max()), (float(grid.distance[0]), float(grid.distance[-1]))
-        dips.append(Dip(*ends, "joint limits on ramps", fastest, fastest, acceleration))
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for first, last in pairwise(edges.tolist()):
+        if cause[first] < 0:
+            continue
         inside = slice(first, last)
-        ratio = state.speed[inside] / grid.asked[inside]
-        lowest = first + int(ratio.argmin())
-        if ratio.min() < 1 - TOLERANCE:
-            points = grid.permitted[first : last + 1]
-            cause = int(grid.cause[first + int(points.argmin())])
-        else:
-            lowest = first + int(state.acceleration[inside].argmin())
-            cause = int(state.ramp_cause[lowest])
+        lowest = first + int((state.speed[inside] / grid.asked[inside]).argmin())
         dips.append(
             Dip(
                 float(grid.distance[first]),
                 float(grid.distance[last]),
-                names[cause],
+                names[int(cause[first])],
                 float(grid.asked[lowest]),
                 float(state.speed[lowest]),
                 float(state.acceleration[inside].min()),
+                float(state.jerk[inside].min()),
             )
         )
     return tuple(_joined(dips, state))
+
+
+def _causes(state: Attempt, limits: Limits) -> NDArray[np.intp]:
+    """Row of cause_names that slows each interval of the grid, -1 where nothing does. Shape (G - 1,)."""
+    grid, speed = state.grid, state.speed
+    gentle = state.acceleration < limits.acceleration * (1 - TOLERANCE)
+    gentle |= state.jerk < limits.jerk * (1 - TOLERANCE)
+    cause = np.where(gentle, state.ramp_cause, -1)
+    slow = speed < grid.asked * (1 - TOLERANCE)
+    # where one speed holds, the slowest place says why
+    starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed)), [len(speed)]])
+    for first, last in pairwise(starts.tolist()):
+        if slow[first:last].any():
+            lowest = first + int(grid.permitted[first : last + 1].argmin())
+            for_ramp = (state.ramp_cause[first:last] >= 0) & (speed[first] < grid.permitted[lowest] * (1 - TOLERANCE))
+            cause[first:last] = np.where(for_ramp, state.ramp_cause[first:last], grid.cause[lowest])
+    return cause
 
 
 def _joined(dips: list[Dip], state: Attempt) -> list[Dip]:
@@ -169,8 +187,8 @@ def _joined(dips: list[Dip], state: Attempt) -> list[Dip]:
         last = joined[-1] if joined else dip
         between = slice(*np.searchsorted(places, [last.end, dip.start]))
         if joined and (last.cause, last.asked) == (dip.cause, dip.asked) and not back[between].any():
-            speed, acceleration = min(last.speed, dip.speed), min(last.acceleration, dip.acceleration)
-            joined[-1] = Dip(last.start, dip.end, dip.cause, dip.asked, speed, acceleration)
+            least = (min(getattr(last, kind), getattr(dip, kind)) for kind in ("speed", "acceleration", "jerk"))
+            joined[-1] = Dip(last.start, dip.end, dip.cause, dip.asked, *least)
         else:
             joined.append(dip)
     return joined

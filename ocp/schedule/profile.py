@@ -33,6 +33,16 @@ class Motion(NamedTuple):
     jerk: Array
 
 
+def _row(value: ArrayLike, what: str) -> Array:
+    try:
+        array = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{what} {value!r} is not numeric") from error
+    if array.ndim != 1:
+        raise ProblemError(f"{what} has shape {array.shape}; give one number or a row")
+    return array
+
+
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
     """Pieces of constant jerk, one after the other.
@@ -59,7 +69,7 @@ class SpeedProfile:
         Raises:
             ProblemError: nan, or a time outside by more than rounding.
         """
-        t = np.atleast_1d(np.asarray(time, dtype=float))
+        t = _row(time, "time")
         slack = 1e-9 * self.duration
         if not ((t >= -slack) & (t <= self.duration + slack)).all():
             wrong = t[~((t >= -slack) & (t <= self.duration + slack))]
@@ -78,7 +88,7 @@ class SpeedProfile:
         Raises:
             ProblemError: nan, or a distance off the path by more than rounding.
         """
-        s = np.atleast_1d(np.asarray(distance, dtype=float))
+        s = _row(distance, "distance")
         length = float(self.distance[-1])
         slack = 1e-9 * length
         if not ((s >= -slack) & (s <= length + slack)).all():

@@ -58,8 +58,8 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
         ProblemError: Values that are not positive; a jerk too low for that mean.
     """
     for name, value in (("mean acceleration", mean), ("speed", speed), ("jerk", jerk)):
-        if not (isfinite(value) and value > 0):
-            raise ProblemError(f"{name} {value:g} must be positive and finite")
+        if not isinstance(value, int | float) or not (isfinite(value) and value > 0):
+            raise ProblemError(f"{name} {value!r} must be positive and finite")
     time = speed / mean
     square = time * time - 4 * speed / jerk
     if square < 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,90 +10,82 @@ from numpy.typing import NDArray
 from ocp.schedule.attempt import TOLERANCE, Attempt
 from ocp.schedule.easing import Broken, broken_ramps
 from ocp.schedule.limits import JointPath, Limits
+from ocp.schedule.slowing import slow_down
 from ocp.schedule.zones import plan
 
 __all__ = ["relax_ramps"]
 
-SHARES = (1.0, 0.5, 0.5, 0.5)
-"""How much of what a stretch has lost of its limits, by the logarithm, is tried to give back, one after the other."""
+SHARES = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.0), (0.0, 1.0), (0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.25, 0.25))
+"""How much of the acceleration and of the jerk that a stretch has lost, by the logarithm, it gets back, in turn."""
+ROUNDS, PATIENCE = 24, 4
+"""After each so many rounds one more neighbour on either side goes back with a stretch, so that long paths settle."""
 
 
-def relax_ramps(best: Attempt, limits: Limits, joints: JointPath, slow_down: Callable[[Attempt], bool]) -> Attempt:
+def relax_ramps(best: Attempt, limits: Limits, joints: JointPath) -> Attempt:
     """The plan with full acceleration and jerk, or at least more of them, wherever the joints can follow.
-
-    The path is cut where the plan does not accelerate. All stretches get more at once; those whose ramps then break a
-    joint limit go back to what they had, until none does.
 
     Args:
         best: A plan that keeps all limits.
         limits, joints: What it keeps to.
-        slow_down: Lowers speed limits of an attempt whose plan is too fast; False when it is not.
     """
     for share in SHARES:
-        trial = _trial(best, limits, joints, slow_down, share)
+        trial = _trial(best, limits, joints, share)
         if trial is not None and trial.profile.duration <= best.profile.duration:
             best = trial
     return best
 
 
-def _trial(
-    best: Attempt, limits: Limits, joints: JointPath, slow_down: Callable[[Attempt], bool], share: float
-) -> Attempt | None:
+def _trial(best: Attempt, limits: Limits, joints: JointPath, share: tuple[float, float]) -> Attempt | None:
+    """All stretches get more; those whose ramps then break a limit go back to what they had, until none does."""
     lost = limits.acceleration / best.acceleration, limits.jerk / best.jerk
-    loss = np.maximum(*lost) > 1 + TOLERANCE
+    eased = np.maximum(*lost) > 1 + TOLERANCE
     owner = _stretches(best)
-    open_ = np.unique(owner[loss])
-    if not open_.size:
+    free = np.unique(owner[eased])
+    if not free.size:
         return None
+    acceleration, jerk = best.acceleration * lost[0] ** share[0], best.jerk * lost[1] ** share[1]
     trial = replace(
-        best,
-        speed=best.speed.copy(),
-        acceleration=best.acceleration * lost[0] ** share,
-        jerk=best.jerk * lost[1] ** share,
-        ramp_cause=best.ramp_cause.copy(),
+        best, speed=best.speed.copy(), acceleration=acceleration, jerk=jerk, ramp_cause=best.ramp_cause.copy()
     )
-    for _ in _rounds():
+    for number in range(ROUNDS):
         trial.profile = plan(trial.zones(), trial.memory)
         if slow_down(trial):
             continue
         broken = broken_ramps(trial, limits, joints)
         if broken is None:
             return trial
-        closed = _touched(trial, broken, owner, open_)
-        if not closed:
+        row = _touched(trial, broken, owner, free, number // PATIENCE)
+        if (row < 0).all():
             return None
-        for stretch, row in closed.items():
-            mine = owner == stretch
-            for name in ("speed", "acceleration", "jerk"):
-                getattr(trial, name)[mine] = getattr(best, name)[mine]
-            trial.ramp_cause[mine & loss] = 1 + len(joints.names) + row
-        open_ = np.setdiff1d(open_, list(closed))
+        back = row[owner] >= 0
+        for kind in ("speed", "acceleration", "jerk"):
+            getattr(trial, kind)[back] = getattr(best, kind)[back]
+        trial.ramp_cause[back & eased] = 1 + len(joints.names) + row[owner][back & eased]
+        free = free[row[free] < 0]
     return None
 
 
-def _rounds() -> Iterator[int]:
-    return iter(range(100))
-
-
 def _stretches(state: Attempt) -> NDArray[np.intp]:
-    """Number of the stretch that each interval of the grid belongs to. Shape (G - 1,)."""
+    """Number of the stretch of each interval of the grid, cut where the plan does not accelerate. Shape (G - 1,)."""
     profile = state.profile
     still = np.flatnonzero(profile.acceleration[1:-1] == 0) + 1
     cuts = np.unique([state.interval(float(s)) for s in profile.distance[still]])
     return np.searchsorted(cuts, np.arange(len(state.speed)), side="right")
 
 
-def _touched(state: Attempt, broken: Broken, owner: NDArray[np.intp], open_: NDArray[np.intp]) -> dict[int, int]:
-    """Stretches to go back to what they had, and the row of joint_demands that says so."""
-    closed: dict[int, int] = {}
-    for one in np.unique(broken.ramp[broken.phase]):
+def _touched(
+    state: Attempt, broken: Broken, owner: NDArray[np.intp], free: NDArray[np.intp], margin: int
+) -> NDArray[np.intp]:
+    """For each stretch the row of joint_demands that sends it back, -1 if none does. Shape (number of stretches,)."""
+    row = np.full(int(owner[-1]) + 1, -1)
+    of_sample = broken.ramp[broken.phase]
+    for one in np.unique(of_sample):
         phases = np.flatnonzero(broken.ramp == one)
         ends = state.profile.distance[[phases[0], phases[-1] + 1]]
         first, last = (int(owner[state.interval(float(s))]) for s in ends)
-        mine = broken.ramp[broken.phase] == one
-        row = int(broken.row[mine][broken.demand[mine].argmax()])
-        inside = open_[(open_ >= first) & (open_ <= last)]
-        if not inside.size:  # its neighbours have changed the speed that it comes from or goes to
-            inside = np.concatenate([open_[open_ < first][-1:], open_[open_ > last][:1]])
-        closed.update(dict.fromkeys(inside.tolist(), row))
-    return closed
+        low, high = np.searchsorted(free, [first - margin, last + margin + 1])
+        if low == high:  # its neighbours have changed the speed that it comes from or goes to
+            low, high = max(low - 1, 0), high + 1
+        mine = of_sample == one
+        row[free[low:high]] = broken.row[mine][broken.demand[mine].argmax()]
+    return row

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath
+from ocp.schedule.limits import JointPath, rates_along
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, Motion
 
@@ -130,7 +130,7 @@ def joint_motion(joints: JointPath, motion: Motion) -> tuple[Array, Array, Array
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """
-    along = joints.at(motion.distance)
+    along = rates_along(joints, motion.distance)
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
     velocity = along.first * v
     acceleration = along.second * v**2 + along.first * a

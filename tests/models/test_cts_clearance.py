@@ -58,6 +58,22 @@ def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: f
         assert float(found) == pytest.approx(cost[nearest], abs=5e-3)
 
 
+def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhere() -> None:
+    """Between two boxes: the best roll is in another basin than the best roll of the grid that is clear."""
+    boxes = (
+        Box((2.009, -0.165, 0.153), (0.027, 0.077, 0.095)),
+        Box((1.919, -0.022, -0.091), (0.044, 0.084, 0.042)),
+    )
+    function = clear_inverse(RIG, TUNNEL, Surroundings(solids=boxes), clearance=0.03)
+    for target, known in (
+        ((2.598, 0.156, 0.078, 0.167, 0.076), 0.0172392516),
+        ((2.585, 0.092, -0.055, 0.147, 0.053), 0.0468053923),
+    ):
+        _, cost, _, _, gap = function(target, 0.0)
+        assert float(cost) <= known + 1e-9
+        assert float(gap) >= 0.03
+
+
 def test_the_constraint_that_holds_the_roll_is_named() -> None:
     table = solve_table(RIG, TUNNEL, TARGETS, surroundings=AROUND, clearance=0.15)
     free = solve_table(RIG, TUNNEL, TARGETS)

@@ -15,7 +15,8 @@ from models.cts_optimal import optimal_inverse
 from models.cts_roll import ACTIVE, STATUS
 from models.cts_table import Table, all_joint_sets, reachable_arcs, solve_table
 from models.errors import ModelError
-from models.harmonics import Harmonics, least_point, roots, series_roots
+from models.harmonics import Harmonics, least_point, roots
+from models.series import series_roots
 from tests.models.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {
@@ -28,6 +29,7 @@ WIDE: dict[str, Any] = {
 }
 REFERENCE = {-15: 0.331364, -7.5: 0.682290, 0: np.pi / 2, 7.5: 2.459303, 15: 2.810229}
 seeds = st.integers(0, 2**32 - 1)
+RIG, LIMITED, TUNNEL = reference_rig(), reference_rig(**LIMITS), reference_tunnel()
 
 
 def run(function: Any, targets: Array, previous: Array) -> tuple[Array, Array, Array, Array]:
@@ -63,7 +65,7 @@ def check_against_grid(
 @pytest.mark.parametrize("z", REFERENCE)
 def test_reference_rolls(z: float) -> None:
     target = np.array([100, 6, z, 0, 0]) * [INCH, INCH, INCH, 1, 1]
-    joints, _, active, status = optimal_inverse(reference_rig(), reference_tunnel())(target, 0.0)
+    joints, _, active, status = optimal_inverse(RIG, TUNNEL)(target, 0.0)
     assert float(joints[5]) == pytest.approx(REFERENCE[z], abs=1e-6)
     assert (int(active), int(status)) == (0, 0)
 
@@ -71,7 +73,7 @@ def test_reference_rolls(z: float) -> None:
 def test_no_target_of_1e5_misses_the_global_minimum_of_i1() -> None:
     rng = np.random.default_rng(5)
     targets, previous = random_targets(rng, 100_000), np.zeros(100_000)
-    active, status = check_against_grid(reference_rig(), reference_tunnel(), HOME, targets, previous, 120)
+    active, status = check_against_grid(RIG, TUNNEL, HOME, targets, previous, 120)
     names = {ACTIVE[code] for code in np.unique(active)}
     assert names == {"free", "pitch reach", "yaw reach"}
     assert {STATUS[code] for code in np.unique(status)} == {"ok", "pitch link out of reach", "yaw link out of reach"}
@@ -82,7 +84,7 @@ def test_no_target_of_1e5_misses_the_global_minimum_of_i1() -> None:
 def test_no_target_of_1e4_misses_the_global_minimum_of_i2(rate_weight: float) -> None:
     rng = np.random.default_rng(int(100 * rate_weight))
     targets, previous = random_targets(rng, 10_000), rng.uniform(-4, 4, 10_000)
-    check_against_grid(reference_rig(), reference_tunnel(), HOME, targets, previous, 240, rate_weight)
+    check_against_grid(RIG, TUNNEL, HOME, targets, previous, 240, rate_weight)
 
 
 @pytest.mark.parametrize("limits", [LIMITS, WIDE])
@@ -140,7 +142,7 @@ def test_several_arcs_and_special_yaws(yaw: float | None, limits: dict[str, Any]
 def test_closed_form_without_limits_is_the_least_index_of_all_rolls() -> None:
     rng = np.random.default_rng(2)
     targets = random_targets(rng, 2000)
-    rig, tunnel = reference_rig(), reference_tunnel()
+    rig, tunnel = RIG, TUNNEL
     _, cost, active, status = run(optimal_inverse(rig, tunnel, limits=False), targets, np.zeros(2000))
     best = np.min([index_by_geometry(rig, tunnel, targets, roll) for roll in np.linspace(-np.pi, np.pi, 720)], axis=0)
     assert (cost[status == 0] <= best[status == 0] + 1e-12).all()
@@ -158,7 +160,7 @@ def test_equal_weights_have_the_closed_form_of_one_harmonic() -> None:
 
 
 def test_roll_is_given_in_the_turn_of_the_previous_one() -> None:
-    function = optimal_inverse(reference_rig(), reference_tunnel())
+    function = optimal_inverse(RIG, TUNNEL)
     target = np.array([100, 6, 0, 0, 0]) * [INCH, INCH, INCH, 1, 1]
     for turns in (-3, 0, 2):
         assert float(function(target, 0.3 + 2 * np.pi * turns)[0][5]) == pytest.approx(np.pi / 2 + 2 * np.pi * turns)
@@ -177,7 +179,7 @@ def test_compiled_like_use_needs_no_iteration_count() -> None:
 @given(seeds, st.sampled_from(BRANCHES), st.booleans())
 def test_arcs_are_the_rolls_that_reach(seed: int, branch: Branch, limited: bool) -> None:
     rng = np.random.default_rng(seed)
-    rig = reference_rig(**(LIMITS if limited else {}))
+    rig = LIMITED if limited else RIG
     target = random_targets(rng, 1)
     arcs = reachable_arcs(rig, target[:, 0], branch)
     rolls = rng.uniform(-np.pi, np.pi, 300)
@@ -193,7 +195,7 @@ def test_arcs_are_the_rolls_that_reach(seed: int, branch: Branch, limited: bool)
 
 
 def test_ends_of_an_arc_sit_on_the_constraint_they_name() -> None:
-    rig = reference_rig()
+    rig = RIG
     targets = random_targets(np.random.default_rng(11), 60)
     pairs = [(target, arc) for target in targets.T for arc in reachable_arcs(rig, target) if arc.holds[0] != "free"]
     assert len(pairs) > 10
@@ -246,7 +248,7 @@ def test_the_best_of_several_branches_is_taken() -> None:
 
 
 def test_a_sequence_passes_its_rolls_on() -> None:
-    rig, tunnel, rows = reference_rig(), reference_tunnel(), sweep()
+    rig, tunnel, rows = RIG, TUNNEL, sweep()
     rows[4] = np.nan
     table = solve_table(rig, tunnel, rows, previous=0.1, in_sequence=True, rate_weight=5.0)
     function, roll = optimal_inverse(rig, tunnel, rate_weight=5.0), 0.1
@@ -256,7 +258,7 @@ def test_a_sequence_passes_its_rolls_on() -> None:
 
 
 def table_of(targets: Any, **options: Any) -> Table:
-    return solve_table(reference_rig(), reference_tunnel(), targets, **options)
+    return solve_table(RIG, TUNNEL, targets, **options)
 
 
 @pytest.mark.parametrize(

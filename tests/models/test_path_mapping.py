@@ -107,15 +107,42 @@ def test_the_drift_shrinks_by_the_order_of_the_quadrature(kind: str) -> None:
         distances = 0.37 * blend.length * np.arange(1, steps + 1) / steps
         return abs(errors(mapping, blend, distances, 1.0)[0])
 
-    for mapping, order, steps in ((predictor_corrector(degree, 30), 2, 40), (gauss_newton(degree, 5), 6, 10)):
+    for mapping, order, steps in ((predictor_corrector(degree, 30), 2, 40), (gauss_newton(degree, (3,) * 5), 6, 10)):
         assert np.log2(drift(mapping, steps) / drift(mapping, 2 * steps)) == pytest.approx(order, abs=0.5)
 
 
-def test_more_nodes_and_corrections_follow_coarse_steps_too() -> None:
+@pytest.mark.parametrize("kind", ["cubic", "quintic"])
+@pytest.mark.parametrize("period", [1e-3, 2e-3, 4e-3])
+@pytest.mark.parametrize("remaining", [5, 10, 20, 50, 150])
+def test_the_default_mapping_is_exact_for_every_size_and_period(kind: str, period: float, remaining: float) -> None:
+    """Up to two samples in a blend of 9 mm, wherever they lie."""
+    blend, mapping = right_angle(remaining * MM, kind), gauss_newton(3 if kind == "cubic" else 5)
+    for first in (0.2, 0.6, 1.0):
+        distances = np.arange(first * period, blend.length, period)
+        drift, true, _ = errors(mapping, blend, distances, period)
+        assert abs(drift) < (1e-4 if remaining < 150 else 1e-9)
+        assert abs(true) < (1e-6 if period < 4e-3 or remaining > 10 else 1e-3)
+
+
+def test_few_nodes_are_not_enough_for_coarse_steps() -> None:
     blend = right_angle(5 * MM)
     distances = np.arange(1, 5) * 2e-3
-    coarse, fine = (abs(errors(m, blend, distances, 2e-3)[0]) for m in (gauss_newton(), gauss_newton(3, 5, 7)))
-    assert fine < 1e-5 < coarse
+    coarse, fine = (abs(errors(m, blend, distances, 2e-3)[0]) for m in (gauss_newton(3, (3, 3)), gauss_newton(3)))
+    assert fine < 1e-7 < 1e-3 < coarse
+
+
+@pytest.mark.parametrize("wrong", [[0.2, 0.1], [np.nan], [[0.1]], [-0.1, 0.2]])
+def test_distances_that_are_no_march_are_a_named_error(wrong: Any) -> None:
+    blend = right_angle(0.1)
+    assert march(gauss_newton(), blend.coefficients, []).shape == (0,)
+    with pytest.raises(ModelError, match="increase from 0"):
+        march(gauss_newton(), blend.coefficients, wrong)
+
+
+@pytest.mark.parametrize("nodes", [(), (0,), (2, 2.5)])
+def test_quadratures_that_are_none_are_a_named_error(nodes: Any) -> None:
+    with pytest.raises(ModelError, match="nodes"):
+        gauss_newton(3, nodes)
 
 
 def test_the_mapping_of_a_quintic_reaches_the_distances_of_the_exact_inverse() -> None:

@@ -306,3 +306,21 @@ def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
         planar_chain((0.44, 0.44), (6.02, -14.0))
     with pytest.raises(ModelError, match=r"'counterweight'.*-1"):
         Link("counterweight", -1.0)
+
+
+def test_a_support_that_is_none_and_wrenches_that_are_no_list_are_refused() -> None:
+    machine, rest = paper_example(), np.zeros(5)
+    wide: Any = "wide"
+    with pytest.raises(ModelError, match=r"support must be a Support, .* not 'wide'"):
+        replace(machine, support=wide)
+    alone: Any = machine.tip_wrench((0, 0, 1))
+    for call in (machine.zero_moment_point, machine.joint_torques, machine.ground_reaction):
+        with pytest.raises(ModelError, match="wrenches must be a list"):
+            call(rest, rest, rest, alone)
+
+
+@pytest.mark.parametrize("times", [[], ["soon"], [np.nan]])
+def test_a_motion_of_no_times_is_refused(times: Any) -> None:
+    rest = np.zeros((len(times), 5))
+    with pytest.raises(ModelError, match="motion: "):
+        standing_motion(paper_example(), times, rest, rest, rest)

@@ -78,6 +78,7 @@ def test_the_margin_is_symbolic_too() -> None:
         ([(0, 0), (1, 1)], "at least three points"),
         ([(0, 0, 0), (1, 1, 0), (1, 0, 0)], "has shape"),
         ("square", "at least three points"),
+        ([(0, 0), (1, 0), (0, 1), "corner"], "at least three points"),
         ([(0, 0), (1, 0), (1, 0), (1, 1)], r"corner \[1.0, 0.0\] occurs twice"),
         ([(0, 0), (1, 0), (np.nan, 1)], "not finite"),
         ([(np.cos(4 * np.pi * k / 5), np.sin(4 * np.pi * k / 5)) for k in range(5)], "crosses itself"),

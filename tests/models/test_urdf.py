@@ -10,7 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import FreeFloating, ModelError, Robot, center_of_mass, link_frames, robot_inertia
+from models import (
+    FreeFloating,
+    Joint,
+    Link,
+    ModelError,
+    Robot,
+    Standing,
+    center_of_mass,
+    link_frames,
+    rectangle,
+    robot_inertia,
+)
 from models.urdf import read_urdf
 from tests.models.pinocchio_robots import Peer, random_state, urdf_file
 from tests.models.trees import few, numeric, numeric_poses, random_robot, seeds
@@ -323,7 +334,38 @@ def test_a_configuration_of_a_wrong_length_names_the_joints() -> None:
 def test_a_robot_without_inertials_does_not_float() -> None:
     robot = Robot.from_urdf(chain().replace(BODY, ""))
     assert robot.total_mass == 0
-    with pytest.raises(ModelError, match="no mass"):
+    message = "no mass.*in URDF none has an <inertial>"
+    with pytest.raises(ModelError, match=message):
         FreeFloating(robot)
-    with pytest.raises(ModelError, match="no mass"):
+    with pytest.raises(ModelError, match=message):
         center_of_mass(robot, np.zeros(3))
+    with pytest.raises(ModelError, match=message):
+        Standing(robot, support=rectangle((-1.0, 1.0), (-1.0, 1.0)))
+
+
+def test_a_robot_of_point_masses_does_not_float_and_the_bare_links_are_named() -> None:
+    point = '<inertial><mass value="2"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
+    joint = f'<joint name="j" type="continuous">{ENDS}</joint>'
+    with pytest.raises(ModelError, match=r"links \['b'\] have no mass: in URDF, no <inertial>"):
+        FreeFloating(Robot.from_urdf(text(joint).replace(BODY, point)))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e5])
+def test_whether_a_robot_floats_does_not_depend_on_its_size(size: float) -> None:
+    """Similar robots of one mass move alike: the same turning, all ways in proportion."""
+    rates = np.array([0.3, -0.5, 0.4])
+    turning = []
+    for scale in (1.0, size):
+        links = tuple(Link(f"l{i}", 1.0, (0.4 * scale, 0, 0), np.diag([1, 2, 2.5]) * scale**2) for i in range(4))
+        joints = tuple(
+            Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", (scale, 0, 0), axis=axis)
+            for i, axis in enumerate(((0, 0, 1), (0, 1, 0), (1, 0, 1)))
+        )
+        machine = FreeFloating(Robot(links, joints))
+        turning.append(numeric(machine.base_twist(machine.base_home(), (0.2, 0.3, 0.4), rates))[:3])
+    np.testing.assert_allclose(turning[1], turning[0], rtol=1e-9)
+
+
+def test_a_configuration_of_words_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"q 'home' is not numeric; \(3, 1\) expected"):
+        link_frames(Robot.from_urdf(chain()), "home")

@@ -13,6 +13,7 @@ from models.cts import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
 from models.cts_optimal import optimal_inverse
 from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.cts import roll_plan, spline_targets
+from ocp.builders.cts_guess import least_course
 from tests.models.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
@@ -64,20 +65,48 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
     assert found.cost < 0.95 * greedy
 
 
-def test_clearance_is_kept_where_the_free_plan_would_not() -> None:
-    around = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))
+def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
+    around = Surroundings(solids=(Box(INCH * np.array([80.0, -4.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))
     q = ca.SX.sym("q", 6)
     gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
+    t = np.linspace(0, HORIZON, 101)
+    free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(t), np.zeros((1, 101)))[0]
+    assert np.array(gaps.map(101)(free)).min() < -0.02  # in its midst
+    problem = roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, clearance=0.01)
+    found = solve(problem, SMOOTH)
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    joints = ca.Function("j", [x, phi], [inverse(RIG, x, phi, HOME)[0]]).map(len(found.t))
+    rows = joints(targets_at(found.t), found["roll"].T)
+    assert np.array(gaps.map(len(found.t))(rows)).min() >= 0.01 - 1e-6
+    assert found.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
 
-    def least(found: Solution) -> float:
-        x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
-        joints = ca.Function("j", [x, phi], [inverse(RIG, x, phi, HOME)[0]])
-        rows = joints.map(len(found.t))(targets_at(found.t), found["roll"].T)
-        return float(np.min(np.array(gaps.map(len(found.t))(rows))))
 
-    free = least(plan())
-    kept = plan(surroundings=around, clearance=free + 0.01)
-    assert least(kept) >= free + 0.01 - 1e-6
+def course(cost: Any, t: Any, **options: Any) -> Any:
+    known = {"lower": -np.inf, "upper": np.inf, "start": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
+    return least_course(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
+
+
+def test_a_course_winds_as_often_as_it_pays() -> None:
+    t = np.linspace(0, 1, 65)
+    for turns in (-3, 2):
+        rolls = course(lambda at, roll: -np.cos(roll - 2 * np.pi * turns * at), t)  # noqa: B023
+        np.testing.assert_allclose(rolls[8:-8], 2 * np.pi * turns * t[8:-8], atol=0.02)  # ends are free to lag
+
+
+def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must() -> None:
+    t = np.linspace(0, 10, 65)
+
+    def cost(at: Any, roll: Any) -> Any:
+        gap = (np.abs(roll - 1.5) < 0.3) | (np.abs(roll + 2.5) < 0.3)
+        return 0.1 * roll**2 + np.where((np.abs(at - 5) < 1) & ~gap, 1e3, 0.0)
+
+    rolls = course(cost, t, start=-0.4, rate_limit=2.0, rate_weight=0.01)
+    assert rolls[0] == -0.4
+    assert (np.abs(rolls[np.abs(t - 5) < 1] - 1.5) < 0.3).all()
+    assert np.abs(np.diff(rolls)).max() <= 2.0 * (t[1] - t[0]) + 1e-9
+    held = course(cost, t, start=-0.4, rate_weight=0.01, lower=-3.0, upper=1.0)
+    assert (np.abs(held[np.abs(t - 5) < 1] + 2.5) < 0.3).all()
+    assert course(cost, t, lower=100.0, upper=106.0).min() >= 100.0
 
 
 def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
@@ -102,13 +131,25 @@ def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
             roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, **options)  # type: ignore[arg-type]
 
 
+def joints_along(rig: Rig, found: Solution) -> Any:
+    """Joints between the nodes too, shape (6, samples)."""
+    t = np.linspace(0, HORIZON, 401)
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]]).map(len(t))
+    return np.array(joints(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1)))
+
+
 def test_joint_limits_hold_along_the_plan() -> None:
+    rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 3, 0.175, 3, 9))
+    assert joints_along(rig, plan(rig))[3].max() == pytest.approx(0.175, abs=1e-4)
+
+
+def test_a_roll_that_a_joint_limit_forbids_all_the_way_is_gone_round() -> None:
+    """Joint 3 forbids roll pi / 2 at every target: near the best roll of each by itself there is no way across."""
     rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 0.3, 3, 3, 9))
     found = plan(rig)
-    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
-    joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]])
-    q = np.array(joints.map(len(found.t))(targets_at(found.t), found["roll"].T))
-    assert q[2].max() == pytest.approx(0.3, abs=1e-5)
+    assert joints_along(rig, found)[2].max() <= 0.3 + 1e-5
+    assert found["roll"][-1, 0] < -3.0
 
 
 def test_a_table_of_targets_is_followed_through_its_spline() -> None:
@@ -121,6 +162,8 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
 def test_what_cannot_be_planned_is_named() -> None:
     with pytest.raises(ProblemError, match="no roll reaches the target at 0 s"):
         roll_plan(RIG, TUNNEL, lambda time: [9.0, 9.0, 9.0, 0.0, 0.0], HORIZON, symbols=ca.SX)
+    with pytest.raises(ProblemError, match="start_roll nan"):
+        roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, start_roll=np.nan)
     with pytest.raises(ProblemError, match="horizon"):
         roll_plan(RIG, TUNNEL, falling, 0.0)
     with pytest.raises(ProblemError, match="rate_limit"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from models import ModelError
 from models.machine import jacobian_manipulability
 from models.motion import momentum
 from models.posture import joint_limit_index
@@ -392,6 +393,10 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
         ({"step": 0.0}, "step must be a positive number"),
         ({"speed_limit": -1.0}, "speed_limit must be a positive number"),
         ({"null_damping": -1.0}, "null_damping must be"),
+        ({"step": "short"}, "step must be a positive number"),
+        ({"layers": ("limits",)}, "layers must be a list of Layer"),
+        ({"law": "stabilised", "stabiliser": 3}, "stabiliser must be"),
+        ({"zmp": lambda t: t, "law": "augmented"}, "zmp must be two numbers"),
         ({"rows": (0, 4)}, r"gives positions, rows 3, 4, 5; leave out \[0\]"),
         ({"start_velocities": (1.0,)}, "start_velocities must be 5 numbers"),
         ({"zmp": (0.0,)}, "zmp must be two numbers"),
@@ -416,9 +421,34 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
         (lambda: Layer("joint_limits", 1.0, "soft"), "unknown form 'soft'"),  # type: ignore[arg-type]
         (lambda: Layer("joint_limits", np.nan), "demand must be a number"),
         (lambda: Stabiliser((4.0, 4.0, -1.0)), "three positive numbers"),
+        (lambda: Stabiliser("fast"), "three positive numbers"),  # type: ignore[arg-type]
         (lambda: Stabiliser(damping=-1.0), "damping must not be negative"),
     ],
 )
 def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("external", "message"),
+    [
+        (3, "external must be a function"),
+        (lambda time, tip: None, "wrenches must be a list"),
+        (lambda time, tip: machine().tip_wrench((0, 0, 1)), "wrenches must be a list"),
+    ],
+)
+def test_what_gives_no_wrenches_is_refused(external: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], 1.0, external=external)
+
+
+def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
+    def push(time: Any, tip: Any) -> Any:
+        return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
+
+    found = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], 0.3, external=push, step=0.01)
+    assert found.stopped is not None
+    assert found.stopped.reason == "breakdown"
+    assert found.stopped.time == pytest.approx(0.11)
+    assert np.isfinite(found.motion.ground_force).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from models import ModelError
 from models.paths import Path, SmoothPath, smooth
 from ocp import ProblemError
 from ocp.schedule import JointLimits, Limits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
@@ -222,3 +224,26 @@ def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
             plan.sample(period)
     with pytest.raises(ValueError, match="2 segments"):
         schedule(smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1), Limits([1, 2, 3], 5.0, 200.0))
+
+
+@pytest.mark.parametrize("wrong", ["x", None, {}, 1j, [[0.1]]])
+def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
+    path = smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1)
+    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    calls: tuple[Callable[[Any], Any], ...] = (
+        plan.sample,
+        lambda value: schedule(path, value),
+        lambda value: schedule(value, Limits(1.0, 5.0, 200.0)),
+        lambda value: peak_acceleration(value, 1.0, 200.0),
+    )
+    for call in calls:
+        with pytest.raises(ProblemError):
+            call(wrong)
+    if wrong is not None:  # numpy reads it as nan, refused elsewhere
+        for call in (plan.at, plan.time_at):
+            with pytest.raises(ProblemError, match=r"not numeric|shape"):
+                call(wrong)
+        with pytest.raises(ModelError):
+            path.at(wrong)
+        with pytest.raises(ModelError):
+            path.blend(wrong)

@@ -6,6 +6,7 @@ import copy
 import json
 from dataclasses import replace
 from pathlib import Path as File
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -138,6 +139,68 @@ def test_what_cannot_be_scheduled_is_a_named_error() -> None:
     cubic = scara_along(ARM, smooth(bent, 0.05, kind="cubic"))
     with pytest.raises(ProblemError, match=r"curvature jumps.*quintic"):
         schedule(cubic.path, limits, joints=cubic)
+
+
+class BrokenJoints:
+    """Two joints that turn evenly, but for one wrong thing."""
+
+    names = ("a", "b")
+
+    def __init__(self, kind: str, value: Any) -> None:
+        self.kind, self.value = kind, value
+
+    def at(self, distance: Any) -> Any:
+        rates = {kind: np.full((len(distance), 2), 0.1) for kind in ("position", "first", "second", "third")}
+        if np.isscalar(self.value):
+            rates[self.kind][distance > 0.5, 1] = self.value
+        else:
+            rates[self.kind] = self.value
+        return SimpleNamespace(**rates)
+
+
+@pytest.mark.parametrize("kind", ["position", "first", "second", "third"])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, "joint 'b' is nan, not finite, at 0.5"),
+        (-np.inf, "joint 'b' is -inf, not finite, at 0.5"),
+        (np.zeros(3), "shape"),
+        ([["x", "y"]], "not numeric"),
+    ],
+)
+def test_joints_that_are_no_numbers_are_a_named_error(kind: str, value: Any, message: str) -> None:
+    path, joints = example("quintic"), BrokenJoints(kind, value)
+    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    with pytest.raises(ProblemError, match=message):
+        schedule(path, Limits(1.0, 5.0, 200.0, joints=JointLimits(1.0)), joints=joints)
+    with pytest.raises(ProblemError, match=message):
+        joint_trajectory(plan, joints, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("joints", "cause"),
+    [
+        (JointLimits(jerk=[1e6, 1e6, 1e6, 300.0]), "joint 'wrist' jerk"),
+        (JointLimits(acceleration=[99.0, 99.0, 99.0, 12.0]), "joint 'wrist' acceleration"),
+    ],
+)
+def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: str) -> None:
+    """The wrist makes up for a fast shoulder at the start: the rest is as without joint limits."""
+    end = [np.cos(0.5), 0.0, 0.0, np.sin(0.5)]
+    lines = (Line((0.5, -0.4, 0), (0.5, 0.4, 0)), Line((0.5, 0.4, 0), (0.1, 0.4, 0), None, end))
+    arm = scara_along(ARM, smooth(Path(lines), 0.05))
+    limits = Limits(0.5, 5.0, 200.0)
+    free, plan = schedule(arm.path, limits), schedule(arm.path, replace(limits, joints=joints), joints=arm)
+    assert [dip.cause for dip in plan.dips] == [cause]
+    assert plan.dips[0].start == 0
+    assert plan.dips[0].end < 0.1
+    assert min(plan.dips[0].jerk / 200, plan.dips[0].acceleration / 5) < 0.99
+    assert "binds on a ramp" in str(plan.dips[0])
+    assert 0.9 < largest(plan, arm).max() <= 1.001
+    before_end = np.linspace(0, plan.duration - plan.time_at(0.1)[0], 1000)
+    mine, other = plan.at(plan.duration - before_end), free.at(free.duration - before_end)
+    for kind in ("distance", "speed", "acceleration"):
+        assert getattr(mine, kind) == pytest.approx(getattr(other, kind), abs=1e-9)
 
 
 @pytest.fixture(scope="module")

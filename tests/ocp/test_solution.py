@@ -141,6 +141,14 @@ def test_unknown_names_are_named(ask: Callable[[Solution], Any], message: str) -
         ask(plan("radau"))
 
 
+def test_a_name_may_be_asked_for_with_a_default() -> None:
+    sample = plan("radau").at(0.1)
+    assert "base" not in sample
+    assert sample.get("base") is None
+    assert sample.get("base", 3.0) == 3.0
+    np.testing.assert_array_equal(sample.get("x"), sample["x"])
+
+
 def test_a_solution_cannot_be_changed_by_accident() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         plan("radau").cost = 0.0  # type: ignore[misc]

@@ -531,10 +531,13 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
-        ({"zmp": InFoot(np.nan)}, "margin nan m leaves no room"),
+        ({"limits": Limits(velocity="fast")}, "velocity must be positive, one number or 5, not 'fast'"),
+        ({"limits": 3}, "Standing machine, Weights and Limits, not Standing, Weights, int"),
+        ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
+        ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
         ({"end_joints": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),
         ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
-        ({"zmp": Following(lambda t: [t])}, "Following: the reference gives"),
+        ({"zmp": Following(lambda t: [t])}, "Following: the reference must be two numbers"),
         ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity must be positive, one number or 5"),
         ({"horizon": 1.0}, "tip_path moves at .* 1 s, where the joints are to be at rest"),
     ],
@@ -570,6 +573,11 @@ def test_a_path_longer_than_the_arm_is_refused() -> None:
     [
         (lambda: IndexAtLeast(1.0), "value must be below 1"),
         (lambda: Weights(velocity=-1.0), "weights: velocity"),
+        (lambda: Weights(time="long"), "weights: time"),  # type: ignore[arg-type]
+        (lambda: InFoot(np.nan), "InFoot: margin must be a finite number"),
+        (lambda: IndexAtLeast(None), "value must be below 1"),  # type: ignore[arg-type]
+        (lambda: FreeTime(np.nan, 1.0, 1.0), "lower <= guess <= upper"),
+        (lambda: Limits(friction="ice"), "friction must be positive"),  # type: ignore[arg-type]
         (lambda: Limits(vertical_force=0.0), "vertical_force must be positive"),
         (lambda: Limits(friction=0.0), "friction must be positive"),
         (lambda: FreeTime(1.0, 0.5, 0.7), "lower <= guess <= upper"),

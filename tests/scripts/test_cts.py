@@ -107,10 +107,14 @@ def test_all_files_are_written(folder: Path) -> None:
             assert list(csv.DictReader(stream))
 
 
-def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def functions() -> dict[str, Any]:
+    return rig_functions(reference_rig(), reference_tunnel())
+
+
+def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path, functions: dict[str, Any]) -> None:
     example = tmp_path / "example"
     shutil.copytree(ROOT / "examples" / "c_export", example, ignore=shutil.ignore_patterns("build"))
-    functions = rig_functions(reference_rig(), reference_tunnel())
     export(functions, example / "build" / "cts_inverse.c")
     subprocess.run(["make", f"PYTHON={sys.executable}"], cwd=example, check=True, capture_output=True, text=True)
     targets = random_targets(np.random.default_rng(9), 500)
@@ -127,8 +131,8 @@ def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path) ->
     assert {0, 1, 2, 3} <= set(found[:, 0].astype(int))
 
 
-def test_export_refuses_what_is_no_c_file(tmp_path: Path) -> None:
+def test_export_refuses_what_is_no_c_file(tmp_path: Path, functions: dict[str, Any]) -> None:
     with pytest.raises(ModelError, match=r"must end in \.c"):
-        export(rig_functions(reference_rig(), reference_tunnel()), tmp_path / "rig.cpp")
+        export(functions, tmp_path / "rig.cpp")
     with pytest.raises(ModelError, match="no function"):
         export([], tmp_path / "rig.c")

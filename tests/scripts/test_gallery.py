@@ -1,0 +1,255 @@
+"""The gallery's plans: audited, on their paths by another library's kinematics, cheaper than the pseudo-inverse."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio
+import pytest
+from PIL import Image
+
+from models.parts import Array
+from ocp import Solution, SolveError
+from scripts import gallery, gallery_panda, gallery_robots, gallery_ur5
+from scripts.gallery_drawing import Scene, animate
+from scripts.gallery_frames import TIP, Frames, frames_along
+from scripts.gallery_results import turning_angle
+from scripts.view_plan import play
+
+pytestmark = pytest.mark.xdist_group("gallery")
+
+NAMES = ["space_arm", "panda", "ur5", "mobile_manipulator"]
+LOCAL = ["space_arm", "panda", "ur5"]
+"""Those that are compared with the pseudo-inverse by cost."""
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """What a run of coarse meshes wrote."""
+
+    folder: Path
+    rows: dict[str, Any]
+    failed: dict[str, str]
+
+    def plan(self, name: str) -> Solution:
+        return Solution.load(self.folder / f"{name}.npz")
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory: pytest.TempPathFactory) -> Gallery:
+    folder = tmp_path_factory.mktemp("gallery")
+    rows, failed = gallery.run(NAMES, folder, coarse=True)
+    return Gallery(folder, rows, failed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_plan_passes_its_audit(coarse: Gallery, name: str) -> None:
+    assert not coarse.failed
+    assert coarse.rows[name]["audit_passed"]
+    assert "passed" in (coarse.folder / f"{name}.audit.txt").read_text(encoding="utf-8").splitlines()[0]
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_every_plan_keeps_its_tip_on_the_path_and_beats_the_pseudo_inverse(coarse: Gallery, name: str) -> None:
+    row = coarse.rows[name]
+    assert row["tip_error"] <= 1e-6
+    assert row["cost_optimal"] < row["cost_local"]
+
+
+def test_the_momentum_of_the_space_arm_stays_zero_and_its_base_turns_less(coarse: Gallery) -> None:
+    row = coarse.rows["space_arm"]
+    assert row["momentum_drift_relative"] <= 1e-9
+    assert 0 < row["base_turn_optimal_deg"] < row["base_turn_local_deg"]
+
+
+def test_the_cyclic_plan_returns_within_the_limits_where_the_pseudo_inverse_drifts(coarse: Gallery) -> None:
+    row, plan = coarse.rows["panda"], coarse.plan("panda")
+    robot = gallery_robots.PANDA.read()
+    assert np.abs(plan["joints"][-1] - plan["joints"][0]).max() <= 1e-8
+    assert row["joint_return_rad"] <= 1e-8
+    assert ((plan["joints"] >= robot.lower) & (plan["joints"] <= robot.upper)).all()
+    drift = np.array(row["drift_by_lap_local_rad"])
+    assert (np.diff(drift) > 0.1).all()
+
+
+def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Gallery) -> None:
+    row = coarse.rows["mobile_manipulator"]
+    assert row["zmp_margin_local_m"] < 0 < row["zmp_margin_optimal_m"]
+    assert row["tip_error"] < 1e-3  # the hand's path is a constraint on accelerations there
+
+
+def placed(file: gallery_robots.RobotFile, joints: Array, frame: str) -> tuple[Array, Array]:
+    """Rotations and positions of a frame by Pinocchio; joints that the plan does not move stand at zero."""
+    model = pinocchio.buildModelFromUrdf(str(file.path))
+    data, robot = model.createData(), file.read()
+    found = []
+    for row in joints:
+        q = pinocchio.neutral(model)
+        for name, value in zip(robot.joint_names, row, strict=True):
+            q[model.joints[model.getJointId(name)].idx_q] = value
+        pinocchio.framesForwardKinematics(model, data, q)
+        pose = data.oMf[model.getFrameId(frame)]
+        found.append((pose.rotation.copy(), pose.translation.copy()))
+    return np.array([turn for turn, _ in found]), np.array([place for _, place in found])
+
+
+def test_the_panda_goes_round_its_circle_by_another_librarys_kinematics(coarse: Gallery) -> None:
+    plan = coarse.plan("panda")
+    t = np.linspace(0.0, plan.horizon, 61)
+    turn, place = placed(gallery_robots.PANDA, plan.at(t)["joints"], "panda_hand_tcp")
+    angle = 2 * np.pi * t / gallery_panda.LAP
+    x, y, z = gallery_panda.CENTER
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    np.testing.assert_allclose(place, [x, y, z] + gallery_panda.RADIUS * ring, atol=1e-6)
+    lean = (gallery_panda.TILT * ring - [0, 0, 1]) / np.hypot(1, gallery_panda.TILT)
+    np.testing.assert_allclose(turn[:, :, 2], lean, atol=1e-6)
+
+
+def test_the_tool_of_the_ur5_stands_on_the_panel_by_another_librarys_kinematics(coarse: Gallery) -> None:
+    plan = coarse.plan("ur5")
+    turn, place = placed(gallery_robots.UR5, plan.at(np.linspace(0.0, plan.horizon, 61))["joints"], "tool0")
+    options = gallery_robots.UR5.options
+    tip = place + turn @ np.array(options["tip_translation"])
+    axis = turn @ np.array(options["tip_rotation"])[:, 2]
+    center = np.stack([tip[:, 0], 0 * tip[:, 1], 0 * tip[:, 2] + gallery_ur5.CENTER[1] - gallery_ur5.CURVE], axis=1)
+    out = tip - center
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), gallery_ur5.CURVE, atol=1e-6)
+    np.testing.assert_allclose(axis, -out / gallery_ur5.CURVE, atol=1e-6)
+    # the whole field: every lane from edge to edge
+    half = gallery_ur5.LENGTH / 2
+    np.testing.assert_allclose([tip[:, 1].min(), tip[:, 1].max()], [-half, half], atol=0.02)
+    np.testing.assert_allclose(tip[-1, 0] - tip[0, 0], gallery_ur5.WIDTH, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_plan_can_be_played_from_its_file_alone(coarse: Gallery, name: str) -> None:
+    played = play(coarse.folder / f"{name}.npz")
+    frames = played.frames(np.linspace(0.0, played.horizon, 5))
+    assert np.isfinite(frames.tip).all()
+    assert len(frames.positions) == len(played.robot.links) + 1
+    assert (coarse.folder / f"{name}.npz").stat().st_size < 400_000
+    with Image.open(coarse.folder / f"{name}.png") as picture:
+        assert min(picture.size) > 500
+
+
+def test_the_summary_holds_every_example(coarse: Gallery) -> None:
+    summary = json.loads((coarse.folder / "summary.json").read_text(encoding="utf-8"))
+    assert list(summary) == NAMES
+    assert not any("seconds" in key and key != "duration_s" for row in summary.values() for key in row)
+    assert not list(coarse.folder.glob(".*"))
+
+
+def test_roll_is_the_angle_about_the_tools_own_axis() -> None:
+    robot = gallery_robots.UR5.read()
+    pose = frames_along(robot, np.tile([0.3, -1.4, 1.6, -1.5, -1.2, 0.4], (2, 1)))
+    angle = 0.7
+    cosine, sine = np.cos(angle), np.sin(angle)
+    about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    turned = pose.rotations[TIP].copy()
+    turned[1] = turned[1] @ about_z
+    found = gallery_ur5.roll(Frames({TIP: turned}, {}))
+    assert found[1] - found[0] == pytest.approx(angle)
+
+
+def test_the_turn_of_a_base_is_its_angle_whatever_the_sign_of_its_quaternion() -> None:
+    half = np.deg2rad(25.0)
+    quaternion = np.array([np.cos(half), 0.0, np.sin(half), 0.0])
+    poses = np.concatenate([np.zeros((2, 3)), [quaternion, -quaternion]], axis=1)
+    np.testing.assert_allclose(np.degrees(turning_angle(poses)), 50.0)
+
+
+def test_an_animation_moves_from_its_first_picture_to_its_last(tmp_path: Path) -> None:
+    robot = gallery_robots.SPACE_ARM.read()
+    joints = np.linspace(0.0, 1.0, 11)[:, None] * np.ones(7)
+    base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (11, 1))
+    scene = Scene("turn", robot, frames_along(robot, joints, base), np.linspace(0, 1, 11), "blue", (robot.root,))
+    assert scene.edges(0).shape == (12, 2, 3)
+    animate(tmp_path / "turn.gif", [scene], frames=4, seconds=0.1, note="note")
+    with Image.open(tmp_path / "turn.gif") as film:
+        assert film.n_frames == 4  # type: ignore[attr-defined]
+        first = np.asarray(film.convert("RGB")).copy()
+        film.seek(3)
+        assert np.any(np.asarray(film.convert("RGB")) != first)
+
+
+def test_without_the_robots_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def absent(name: str) -> Any:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(gallery_robots, "distribution", absent)
+    assert gallery.main(["--out", str(tmp_path), "--only", "space_arm", "panda"]) == 1
+    assert "pip install spartpy example-robot-data" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interruption_ends_it_with_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(coarse: bool = False) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gallery_panda, "plan", interrupted)
+    assert gallery.main(["--out", str(tmp_path), "--only", "panda"]) == 130
+    assert "stopped" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def test_an_interruption_that_a_solver_keeps_to_itself_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def keeps(coarse: bool = False) -> Any:
+        before = signal.signal(signal.SIGINT, lambda *_: None)  # as ocp does while IPOPT runs
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.signal(signal.SIGINT, before)
+        raise SolveError("interrupted")
+
+    monkeypatch.setattr(gallery_panda, "plan", keeps)
+    assert gallery.main(["--out", str(tmp_path), "--only", "panda", "ur5"]) == 130
+    assert "stopped" in capsys.readouterr().err
+
+
+def test_what_fails_is_told_and_does_not_stop_the_rest(
+    coarse: Gallery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(coarse: bool = False) -> Any:
+        raise SolveError("no way round")
+
+    monkeypatch.setattr(gallery_panda, "plan", fails)
+    monkeypatch.setattr(gallery_ur5, "plan", fails)
+    folder = tmp_path / "gallery"
+    folder.mkdir()
+    (folder / "summary.json").write_text(json.dumps({"space_arm": {"dof": 7}, "gone": {}}), encoding="utf-8")
+    assert gallery.main(["--out", str(tmp_path), "--only", "panda", "ur5"]) == 1
+    shown = capsys.readouterr().err
+    assert "panda: no way round" in shown
+    assert "ur5: no way round" in shown
+
+
+def test_the_script_runs_as_a_file_and_knows_its_examples() -> None:
+    script = Path(gallery.__file__)
+    done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert all(name in done.stdout for name in NAMES)
+
+
+def test_the_raster_starts_and_ends_at_rest() -> None:
+    time = ca.SX.sym("time")
+    track = gallery_ur5.raster().position
+    assert track is not None
+    position = track(time)
+    speed = ca.Function("speed", [time], [ca.jacobian(position, time)])
+    for end in (0.0, gallery_ur5.DURATION):
+        np.testing.assert_allclose(np.array(speed(end)), 0.0, atol=1e-12)
