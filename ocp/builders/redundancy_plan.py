@@ -78,6 +78,8 @@ def plan_minimum_velocity(
                 reasons.append(f"{name}: {error}")
                 break
             if not solution.success:
+                if "User_Requested_Stop" in solution.status:
+                    raise SolveError(f"interrupted in the solve with {name}", solution)
                 last = solution
                 reasons.append(f"{name}: ipopt ended with {solution.status.split(':')[0]}")
                 break

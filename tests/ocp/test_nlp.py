@@ -274,6 +274,7 @@ import os, signal, threading, time
 import casadi as ca
 from ocp import Collocation, Problem, SolveError, prepare
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs with Ctrl-C ignored
 problem = Problem("long")
 x = problem.state("x", 2, initial=[1.0, 0.0])
 u = problem.control("u", lower=-1.0, upper=1.0)
