@@ -1,10 +1,7 @@
-"""The rig's functions by name, and their C: what a controller without Python needs."""
+"""The rig's functions by name: what a controller without Python needs, to be written as C by models.c_export."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -12,7 +9,6 @@ import casadi as ca
 from models.cts import HOME, Branch, Rig, Tunnel, forward, goose_neck_corner, inverse
 from models.cts_optimal import optimal_inverse
 from models.cts_table import arc_functions
-from models.errors import ModelError
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
@@ -33,26 +29,3 @@ def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: 
         optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight),
     ]
     return {function.name(): function for function in functions}
-
-
-def export(functions: dict[str, Any] | Iterable[Any], path: Path) -> Path:
-    """Write functions as one C file with its header, with no dependency but the C mathematics library.
-
-    Args:
-        functions: casadi Functions, or a dictionary of them.
-        path: The C file; its folder is made.
-
-    Raises:
-        ModelError: No function, or a path that does not end in .c.
-    """
-    chosen = list(functions.values()) if isinstance(functions, dict) else list(functions)
-    if not chosen:
-        raise ModelError("export: there is no function to write")
-    if path.suffix != ".c":
-        raise ModelError(f"export: {path.name!r} must end in .c")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    code = ca.CodeGenerator(path.name, {"with_header": True, "casadi_int": "long long int"})
-    for function in chosen:
-        code.add(function)
-    code.generate(os.path.join(path.parent.resolve(), ""))  # casadi joins folder and name as text
-    return path

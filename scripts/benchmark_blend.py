@@ -26,7 +26,6 @@ from ocp.builders.path_timing import minimum_time
 from ocp.schedule import Limits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.benchmark_blend_peers import GRID, peer_plans, roots
-from scripts.benchmark_cts import least
 from scripts.blend_compiled import march_compiled, place_compiled
 from scripts.blend_example import (
     ARM,
@@ -40,7 +39,7 @@ from scripts.blend_example import (
     Array,
     example,
 )
-from scripts.cts_compiled import has_compiler
+from scripts.compiled import has_compiler, least
 
 __all__ = ["plot", "random_task", "run"]
 

@@ -13,8 +13,8 @@ import numpy as np
 from models.parts import Array
 from models.paths import SmoothPath
 from models.paths.arc_length import speed
-from scripts.benchmark_cts import least
 from scripts.blend_example import SPEED
+from scripts.compiled import least
 
 __all__ = ["GRID", "peer_plans", "roots"]
 

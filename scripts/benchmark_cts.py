@@ -9,7 +9,6 @@ import argparse
 import importlib
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,8 @@ from models.cts_iterations import combined, null_space
 from models.cts_optimal import optimal_inverse
 from models.parts import Array
 from scripts import drawing
-from scripts.cts_compiled import FLAGS, compiled, has_compiler
+from scripts.compiled import FLAGS, has_compiler, least
+from scripts.cts_compiled import compiled_inverse
 from scripts.cts_results import PAPER_TIMES, sweep_targets
 
 __all__ = ["plot", "run"]
@@ -44,16 +44,6 @@ def random_reachable(count: int) -> Array:
     inside = [(low, high) for low, high in zip(LIMITS["lower"], LIMITS["upper"], strict=True)]
     joints = np.array([rng.uniform(low, high, count) for low, high in inside])
     return np.array(ca.Function("f", [q], [forward(reference_rig(), q)]).map(count)(joints))[:5].T
-
-
-def least(work: Callable[[], Any], repeats: int) -> float:
-    """Least wall time, s."""
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - began)
-    return min(times)
 
 
 def run(repeats: int = 5) -> dict[str, Any]:
@@ -82,7 +72,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
     for name, function in cases.items():
         for on, rows_in in (("sweep", targets), ("random", spread)):
             if has_compiler():
-                found = compiled(function, rows_in, np.zeros(1), repeats)
+                found = compiled_inverse(function, rows_in, np.zeros(1), repeats)
                 solved = float(np.mean(found.result[:, 8] == 0))
                 add(f"compiled, {name}", on, 1e-9 * found.nanoseconds, solved, 1e-9 * found.worst)
             many = function.map(COUNT)

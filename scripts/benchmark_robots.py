@@ -8,12 +8,8 @@ is left out.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import importlib
-import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -37,8 +33,8 @@ from models import (
 )
 from models.parts import Array
 from scripts import drawing
-from scripts.cts_compiled import FLAGS as FAST
-from scripts.cts_compiled import has_compiler
+from scripts.compiled import FLAGS as FAST
+from scripts.compiled import compiled, has_compiler, least, pointers
 
 __all__ = ["plot", "run"]
 
@@ -71,15 +67,16 @@ GOALS = {"generalized Jacobian": 1.0, "its derivative": 5.0}
 """us."""
 
 DRIVER = """
-int {name}(const double** arg, double** res, long long* iw, double* w, int mem);
+#include "kernel.h"
 int run(const double* base, const double* q, double* out, int count, int loops) {{
-  static double w[{work} + 1];
-  static long long iw[{integers} + 1];
-  const double* arg[{inputs} + 2];
-  double* res[{outputs} + 1];
-  for (int k = 0; k < loops; ++k)
-    for (int i = 0; i < count; ++i) {{
-      arg[0] = base + 7 * i; arg[1] = q + {joints} * i; res[0] = out + {size} * i;
+  static long long iw[{name}_SZ_IW + 1];
+  static double w[{name}_SZ_W + 1];
+  const double* arg[{name}_SZ_ARG + 1];
+  double* res[{name}_SZ_RES + 1];
+  int i, k;
+  for (k = 0; k < loops; ++k)
+    for (i = 0; i < count; ++i) {{
+      arg[0] = base + 7 * i; arg[1] = q + JOINTS * i; res[0] = out + SIZE * i;
       if ({name}(arg, res, iw, w, 0)) return 1;
     }}
   return 0;
@@ -95,16 +92,6 @@ def urdf_file(package: str, ending: str) -> Path | None:
         return None
     found = next((f for f in owner.files or [] if ("/" + f.as_posix()).endswith("/" + ending)), None)
     return None if found is None else Path(str(owner.locate_file(found)))
-
-
-def least(work: Callable[[], Any], repeats: int) -> float:
-    """Least wall time, s."""
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - began)
-    return min(times)
 
 
 def build(robot: Robot) -> dict[str, Any]:
@@ -148,26 +135,15 @@ def loading(repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def compiled(function: Any, base: Array, q: Array, repeats: int, flags: tuple[str, ...]) -> tuple[Array, float]:
+def compiled_at(function: Any, base: Array, q: Array, repeats: int, flags: tuple[str, ...]) -> tuple[Array, float]:
     """Compile a function of (base, q): its results at each row, column by column, and the least time of one call, s."""
-    size = function.nnz_out(0)
-    sizes = {"work": function.sz_w(), "integers": function.sz_iw(), "inputs": function.sz_arg()}
-    sizes |= {"outputs": function.sz_res(), "joints": q.shape[1], "size": size}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        generator = ca.CodeGenerator("kernel.c")
-        generator.add(function)
-        generator.generate(f"{folder}/")
-        (folder / "driver.c").write_text(DRIVER.format(name=function.name(), **sizes), encoding="utf-8")
-        library = folder / "kernel.so"
-        sources = [str(folder / "kernel.c"), str(folder / "driver.c")]
-        subprocess.run(["cc", *flags, "-fPIC", "-shared", *sources, "-o", str(library), "-lm"], check=True)
-        run = ctypes.CDLL(str(library)).run
-        out = np.empty((len(q), size))
-        given = [np.ascontiguousarray(each, dtype=float) for each in (base, q)]
-        pointers = [each.ctypes.data_as(ctypes.c_void_p) for each in (*given, out)]
-        loops = 10  # bursts of about a millisecond: on a busy machine some of many run undisturbed
-        seconds = least(lambda: run(*pointers, len(q), loops), 100 * repeats) / (loops * len(q))
+    out = np.empty((len(q), function.nnz_out(0)))
+    given = [np.ascontiguousarray(each, dtype=float) for each in (base, q)]
+    places = pointers(*given, out)
+    loops = 10  # bursts of about a millisecond: on a busy machine some of many run undisturbed
+    driver = DRIVER.replace("JOINTS", str(q.shape[1])).replace("SIZE", str(out.shape[1]))
+    with compiled(function, driver, flags) as run:
+        seconds = least(lambda: run(*places, len(q), loops), 100 * repeats) / (loops * len(q))
     return out, seconds
 
 
@@ -196,10 +172,10 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
     found = np.array(many.call(columns)[0]).reshape(6, COUNT, -1).transpose(1, 0, 2)
     if has_compiler():
         for name, flags in FLAGS.items():
-            out, seconds = compiled(value, base, q, repeats, flags)
+            out, seconds = compiled_at(value, base, q, repeats, flags)
             check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), found, name)
             add("generalized Jacobian", f"compiled, {name}", seconds, value.n_instructions())
-            _, seconds = compiled(derivative, base, q, repeats, flags)
+            _, seconds = compiled_at(derivative, base, q, repeats, flags)
             add("its derivative", f"compiled, {name}", seconds, derivative.n_instructions())
     add("generalized Jacobian", "map in CasADi", least(lambda: many.call(columns), repeats) / COUNT)
     one = [[ca.DM(base[i]), ca.DM(q[i])] for i in range(COUNT)]

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
-import subprocess
-import tempfile
-import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from models.cts_export import export
 from models.parts import Array
-from scripts.cts_compiled import FLAGS
+from scripts.compiled import compiled, least, pointers
 
 __all__ = ["march_compiled", "place_compiled"]
 
@@ -80,22 +74,14 @@ def place_compiled(function: Any, distances: Array, repeats: int = 5) -> tuple[A
 
 
 def _timed(function: Any, driver: str, first: Array, second: Array, out: Array, repeats: int) -> float:
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        export([function], folder / "kernel.c")
-        (folder / "driver.c").write_text(driver.format(name=function.name()), encoding="utf-8")
-        library = folder / "kernel.so"
-        sources = [str(folder / "kernel.c"), str(folder / "driver.c")]
-        subprocess.run(["cc", *FLAGS, "-fPIC", "-shared", *sources, "-o", str(library), "-lm"], check=True)
-        run = ctypes.CDLL(str(library)).run
-        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (first, second, out)]
-        # many short runs: the least of them is one that nothing else disturbed
-        loops = max(1, 10_000 // len(out))
-        times = []
-        for _ in range(RUNS * repeats):
-            began = time.perf_counter()
+    # many short runs: the least of them is one that nothing else disturbed
+    loops = max(1, 10_000 // len(out))
+    places = pointers(first, second, out)
+    with compiled(function, driver) as run:
+
+        def work() -> None:
             for _ in range(loops):
-                if run(*pointers, len(out)):
+                if run(*places, len(out)):
                     raise RuntimeError(f"{function.name()}: the compiled function failed")
-            times.append(time.perf_counter() - began)
-    return 1e9 * min(times) / (loops * len(out))
+
+        return 1e9 * least(work, RUNS * repeats) / (loops * len(out))

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
-import shutil
-import subprocess
-import tempfile
-import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from models.cts_export import export
 from models.parts import Array
+from scripts.compiled import FLAGS, compiled, least, pointers
 
-__all__ = ["FLAGS", "Compiled", "compiled", "has_compiler"]
-
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-semantic-interposition", "-std=gnu89")
-"""None of them lets the compiler assume numbers finite or reorder sums (no -ffast-math): nan must stay nan. The last
-two let it put the generated helpers inline: in C89 casadi writes minimum and maximum as comparisons, not as calls."""
+__all__ = ["Compiled", "compiled_inverse"]
 
 DRIVER = """
 #include "kernel.h"
@@ -55,42 +45,30 @@ class Compiled:
     worst: float
 
 
-def has_compiler() -> bool:
-    """Whether there is a C compiler named cc."""
-    return shutil.which("cc") is not None
-
-
-def compiled(
+def compiled_inverse(
     function: Any, targets: Array, previous: Array, repeats: int = 5, flags: tuple[str, ...] = FLAGS
 ) -> Compiled:
     """Compile an optimal_inverse function and run it over targets, shape (samples, 5), again and again."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        export([function], folder / "kernel.c")
-        (folder / "driver.c").write_text(DRIVER.format(name=function.name()), encoding="utf-8")
-        library = folder / "kernel.so"
-        sources = [str(folder / "kernel.c"), str(folder / "driver.c")]
-        subprocess.run(["cc", *flags, "-fPIC", "-shared", *sources, "-o", str(library), "-lm"], check=True)
-        run = ctypes.CDLL(str(library)).run
-        rows = np.ascontiguousarray(targets, dtype=float)
-        before = np.ascontiguousarray(np.broadcast_to(previous, len(rows)), dtype=float)
-        out = np.empty((len(rows), 9))
+    rows = np.ascontiguousarray(targets, dtype=float)
+    before = np.ascontiguousarray(np.broadcast_to(previous, len(rows)), dtype=float)
+    out = np.empty((len(rows), 9))
+    with compiled(function, DRIVER, flags) as run:
 
-        def least(first: int, count: int, loops: int, times: int) -> float:
-            pointers = [array[first:].ctypes.data_as(ctypes.c_void_p) for array in (rows, before, out)]
-            spans = []
-            for _ in range(times):
-                began = time.perf_counter()
+        def nanoseconds(rows: Array, before: Array, out: Array, loops: int, runs: int) -> float:
+            places = pointers(rows, before, out)
+
+            def work() -> None:
                 for _ in range(loops):
-                    run(*pointers, count)
-                spans.append(time.perf_counter() - began)
-            return 1e9 * min(spans) / (loops * count)
+                    run(*places, len(rows))
 
-        mean = least(0, len(rows), max(1, 2000 // len(rows)), 10 * repeats)  # short runs: one is undisturbed
-        run_again = [least(k, 1, 1, 20) for k in range(len(rows))]  # calls from Python: only to find the slowest
-        slowest = int(np.argmax(run_again))
-        many = np.repeat(rows[slowest : slowest + 1], 100, axis=0)
-        rows, before, out_mean = many, np.repeat(before[slowest : slowest + 1], 100), out
-        out = np.empty((100, 9))
-        worst = least(0, 100, 20, 10 * repeats)
-    return Compiled(out_mean, mean, worst)
+            return 1e9 * least(work, runs) / (loops * len(rows))
+
+        # short runs: one of many is undisturbed
+        mean = nanoseconds(rows, before, out, max(1, 2000 // len(rows)), 10 * repeats)
+        result = out.copy()
+        # calls from Python, only to find the slowest
+        alone = [nanoseconds(rows[k : k + 1], before[k : k + 1], out, 1, 20) for k in range(len(rows))]
+        slowest = int(np.argmax(alone))
+        many, roll = np.repeat(rows[slowest : slowest + 1], 100, axis=0), np.repeat(before[slowest : slowest + 1], 100)
+        worst = nanoseconds(many, roll, np.empty((100, 9)), 20, 10 * repeats)
+    return Compiled(result, mean, worst)

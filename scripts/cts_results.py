@@ -19,7 +19,8 @@ from models.cts_roll import index_harmonics
 from models.cts_table import Table, solve_table
 from models.parts import Array, Link
 from models.rigid_body import Ejector, SlenderAir, Store, release, yaw_pitch
-from scripts.cts_compiled import compiled, has_compiler
+from scripts.compiled import has_compiler
+from scripts.cts_compiled import compiled_inverse
 from scripts.cts_plan import RollPlan, plan_sweep
 
 __all__ = ["NOTE", "PAPER_TIMES", "REFERENCE", "Release", "Results", "compute", "sweep_targets"]
@@ -127,8 +128,8 @@ def compute() -> Results:
     if has_compiler():
         free = optimal_inverse(rig, tunnel, limits=False)
         nanoseconds = {
-            "closed form, limits off": compiled(free, targets, np.zeros(1)).nanoseconds,
-            "closed form, reach": compiled(function, targets, np.zeros(1)).nanoseconds,
+            "closed form, limits off": compiled_inverse(free, targets, np.zeros(1)).nanoseconds,
+            "closed form, reach": compiled_inverse(function, targets, np.zeros(1)).nanoseconds,
         }
     arithmetic = arithmetic_times(rig, tunnel, targets, runs)
     study = random_study(rig, tunnel)

@@ -13,7 +13,7 @@ import pytest
 from models.paths import smooth
 from scripts import benchmark_blend, benchmark_blend_peers, drawing
 from scripts.blend_example import REMAINING, example
-from scripts.cts_compiled import has_compiler
+from scripts.compiled import has_compiler
 
 pytestmark = pytest.mark.xdist_group("benchmark_blend")
 

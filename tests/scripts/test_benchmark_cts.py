@@ -38,7 +38,7 @@ def test_compiled_is_what_python_gives_and_a_bad_row_leaves_the_others() -> None
     function = optimal_inverse(reference_rig(**benchmark_cts.LIMITS), reference_tunnel())
     rows = np.vstack([benchmark_cts.random_reachable(60), sweep_targets(20)])
     rows[[5, 17], [0, 3]] = np.nan, np.inf
-    found = cts_compiled.compiled(function, rows, np.zeros(1), 1).result
+    found = cts_compiled.compiled_inverse(function, rows, np.zeros(1), 1).result
     joints, cost, active, status = (np.array(part) for part in function.map(80)(rows.T, np.zeros((1, 80))))
     np.testing.assert_array_equal(found[:, 8], status[0])
     np.testing.assert_array_equal(found[:, 7][status[0] == 0], active[0][status[0] == 0])

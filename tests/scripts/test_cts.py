@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models.c_export import export
 from models.cts import reference_rig, reference_tunnel
-from models.cts_export import export, rig_functions
+from models.cts_export import rig_functions
 from models.errors import ModelError
 from scripts import cts
 from tests.models.cts_oracle import random_targets
