@@ -52,6 +52,7 @@ EXAMPLES: Mapping[str, Entry] = {
     "panda": Entry("scripts.gallery_panda", "example-robot-data"),
     "ur5": Entry("scripts.gallery_ur5", "example-robot-data"),
     "mobile_manipulator": Entry("scripts.gallery_mobile_manipulator", "example-robot-data"),
+    "pushing": Entry("scripts.gallery_pushing", "example-robot-data"),
 }
 COLUMNS = ("dof", "task_rows", "cost_local", "cost_optimal", "tip_error", "joint_return_rad", "audit_passed")
 """Of the summary, printed."""

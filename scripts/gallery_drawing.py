@@ -22,7 +22,7 @@ __all__ = ["JOINT_COLORS", "Scene", "animate", "cells", "draw_scene", "solid"]
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]
 DPI = 100
-PALETTE = 128
+PALETTE = 256  # with fewer a thin line may lose its colour
 RECT = (0.0, 0.0, 0.97, 1.0)
 """Share of a figure that is used: the layout does not see the labels of solid axes."""
 VIEW = (22.0, -58.0)  # elevation, azimuth, deg

@@ -25,7 +25,7 @@ from ocp.builders.standing import InFoot, Limits, Weights, standing_plan
 from ocp.local_acceleration import resolve_accelerations
 from scripts.drawing import COLORS, DASHES, sheet
 
-__all__ = ["Results", "draw", "plan", "problem", "robot_file", "tiago"]
+__all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]
 
 PACKAGE, FILE = "example-robot-data", "tiago_description/robots/tiago.urdf"
 JOINTS = ("torso_lift_joint", *(f"arm_{i}_joint" for i in range(1, 8)))
@@ -125,9 +125,9 @@ def smooth(share: Any) -> Any:
     return share**3 * (10 - 15 * share + 6 * share**2)
 
 
-def timed(hand: HandPath) -> HandPath:
+def timed(hand: HandPath, seconds: float = SECONDS) -> HandPath:
     """The same path as a function of time, s."""
-    return lambda time: hand(smooth(time / SECONDS))
+    return lambda time: hand(smooth(time / seconds))
 
 
 def problem(machine: Standing, *, along: Any = "time") -> Problem:
@@ -176,40 +176,62 @@ def plan() -> Results:
 
 def draw(folder: Path, results: Results) -> None:
     """Write mobile_manipulator.png: zero moment point from above, its distance from the edge, rope, limits."""
-    kinds = (("instant by instant", results.local, "orange", 1), ("planned", results.motion, "blue", 0))
     note = (
         f"TIAGo of {results.robot.total_mass:.1f} kg with {LOAD:g} kg in its hand on a circle of {SECONDS:g} s; a rope "
         f"pulls the hand forward with {PULL:g} N. Footprint, inertias and limits from its URDF (example-robot-data); "
         f"both motions have the same hand path and force. Plan: zero moment point {1000 * MARGIN:g} mm inside, "
         f"{100 * SHARE:g} % of the limits of velocity and torque."
     )
-    with sheet(folder / "mobile_manipulator.png", rows=2, columns=2, size=(8.4, 6.6), note=note) as (figure, axes):
-        above, edge, force, shares = axes.flat
-        _from_above(above, results, kinds)
+    figure(folder / "mobile_manipulator.png", results, note=note, force="force of the rope on the hand")
+
+
+def figure(
+    path: Path,
+    results: Results,
+    *,
+    note: str,
+    force: str,
+    prefix: str = "",
+    inset: tuple[float, float, float, float] = (0.1, 0.27, 0.46, 0.46),
+) -> None:
+    """A plan and the local motion: zero moment point from above, its distance from the edge, force, limits.
+
+    Args:
+        path: PNG file.
+        note: Fine print.
+        force: Title over the force from outside.
+        prefix: Of joint names, left out.
+        inset: Left, bottom, width and height of the enlarged part, in shares of the picture from above.
+    """
+    kinds = (("instant by instant", results.local, "orange", 1), ("planned", results.motion, "blue", 0))
+    span = (0.0, results.solution.horizon)
+    with sheet(path, rows=2, columns=2, size=(8.4, 6.6), note=note) as (drawn, axes):
+        above, edge, outside, shares = axes.flat
+        _from_above(above, results, kinds, inset)
         for label, motion, color, dash in kinds:
             edge.plot(motion.t, 1000 * motion.foot_margin, color=COLORS[color], ls=DASHES[dash], label=label)
         edge.axhline(0.0, color=COLORS["black"], lw=0.8)
         low = 1.5 * 1000 * min(0.0, float(results.local.foot_margin.min()), float(results.motion.foot_margin.min()))
         edge.axhspan(low, 0.0, color=COLORS["orange"], alpha=0.12, lw=0)
         edge.set_ylim(bottom=low)
-        edge.set(xlabel="time, s", ylabel="mm", title="zero moment point inside the footprint", xlim=(0, SECONDS))
+        edge.set(xlabel="time, s", ylabel="mm", title="zero moment point inside the footprint", xlim=span)
         for i, (name, color) in enumerate(zip("xyz", ("black", "green", "purple"), strict=True)):
             values = results.motion.external_force[:, i]
-            force.plot(results.motion.t, values, color=COLORS[color], ls=DASHES[i], label=name)
-        force.set(xlabel="time, s", ylabel="N", title="force of the rope on the hand", xlim=(0, SECONDS))
-        force.legend(ncols=3)
-        _shares(shares, results, kinds)
-        figure.legend(handles=edge.get_lines()[:2], loc="outside upper left", ncols=2)
+            outside.plot(results.motion.t, values, color=COLORS[color], ls=DASHES[i], label=name)
+        outside.set(xlabel="time, s", ylabel="N", title=force, xlim=span)
+        outside.legend(ncols=3)
+        _shares(shares, results, kinds, prefix)
+        drawn.legend(handles=edge.get_lines()[:2], loc="outside upper left", ncols=2)
 
 
-def _from_above(ax: Any, results: Results, kinds: Any) -> None:
+def _from_above(ax: Any, results: Results, kinds: Any, inset: tuple[float, float, float, float]) -> None:
     """The footprint, and the place of interest enlarged."""
     corners = results.footprint.support.vertices
     points = np.vstack([motion.zero_moment_point for _, motion, _, _ in kinds])
     least, most = points.min(axis=0), points.max(axis=0)
     middle, half = (least + most) / 2, 0.6 * float((most - least).max())
     window = {"xlim": (middle[0] - half, middle[0] + half), "ylim": (middle[1] - half, middle[1] + half)}
-    enlarged = ax.inset_axes((0.1, 0.27, 0.46, 0.46), xticks=[], yticks=[], **window)
+    enlarged = ax.inset_axes(inset, xticks=[], yticks=[], **window)
     for part in (ax, enlarged):
         part.fill(*corners.T, color=COLORS["grey"], alpha=0.18, lw=0)
         part.plot(*np.vstack([corners, corners[:1]]).T, color=COLORS["grey"], lw=1)
@@ -226,7 +248,7 @@ def _from_above(ax: Any, results: Results, kinds: Any) -> None:
     ax.set(xlabel="x, forward, m", ylabel="y, m", title=title)
 
 
-def _shares(ax: Any, results: Results, kinds: Any) -> None:
+def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
     """Peaks of torques and velocities over their limits, joint by joint."""
     robot = results.robot
     rows: Array = np.arange(robot.dof, dtype=float)
@@ -236,7 +258,7 @@ def _shares(ax: Any, results: Results, kinds: Any) -> None:
         ax.barh(rows + place, torque, height=0.38, color=COLORS[color], alpha=0.75, lw=0)
         ax.plot(speed, rows + place, "D", color=COLORS[color], ms=4, mec="white", mew=0.6, ls="none")
     ax.axvline(1.0, color=COLORS["black"], lw=0.8)
-    names = [name.removesuffix("_joint").replace("_", " ") for name in robot.joint_names]
+    names = [name.removeprefix(prefix).removesuffix("_joint").replace("_", " ") for name in robot.joint_names]
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
     ax.set(xlabel="peak over limit: bars torque, diamonds velocity", title="joints against their limits")

@@ -6,7 +6,7 @@ the same files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ import numpy as np
 import pinocchio
 import pytest
 
-from models import Robot, Standing, Wrench, footprint, rectangle, simplified, with_load
+from models import Robot, Standing, Wrench, rectangle, simplified, with_load
 from models.standing import paper_example
 from models.standing_motion import StandingMotion
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing import Anywhere, InFoot, Limits, Pinned, standing_plan
+from ocp.builders.standing import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError
 from ocp.local_acceleration import resolve_accelerations
+from scripts import gallery_pushing as pushing
 from scripts import gallery_standing as gallery
 from tests.models.pinocchio_robots import Peer, State
 from tests.models.trees import Array, numeric
@@ -32,19 +33,6 @@ pytestmark = pytest.mark.xdist_group("standing robots")
 
 ROWS = (3, 4, 5)
 RELATIVE = 1e-9
-METHOD = Collocation(16, degree=3, scheme="legendre")
-
-ANYMAL = "anymal_b_simple_description/robots/anymal-kinova.urdf"
-FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
-LEGS = {  # of the file's own standing posture
-    f"{side}{end}_{joint}": value
-    for side, roll in (("L", -0.1), ("R", 0.1))
-    for end, sign in (("F", 1), ("H", -1))
-    for joint, value in (("HAA", roll), ("HFE", 0.7 * sign), ("KFE", -1.0 * sign))
-}
-ANYMAL_START = np.array([-2.294, 3.884, 1.744, 2.895, 1.013, -1.85])
-ANYMAL_SECONDS = 2.5
-ANYMAL_LOAD = 1.0
 
 
 @dataclass(frozen=True)
@@ -119,42 +107,13 @@ def tiago() -> gallery.Results:
 
 @pytest.fixture(scope="module")
 def anymal() -> Peered:
-    file = gallery.robot_file(ANYMAL)
-    robot = Robot.from_urdf(file, tip="j2s6s200_end_effector", inertia="as_given", lock=LEGS)
-    ground = footprint(robot, file, links=FEET)
-    robot = with_load(robot, str(robot.tip), ANYMAL_LOAD)
-    machine = Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation)
-    return Peered(file, machine, LEGS, ANYMAL_LOAD)
-
-
-def pull(machine: Standing) -> Callable[[Any, Any], list[Wrench]]:
-    """60 N aside."""
-    return lambda time, tip: [machine.tip_wrench((0.0, 60.0, 0.0))]
-
-
-def reach(machine: Standing, share: Any) -> list[Any]:
-    """0.3 m aside, back and up."""
-    begin = numeric(machine.tip_pose((), ANYMAL_START).position).ravel()
-    return [value + step * share for value, step in zip(begin, (-0.2, 0.2, 0.1), strict=True)]
-
-
-def timed(machine: Standing) -> Callable[[Any], list[Any]]:
-    return lambda time: reach(machine, gallery.smooth(time / ANYMAL_SECONDS))
-
-
-def anymal_plan(machine: Standing, along: Any = "time", **changes: Any) -> Any:
-    settings: dict[str, Any] = {"zmp": InFoot(0.01), "limits": Limits(friction=0.7), **changes}
-    path = timed(machine) if along == "time" else lambda share: reach(machine, share)
-    horizon = settings.pop("horizon", ANYMAL_SECONDS)
-    return standing_plan(
-        machine, path, ROWS, ANYMAL_START, horizon, external=pull(machine), along=along, tip_level="acceleration",
-        **settings,
-    )  # fmt: skip
+    machine, _ = pushing.anymal()
+    return Peered(pushing.ANYMAL.path, machine, pushing.LEGS, pushing.LOAD)
 
 
 @pytest.fixture(scope="module")
 def anymal_solution(anymal: Peered) -> Solution:
-    return solve(anymal_plan(anymal.machine), METHOD)
+    return solve(pushing.problem(anymal.machine), pushing.METHOD)
 
 
 def test_tiago_stands_where_instant_resolution_tips_it(tiago: gallery.Results) -> None:
@@ -202,31 +161,32 @@ def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None
 
 def test_anymal_stands_where_instant_resolution_tips_it(anymal: Peered, anymal_solution: Solution) -> None:
     machine = anymal.machine
-    settings: dict[str, Any] = {"external": pull(machine), "step": 1e-2}
-    local = resolve_accelerations(machine, timed(machine), ROWS, ANYMAL_START, ANYMAL_SECONDS, **settings).motion
+    settings: dict[str, Any] = {"external": pushing.reaction(machine), "step": 1e-2}
+    path = pushing.timed(machine)
+    local = resolve_accelerations(machine, path, ROWS, pushing.START, pushing.SECONDS, **settings).motion
     assert not local.stands
     audit = anymal_solution.audit()
     assert audit.passed, str(audit)
-    motion = sampled(machine, anymal_solution, pull(machine), ROWS)
+    motion = sampled(machine, anymal_solution, pushing.reaction(machine), ROWS)
     assert motion.foot_margin.min() > 0.009
     assert motion.friction.max() <= 0.7
     assert_in_limits(machine.robot, motion)
-    assert tip_error(motion, timed(machine), ROWS) < 1e-6
-    assert_pinocchio_agrees(anymal, motion, pull(machine))
+    assert tip_error(motion, path, ROWS) < 1e-6
+    assert_pinocchio_agrees(anymal, motion, pushing.reaction(machine))
 
 
 def test_anymal_with_its_time_law_free_costs_less(anymal: Peered, anymal_solution: Solution) -> None:
-    solution = solve(anymal_plan(anymal.machine, "parameter"), METHOD)
+    solution = solve(pushing.problem(anymal.machine, along="parameter"), pushing.METHOD)
     assert solution.audit().passed
     assert solution.cost < anymal_solution.cost
-    motion = sampled(anymal.machine, solution, pull(anymal.machine), ROWS)
+    motion = sampled(anymal.machine, solution, pushing.reaction(anymal.machine), ROWS)
     assert motion.foot_margin.min() > 0.009
-    assert_pinocchio_agrees(anymal, motion, pull(anymal.machine))
+    assert_pinocchio_agrees(anymal, motion, pushing.reaction(anymal.machine))
 
 
 def test_a_simplified_robot_has_the_same_plan(anymal: Peered, anymal_solution: Solution) -> None:
     machine = replace(anymal.machine, robot=simplified(anymal.machine.robot))
-    assert solve(anymal_plan(machine), METHOD).cost == pytest.approx(anymal_solution.cost, rel=1e-9)
+    assert solve(pushing.problem(machine), pushing.METHOD).cost == pytest.approx(anymal_solution.cost, rel=1e-9)
 
 
 def changed(machine: Standing, name: str, **limits: Any) -> Standing:
@@ -237,18 +197,18 @@ def changed(machine: Standing, name: str, **limits: Any) -> Standing:
 def test_joints_without_limits_are_free_to_move(anymal: Peered, anymal_solution: Solution) -> None:
     free = np.inf
     loose = changed(anymal.machine, "j2s6s200_joint_1", lower=-free, upper=free, velocity=free, effort=free)
-    solution = solve(anymal_plan(loose), METHOD)
+    solution = solve(pushing.problem(loose), pushing.METHOD)
     assert solution.cost <= anymal_solution.cost + 1e-6  # its share of the joint-limit index is gone
 
 
 def test_a_start_at_a_limit_to_rounding_is_taken(anymal: Peered, anymal_solution: Solution) -> None:
     """At a joint that the plan only ever moves away from where it starts."""
-    away = anymal_solution["joints"] - ANYMAL_START
+    away = anymal_solution["joints"] - pushing.START
     i = int(np.flatnonzero((away.min(axis=0) > -1e-9) | (away.max(axis=0) < 1e-9))[0])
     side, inwards = ("lower", 1) if away[:, i].max() > 1e-3 else ("upper", -1)
-    edge = changed(anymal.machine, anymal.machine.robot.joint_names[i], **{side: ANYMAL_START[i] + inwards * 1e-10})
-    solution = solve(anymal_plan(edge), METHOD)
-    assert (inwards * (solution["joints"][:, i] - ANYMAL_START[i])).min() >= -1e-7
+    edge = changed(anymal.machine, anymal.machine.robot.joint_names[i], **{side: pushing.START[i] + inwards * 1e-10})
+    solution = solve(pushing.problem(edge), pushing.METHOD)
+    assert (inwards * (solution["joints"][:, i] - pushing.START[i])).min() >= -1e-7
 
 
 @pytest.mark.parametrize(
@@ -262,7 +222,7 @@ def test_a_start_at_a_limit_to_rounding_is_taken(anymal: Peered, anymal_solution
 )
 def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: dict[str, float], message: str) -> None:
     with pytest.raises(ProblemError, match=message):
-        anymal_plan(changed(anymal.machine, name, **limits))
+        pushing.problem(changed(anymal.machine, name, **limits))
 
 
 def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> None:
@@ -271,10 +231,10 @@ def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> No
     with pytest.raises(
         ProblemError, match=r"whatever the joints do there, .*the torque of 'j2s6s200_joint_\d', at most"
     ):
-        anymal_plan(heavy, zmp=Anywhere())
+        pushing.problem(heavy, zmp=Anywhere())
     weak = replace(machine, support=rectangle((-0.3, 0.3), (-0.5, -0.3)))
     with pytest.raises(ProblemError, match="the place of the zero moment point, by"):
-        anymal_plan(weak, zmp=Pinned((0.0, -0.4)), limits=Limits(acceleration=5.0))
+        pushing.problem(weak, zmp=Pinned((0.0, -0.4)), limits=Limits(acceleration=5.0))
 
 
 def test_a_start_in_a_singular_posture_may_be_left() -> None:

@@ -19,7 +19,8 @@ from PIL import Image
 
 from models.parts import Array
 from ocp import Solution, SolveError
-from scripts import gallery, gallery_panda, gallery_robots, gallery_ur5
+from ocp.local_acceleration import resolve_accelerations
+from scripts import gallery, gallery_panda, gallery_pushing, gallery_robots, gallery_ur5
 from scripts.gallery_drawing import Scene, animate
 from scripts.gallery_frames import TIP, Frames, frames_along
 from scripts.gallery_results import turning_angle
@@ -27,7 +28,7 @@ from scripts.view_plan import play
 
 pytestmark = pytest.mark.xdist_group("gallery")
 
-NAMES = ["space_arm", "panda", "ur5", "mobile_manipulator"]
+NAMES = ["space_arm", "panda", "ur5", "mobile_manipulator", "pushing"]
 LOCAL = ["space_arm", "panda", "ur5"]
 """Those that are compared with the pseudo-inverse by cost."""
 
@@ -85,6 +86,30 @@ def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Ga
     row = coarse.rows["mobile_manipulator"]
     assert row["zmp_margin_local_m"] < 0 < row["zmp_margin_optimal_m"]
     assert row["tip_error"] < 1e-3  # the hand's path is a constraint on accelerations there
+
+
+def test_the_pushing_robot_stays_on_its_feet_where_instant_resolution_tips_it(coarse: Gallery) -> None:
+    row = coarse.rows["pushing"]
+    assert row["zmp_margin_local_m"] < 0
+    assert row["zmp_margin_optimal_m"] > 0.99 * gallery_pushing.MARGIN
+    assert row["tip_error"] < 1e-5
+    assert not row["audit_tolerances"]
+
+
+def test_what_acts_on_the_pushing_hand_is_the_reaction_of_its_push() -> None:
+    machine, _ = gallery_pushing.anymal()
+    (wrench,) = gallery_pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
+    np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + gallery_pushing.PUSH, 0.0)
+    # by hand: pushing to its right presses its left feet
+    path = gallery_pushing.timed(machine)
+    task = (gallery_pushing.ROWS, gallery_pushing.START, gallery_pushing.SECONDS)
+    pressed, free = (
+        resolve_accelerations(machine, path, *task, external=external, step=1e-2, stop_at_lift_off=False).motion
+        for external in (gallery_pushing.reaction(machine), None)
+    )
+    aside = pressed.zero_moment_point[0, 1] - free.zero_moment_point[0, 1]
+    lever = -gallery_pushing.PUSH[1] * pressed.tip_in_world[0, 2]
+    assert aside == pytest.approx(lever / machine.weight)
 
 
 def placed(file: gallery_robots.RobotFile, joints: Array, frame: str) -> tuple[Array, Array]:
