@@ -134,6 +134,8 @@ def audit(
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
             unknown.
     """
+    if not isinstance(tolerances, Mapping | None):
+        raise ProblemError(f"audit: tolerances must be a dictionary by name, not {tolerances!r}")
     limits = dict(tolerances or {})
     named = {"integration": integration, "constraints": constraints, "stationarity": stationarity}
     for name, limit in {**named, "drift": drift, "costates": costates, **limits}.items():

@@ -440,6 +440,8 @@ def test_an_exact_optimum_passes_strict_limits() -> None:
         {"tolerances": {"x": -1.0}},
         {"tolerances": {"y": 1.0}},
         {"tolerances": {"X": 1.0}},
+        {"tolerances": 3},
+        {"tolerances": [("x", 1.0)]},
     ],
 )
 def test_bad_limits_are_named(settings_: dict[str, Any]) -> None:
