@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import Any
@@ -7,10 +8,10 @@ from typing import Any
 import casadi as ca
 import pytest
 
-from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
+from ocp import Collocation, MultipleShooting, Problem, SolveError, elastic, solve
 
 METHODS = [Collocation(8), Collocation(8, scheme="legendre"), Collocation(8, control="held"), MultipleShooting(8)]
-NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
+NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
 
 
 def conflicts(problem: Problem, method: Any, **settings: Any) -> list[tuple[str, float, float, float | None]]:
@@ -114,3 +115,123 @@ def test_a_condition_that_ties_both_ends_gives_way_or_makes_a_limit_do_so(solver
     found = re.search(rf"^  u would have to go {NUMBER} beyond", str(caught.value), re.MULTILINE)
     assert found is not None
     assert float(found[1]) == pytest.approx(0.5, abs=1e-3)
+
+
+def between(scale: float = 1.0, draw: float = 0.0, wall: float | None = None, gate: float | None = None) -> Problem:
+    """A wall at 0.7 m while a gate asks for 0.9 m, at half the time only; the cost draws towards a place.
+
+    Each is told in a unit of its own, so that its size is its place; without one, with bound 0, so that its size is 1.
+    """
+    problem = Problem("between")
+    q = problem.state("q", initial=0.0, terminal=1.0)
+    v = problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u", lower=-1e3, upper=1e3)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    aside = 100 * (problem.time - 0.5) ** 2
+    problem.path("wall", (q - 0.7 if wall is None else wall * q) - (wall or 1.0) * aside, upper=0.7 * (wall or 0.0))
+    problem.path("gate", (q - 0.9 if gate is None else gate * q) + (gate or 1.0) * aside, lower=0.9 * (gate or 0.0))
+    problem.horizon(1.0)
+    problem.minimize(running=scale * ((q - draw) ** 2 + 1e-3 * u**2))
+    return problem
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize(("draw", "name"), [(0.0, "gate"), (3.0, "wall")])
+def test_of_two_that_cost_the_same_the_one_in_the_way_of_the_cost_gives_way(
+    draw: float, name: str, scale: float
+) -> None:
+    """Whatever the unit of the cost."""
+    found = conflicts(between(scale, draw), Collocation(20))
+    assert (found[0][0], found[0][2]) == (name, 0.0)
+    assert (found[0][1], found[0][3]) == pytest.approx((0.2, 0.5), abs=1e-3)
+    assert all(amount < 1e-3 for _, amount, _, _ in found[1:])
+
+
+@pytest.mark.parametrize("draw", [0.0, 3.0])
+@pytest.mark.parametrize("wall", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("gate", [1e-4, 1.0, 1e4])
+def test_units_of_constraints_scale_what_lacks_and_change_nothing_else(gate: float, wall: float, draw: float) -> None:
+    """The gate gives way: 0.2 m are a smaller share of its 0.9 m than of the wall's 0.7 m, whatever the cost."""
+    found = conflicts(between(1.0, draw, wall, gate), Collocation(20))
+    assert found[0][0] == "gate"
+    assert found[0][1] == pytest.approx(0.2 * gate, rel=5e-3)
+    assert found[0][2] == pytest.approx(0.9 * gate)
+    assert all(amount < 1e-3 * wall for _, amount, _, _ in found[1:])
+
+
+@pytest.mark.parametrize(("limit", "name", "amount"), [(0.5, "v", 0.5), (0.2, "v", 0.8), (0.08, "far", 0.92)])
+def test_what_is_asked_gives_way_only_for_a_limit_a_tenth_as_large(limit: float, name: str, amount: float) -> None:
+    """1 m is asked in 1 s at the limit: whichever gives way, the same lacks of it."""
+    problem = Problem("asked")
+    q = problem.state("q", initial=0.0)
+    v = problem.control("v", upper=limit)
+    problem.dynamics(q, v)
+    problem.horizon(1.0)
+    problem.end("far", q, lower=1.0, upper=1.0)
+    problem.minimize(running=v**2)
+    found = conflicts(problem, MultipleShooting(6))
+    assert [line[0] for line in found] == [name]
+    assert found[0][1] == pytest.approx(amount, abs=1e-4)
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1.0, 1e2])
+def test_conflicts_that_have_nothing_to_do_with_each_other_are_all_named_the_largest_share_first(unit: float) -> None:
+    """Three axes at most at 1 m/s for 1 s and asked for more, or less: shares 1/2, 1/3, 1/5 of the speed's 2 m/s."""
+    problem = Problem("axes")
+    speeds = {"a": 0.4, "b": -1.0, "c": -2 / 3}
+    cost: Any = 0.0
+    for i, (name, lack) in enumerate(speeds.items()):
+        by = unit if i == 1 else 1.0
+        q = problem.state(f"q{name}", initial=0.0)
+        u = problem.control(f"u{name}", lower=-by, upper=by)
+        problem.dynamics(q, u)
+        asked = (lack + 1 if lack > 0 else lack - 1) * by
+        problem.end(f"far {name}", q, lower=asked, upper=asked)
+        cost += (u / by) ** 2
+    problem.horizon(1.0)
+    problem.minimize(running=cost)
+    found = conflicts(problem, Collocation(4))
+    assert [line[0] for line in found] == ["ub", "uc", "ua"]
+    assert [line[1] for line in found] == pytest.approx([unit, 2 / 3, 0.4], rel=2e-3)
+    assert [line[2] for line in found] == pytest.approx([-unit, -1.0, 1.0])
+
+
+@pytest.mark.parametrize("unit", [1e-5, 1.0, 1e3])
+@pytest.mark.parametrize("method", [Collocation(20), MultipleShooting(20)], ids=str)
+def test_the_way_that_drag_leaves_too_short_is_named_whatever_the_unit_of_the_push(method: Any, unit: float) -> None:
+    """v' = u - v^2 from rest with u = 1 gets ln cosh T far, and a push for more would be the larger share."""
+    problem = Problem("drag")
+    q, v = problem.state("q", initial=0.0), problem.state("v", initial=0.0)
+    u = problem.control("u", lower=-unit, upper=unit)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u / unit - v**2)
+    problem.horizon(1.0)
+    problem.end("far", q, lower=4.0)
+    problem.minimize(running=(u / unit) ** 2)
+    (found,) = conflicts(problem, method)
+    assert (found[0], found[2]) == ("far", 4.0)
+    assert found[1] == pytest.approx(4 - math.log(math.cosh(1)), abs=6e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e3])
+@pytest.mark.parametrize("turn", [math.pi / 2, 1.5 * math.pi])
+@pytest.mark.parametrize("method", [Collocation(20), MultipleShooting(20)], ids=str)
+def test_a_turn_on_half_the_least_radius_lacks_as_much_again_and_is_found_in_few_steps(
+    method: Any, turn: float, unit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The length is just that of the arc, so that nothing else leads there; Newton's steps need exact derivatives."""
+    monkeypatch.setitem(elastic.IPOPT, "max_iter", 18)
+    problem = Problem("turn")
+    x = problem.state("x", initial=0.0, terminal=math.sin(turn) / 2)
+    y = problem.state("y", initial=0.0, terminal=(1 - math.cos(turn)) / 2)
+    heading = problem.state("heading", initial=0.0, terminal=turn)
+    curvature = problem.control("curvature", lower=-unit, upper=unit)
+    problem.dynamics(x, ca.cos(heading))
+    problem.dynamics(y, ca.sin(heading))
+    problem.dynamics(heading, curvature / unit)
+    problem.horizon(turn / 2)
+    problem.minimize(running=(curvature / unit) ** 2)
+    (found,) = conflicts(problem, method)
+    assert found[0] == "curvature"
+    assert found[1:3] == pytest.approx((unit, unit), rel=1e-3)

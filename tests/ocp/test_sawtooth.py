@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
+from ocp.formulation import Formulation
+from ocp.sawtooth import costates_at_samples
+from tests.ocp.problems import Array
 
 METHODS = [
     Collocation(40),
@@ -85,3 +88,79 @@ def shifted(plan: Solution, amount: float) -> Solution:
 def test_costates_that_are_wrong_along_the_bound_do_not_pass(method: Any, amount: float) -> None:
     plan = shifted(solve(chase(), method), amount)
     assert not plan.audit(chase()).passed
+
+
+HORIZON, CONTACT, EFFORT = 1.5, 0.375, 0.01
+LARGEST = 2 * (2 * HORIZON - 0.5) * HORIZON / 60  # atom of the bound, at the last of 60 nodes
+
+
+def pushed(sign: float, gain: float) -> tuple[Problem, Any]:
+    """Follow 2 t, at nearly the speed w, below a bound that is met at CONTACT: the problem, and the costate over time.
+
+    Before it q'' = (q - 2 t) / EFFORT + w', on it q' = 0, and the costate is 2 EFFORT (w - q') all along: its force
+    keeps it so whatever the final cost -gain q is.
+    """
+    rate, wish = 2.0, (0.5, 3.0)
+    k, b = EFFORT**-0.5, EFFORT * wish[1]
+    a = -(rate + b * k * np.sinh(k * CONTACT)) / (k * np.cosh(k * CONTACT))
+    bound = rate * CONTACT - b + a * np.sinh(k * CONTACT) + b * np.cosh(k * CONTACT)
+
+    def costate(t: Array) -> Array:
+        free = np.minimum(t, CONTACT)
+        speed = np.where(t < CONTACT, rate + k * (a * np.cosh(k * free) + b * np.sinh(k * free)), 0.0)
+        return np.asarray(sign * 2 * EFFORT * (wish[0] + wish[1] * t - speed))
+
+    problem = Problem("pushed")
+    lower, upper = (-np.inf, bound) if sign > 0 else (-bound, np.inf)
+    q = problem.state("q", initial=0.0, lower=lower, upper=upper)
+    u = problem.control("u")
+    problem.dynamics(q, u)
+    problem.horizon(HORIZON)
+    time = problem.time
+    running = (q - sign * rate * time) ** 2 + EFFORT * (u - sign * (wish[0] + wish[1] * time)) ** 2
+    problem.minimize(running=running, terminal=-gain * sign * q)
+    return problem, costate
+
+
+def sampled(plan: Solution, problem: Problem) -> tuple[Array, Array, Array]:
+    """Times and costates of q at the samples of the controls, (N, samples), and which intervals are beside a jump."""
+    form = Formulation(problem)
+    p = form.parameter_vector({})
+    costates, beside = costates_at_samples(form, plan, p, form.bound_values(p))
+    mesh = plan.control_interpolant.breaks
+    return (
+        (mesh[:-1, None] + np.diff(mesh)[:, None] * plan.control_interpolant.nodes) * HORIZON,
+        costates[..., 0],
+        beside,
+    )
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.3])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("scheme", ["radau", "legendre"])
+def test_costates_up_to_a_free_end_at_a_bound_are_those_of_the_closed_form(
+    scheme: Any, sign: float, gain: float
+) -> None:
+    problem, costate = pushed(sign, gain)
+    plan = solve(problem, Collocation(40, scheme=scheme))
+    times, found, beside = sampled(plan, problem)
+    assert found == pytest.approx(costate(times), abs=3e-5)
+    assert not beside.any()
+    assert abs(plan.costates["q"][-1, 0] - costate(np.array(HORIZON))) > 1e-3  # as reported it has the atom of the end
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.3])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("control", ["held", "linear"])
+def test_costates_between_nodes_at_a_bound_are_those_of_the_closed_form(control: Any, sign: float, gain: float) -> None:
+    problem, costate = pushed(sign, gain)
+    plan = solve(problem, MultipleShooting(60, control=control))
+    times, found, beside = sampled(plan, problem)
+    if control == "linear":  # between atoms it is a sawtooth, about the closed form in the mean over each hat
+        found = (2 * found[1:, :1] + found[1:, 1:] + 2 * found[:-1, 1:] + found[:-1, :1]) / 6
+        times, beside = times[1:, :1], beside[1:]
+    assert found == pytest.approx(costate(times), abs=LARGEST / 50)
+    assert beside[times[:, 0] > CONTACT + HORIZON / 60].all()
+    assert not beside[times[:, 0] < CONTACT - HORIZON / 60].any()
+    on_bound = plan.t[:-1] > CONTACT + HORIZON / 60
+    assert np.abs(plan.costates["q"][:-1, 0] - costate(plan.t[:-1]))[on_bound].max() > LARGEST / 5  # as reported
