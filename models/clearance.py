@@ -13,9 +13,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from models.arrays import ArrayInput, checked_array, checked_rotation
 from models.cts import INCH, Rig, dh_frames
 from models.errors import ModelError
-from models.parts import ArrayInput, checked_array, checked_rotation
 from models.spatial import Expression, expression
 
 SEARCH_STEPS = 40

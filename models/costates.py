@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.machine import checked_rows
-from models.parts import Array, ArrayInput, checked_array
 from models.recursion import D, J, dD, dJ
 from models.virtual_chain import VirtualChain
 

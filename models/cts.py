@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, checked_array
 from models.spatial import Expression, Frame, expression, rotation
 
 INCH = 0.0254

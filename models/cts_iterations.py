@@ -13,13 +13,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.cts import HOME, INCH, Branch, Rig, Tunnel, forward, inverse, task_jacobian
 from models.cts_optimal import checked_gain
 from models.cts_roll import index_harmonics
 from models.errors import ModelError
-from models.linear import solve_spd
-from models.parts import Array, ArrayInput, checked_array
-from models.spatial import Expression
+from models.spatial import Expression, solve_spd
 
 TOLERANCE, MOST_STEPS = 1e-6, 100  # Table 5
 

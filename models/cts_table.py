@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput
 from models.clearance import Surroundings
 from models.cts import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
 from models.cts_clearance import clear_inverse
@@ -18,7 +19,6 @@ from models.cts_optimal import optimal_inverse
 from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, verdict
 from models.cts_slide import slide_ends
 from models.errors import ModelError
-from models.parts import Array, ArrayInput
 
 TURN = 2 * np.pi
 TOLERANCE = 1e-9

@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_rotation
 from models.errors import ModelError
 from models.kinematics import link_frames
-from models.parts import Array, ArrayInput, checked_rotation
 from models.robot import Robot
 from models.spatial import Frame
 from models.support import Support

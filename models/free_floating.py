@@ -21,6 +21,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.kinematics import (
     center_of_mass,
@@ -33,7 +34,7 @@ from models.kinematics import (
 )
 from models.kinematics import momentum_matrix as joint_momentum_matrix
 from models.machine import TWIST_SIZE, jacobian_manipulability, require_joints
-from models.parts import Array, ArrayInput, Link, checked_array
+from models.parts import Link
 from models.reaction import Reaction, reaction, require_inertia, require_planar
 from models.robot import Robot, planar_chain
 from models.spatial import (

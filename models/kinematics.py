@@ -13,8 +13,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array
 from models.errors import ModelError
-from models.parts import Array, massless
+from models.parts import massless
 from models.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, rotation, skew
 

@@ -9,12 +9,11 @@ from typing import Protocol, cast
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
 from models.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
-from models.linear import determinant
-from models.parts import Array, ArrayInput, checked_array, checked_rotation
 from models.robot import Robot
-from models.spatial import Expression, Frame, expression, on_scalars
+from models.spatial import Expression, Frame, determinant, expression, on_scalars
 
 TWIST_SIZE = 6
 

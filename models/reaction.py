@@ -9,10 +9,9 @@ import numpy as np
 
 from models.errors import ModelError
 from models.kinematics import frames_and_axes, point_jacobian, subtree_moments, tip_frame
-from models.linear import solve_spd
 from models.parts import massless
 from models.robot import Robot
-from models.spatial import Expression, cross, skew
+from models.spatial import Expression, cross, skew, solve_spd
 
 
 class Reaction(NamedTuple):

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, Joint, Link, checked_array, checked_rotation
+from models.parts import Joint, Link
 from models.robot import Robot
 from models.tree import reroot
 

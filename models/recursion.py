@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.parts import Array, ArrayInput
+from models.arrays import Array, ArrayInput
 from models.virtual_chain import VirtualChain, motion_cross, transforms
 
 ONE = np.eye(6)

@@ -14,8 +14,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, Link, checked_array
+from models.parts import Link
 from models.spatial import Expression, cross, expression, quaternion_product, rotation_from_quaternion
 
 GRAVITY = 9.80665

@@ -9,8 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, Joint, Link, checked_array, checked_rotation
+from models.parts import Joint, Link
 from models.tree import absent, find_root, require_unique, reroot, tree_order
 from models.urdf import InertiaRule, MimicRule, Source, held_by_mimicry, read_urdf
 

@@ -17,8 +17,9 @@ from typing import Any, Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, Joint, Link, checked_array
+from models.parts import Joint, Link
 from models.robot import Robot
 from models.spatial import Expression, Frame, expression, rotation
 

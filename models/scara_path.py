@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput
 from models.errors import ModelError
-from models.parts import Array, ArrayInput
 from models.paths import SmoothPath
 from models.scara import Elbow, Scara
 

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.errors import ModelError
 from models.kinematics import checked_vector
 from models.machine import FixedBase
-from models.parts import Array, ArrayInput, checked_array, massless
+from models.parts import massless
 from models.rebuild import simplified
 from models.robot import Robot, planar_chain
 from models.spatial import Expression, expression

@@ -9,9 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.kinematics import center_of_mass
-from models.parts import Array, ArrayInput, checked_array
 from models.posture import joint_excess, joint_limit_index
 from models.standing import External, Standing, center_of_pressure, wrenches_at
 

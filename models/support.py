@@ -9,9 +9,9 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.kinematics import checked_vector
-from models.parts import Array, ArrayInput, checked_array
 from models.spatial import Expression
 
 FLAT = 1e-9

@@ -16,8 +16,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from models.arrays import Array
 from models.errors import ModelError
-from models.parts import Array, Joint, Kind, Link
+from models.parts import Joint, Kind, Link
 from models.spatial import rotation_from_rpy
 from models.tree import absent
 

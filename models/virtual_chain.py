@@ -11,9 +11,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.free_floating import PLANAR_ROWS, FreeFloating
-from models.parts import Array, ArrayInput, Joint, Link, checked_array
+from models.parts import Joint, Link
 from models.robot import Robot
 
 

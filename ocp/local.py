@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.linear import solve_spd
+from models.spatial import solve_spd
 from ocp.builders.task import Array, Velocity, checked_configuration, checked_horizon, checked_weights
 from ocp.builders.task_checks import checked_tasks, dependent_rows
 from ocp.builders.task_equations import TaskEquations, bind

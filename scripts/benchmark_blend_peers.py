@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 from models.paths import SmoothPath
 from models.paths.arc_length import speed
 from scripts.blend_example import SPEED

@@ -17,10 +17,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array
 from models.cts import HOME, forward, inverse, reference_rig, reference_tunnel
 from models.cts_iterations import combined, null_space
 from models.cts_optimal import optimal_inverse
-from models.parts import Array
 from scripts import drawing
 from scripts.compiled import FLAGS, has_compiler, least
 from scripts.cts_compiled import compiled_inverse

@@ -31,7 +31,7 @@ from models import (
     simplified,
     tip_jacobian,
 )
-from models.parts import Array
+from models.arrays import Array
 from scripts import drawing
 from scripts.compiled import FLAGS as FAST
 from scripts.compiled import compiled, has_compiler, least, pointers

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 from scripts.compiled import compiled, least, pointers
 
 __all__ = ["march_compiled", "place_compiled"]

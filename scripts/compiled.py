@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from models.arrays import Array
 from models.c_export import export
-from models.parts import Array
 
 __all__ = ["FLAGS", "compiled", "has_compiler", "least", "pointers"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 from scripts.compiled import FLAGS, compiled, least, pointers
 
 __all__ = ["Compiled", "compiled_inverse"]

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from matplotlib.figure import Figure
 
+from models.arrays import Array
 from models.clearance import rig_capsules
 from models.cts import INCH, Rig
-from models.parts import Array
 from scripts.cts_results import NOTE, SCALE, Results, corners, surroundings
 from scripts.drawing import COLORS, DASHES, gif, sheet
 

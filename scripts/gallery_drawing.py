@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from models import Robot
-from models.parts import Array
+from models.arrays import Array
 from scripts.drawing import COLORS, add_note, gif, sheet
 from scripts.gallery_frames import TIP, Frames, chain, inertia_box
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import ModelError, Robot, link_frames
-from models.parts import Array
+from models.arrays import Array
 from models.spatial import rotation, rotation_from_quaternion
 
 __all__ = ["TIP", "Frames", "bones", "chain", "frames_along", "frames_function", "inertia_box", "placement"]

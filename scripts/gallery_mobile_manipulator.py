@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models import Robot
-from models.parts import Array
+from models.arrays import Array
 from ocp import Audit
 from scripts import gallery_standing as standing
 from scripts.gallery_drawing import Scene, animate

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.parts import Array
+from models.arrays import Array
 from ocp import Collocation
 from ocp.builders.redundancy_plan import plan_minimum_velocity
 from ocp.builders.tip_task import TipTask

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models import Footprint, Robot, Standing, Wrench, footprint, with_load
-from models.parts import Array
+from models.arrays import Array
 from models.standing import External
 from ocp import Collocation, Problem, solve
 from ocp.builders.standing import InFoot, Limits, standing_plan

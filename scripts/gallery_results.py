@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Machine
-from models.parts import Array
+from models.arrays import Array
 from ocp import Audit, Solution
 from ocp.builders.task_equations import task_errors
 from ocp.builders.tip_task import TipTask

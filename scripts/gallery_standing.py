@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from models import Footprint, Robot, Standing, Wrench, footprint, locked, with_load
-from models.parts import Array
+from models.arrays import Array
 from models.standing import External
 from models.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve

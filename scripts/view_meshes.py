@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlparse
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 
 __all__ = ["Shape", "Shapes", "find_mesh", "read_shapes"]
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from models import Robot
-from models.parts import Array
+from models.arrays import Array
 from ocp import ProblemError, Solution
 from scripts.drawing import written
 from scripts.gallery_frames import Frames, frames_function

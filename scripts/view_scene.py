@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 from scripts.gallery_frames import TIP, Frames, bones, inertia_box
 from scripts.view_meshes import Shapes, read_shapes
 from scripts.view_plan import Played

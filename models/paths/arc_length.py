@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.arrays import Array
 from models.errors import ModelError
-from models.parts import Array
 
 __all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
 

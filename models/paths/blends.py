@@ -14,8 +14,8 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
+from models.arrays import Array
 from models.errors import ModelError
-from models.parts import Array
 
 __all__ = [
     "DEFAULT_SHAPE",

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, checked_array
 from models.paths.orientation import rotation_vector
 from models.paths.segments import Arc, Line, Segment, constant_curvature
 

@@ -7,8 +7,8 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from models.arrays import Array, ArrayInput
 from models.errors import ModelError
-from models.parts import Array, ArrayInput
 from models.paths.blends import BlendKind, cubic, gamma, polynomial, quintic
 from models.paths.chain import Path
 

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 from models.paths.arc_length import NEWTON_STEPS, NODES, WEIGHTS, speed
 from models.paths.orientation import orientation_function
 from models.paths.smooth import SmoothPath

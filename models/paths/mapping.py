@@ -12,8 +12,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, checked_array
 
 __all__ = ["gauss_newton", "march", "predictor_corrector"]
 

@@ -14,8 +14,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, checked_array
 from models.paths.blends import polynomial
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 

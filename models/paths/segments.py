@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Array, ArrayInput, checked_array
 from models.paths.orientation import rotation_vector, unit_quaternion
 
 __all__ = ["Arc", "Line", "Segment", "constant_curvature"]

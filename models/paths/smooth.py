@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.arrays import Array, ArrayInput
 from models.errors import ModelError
-from models.parts import Array, ArrayInput
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, by_arc_length, quintic
 from models.paths.chain import Path

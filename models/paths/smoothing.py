@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from models.arrays import ArrayInput
 from models.errors import ModelError
-from models.parts import ArrayInput
 from models.paths.arc_length import cells
 from models.paths.blends import BlendKind, checked_kind, checked_shape
 from models.paths.chain import Path

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from models.parts import Array
+from models.arrays import Array
 
 __all__ = ["ROLLS", "least_course"]
 

@@ -25,9 +25,8 @@ from models import (
     planar_chain,
 )
 from models.free_floating import PLANAR_ROWS
-from models.linear import solve_spd
 from models.machine import with_tip
-from models.spatial import Frame
+from models.spatial import Frame, solve_spd
 from models.virtual_chain import VirtualChain
 from tests.models.pinocchio_robots import ROBOTS, Peer, random_state, swapped, urdf_file
 from tests.models.trees import (

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.linear import determinant, solve_spd
+from models.spatial import determinant, solve_spd
 from tests.models.trees import Array, numeric, seeds
 
 

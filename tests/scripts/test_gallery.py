@@ -17,7 +17,7 @@ import pinocchio
 import pytest
 from PIL import Image
 
-from models.parts import Array
+from models.arrays import Array
 from ocp import Solution, SolveError
 from ocp.local_acceleration import resolve_accelerations
 from scripts import gallery, gallery_panda, gallery_pushing, gallery_robots, gallery_ur5

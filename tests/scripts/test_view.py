@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, link_frames
-from models.parts import Array
+from models.arrays import Array
 from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from scripts import view
