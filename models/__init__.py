@@ -2,8 +2,6 @@
 
 from models.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.errors import ModelError
-from models.footprint import Footprint, footprint
-from models.free_floating import FreeFloating, paper_example
 from models.kinematics import (
     center_of_mass,
     center_of_mass_jacobian,
@@ -16,7 +14,11 @@ from models.kinematics import (
     tip_jacobian,
     tip_pose,
 )
-from models.machine import FixedBase, Machine
+from models.machines.footprint import Footprint, footprint
+from models.machines.free_floating import FreeFloating, paper_example
+from models.machines.machine import FixedBase, Machine
+from models.machines.standing import Standing
+from models.machines.support import Support, rectangle
 from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from models.parts import Joint, Link
 from models.rebuild import (
@@ -33,8 +35,6 @@ from models.rebuild import (
 )
 from models.robot import Robot, planar_chain
 from models.spatial import Frame
-from models.standing import Standing
-from models.support import Support, rectangle
 
 __all__ = [
     "FixedBase",

@@ -20,7 +20,7 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.machine import checked_rows
+from models.machines.machine import checked_rows
 from models.recursion import D, J, dD, dJ
 from models.virtual_chain import VirtualChain
 

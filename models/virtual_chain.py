@@ -13,7 +13,7 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.free_floating import PLANAR_ROWS, FreeFloating
+from models.machines.free_floating import PLANAR_ROWS, FreeFloating
 from models.parts import Joint, Link
 from models.robot import Robot
 

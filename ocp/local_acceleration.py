@@ -15,8 +15,8 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models.standing import External, Standing
-from models.standing_motion import StandingMotion, evaluate, motion_function
+from models.machines.standing import External, Standing
+from models.machines.standing_motion import StandingMotion, evaluate, motion_function
 from ocp.acceleration_laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.builders.task import Array, checked_start
 from ocp.builders.tip_path import Path, check_path, linear_rows, path_derivatives

@@ -19,9 +19,9 @@ import casadi as ca
 import numpy as np
 
 from models import paths
+from models.machines.scara_path import scara_along
 from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
 from models.paths.arc_length import arc_length
-from models.scara_path import scara_along
 from ocp.builders.path_timing import minimum_time
 from ocp.schedule import Limits, Schedule, peak_acceleration, schedule
 from scripts import drawing

@@ -7,9 +7,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from models.machines.scara import Elbow, Scara
 from models.paths import Arc, Line, Path, SmoothPath, smooth
 from models.paths.blends import BlendKind
-from models.scara import Elbow, Scara
 from ocp.schedule import JointLimits
 
 __all__ = ["NOTE", "corner", "example"]

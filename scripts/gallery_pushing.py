@@ -17,7 +17,7 @@ import numpy as np
 
 from models import Footprint, Robot, Standing, Wrench, footprint, with_load
 from models.arrays import Array
-from models.standing import External
+from models.machines.standing import External
 from ocp import Collocation, Problem, solve
 from ocp.builders.standing import InFoot, Limits, standing_plan
 from ocp.local_acceleration import resolve_accelerations

@@ -18,8 +18,8 @@ import numpy as np
 
 from models import Footprint, Robot, Standing, Wrench, footprint, locked, with_load
 from models.arrays import Array
-from models.standing import External
-from models.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import External
+from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve
 from ocp.builders.standing import InFoot, Limits, Weights, standing_plan
 from ocp.local_acceleration import resolve_accelerations

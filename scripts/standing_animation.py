@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from models.standing_motion import StandingMotion
+from models.machines.standing_motion import StandingMotion
 from scripts.drawing import COLORS, add_note, gif, sheet
 from scripts.standing_cases import ASSUMED, HORIZON, Local, machine
 from scripts.standing_drawing import arm_points, axes_frame, foot, nearest

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.standing import PAPER_START, External, Standing, paper_example, tip_spring
-from models.standing_motion import StandingMotion
+from models.machines.standing import PAPER_START, External, Standing, paper_example, tip_spring
+from models.machines.standing_motion import StandingMotion
 from ocp.builders.standing import motion_cost
 from ocp.local_acceleration import Layer, Stabiliser, resolve_accelerations
 from scripts.drawing import Row

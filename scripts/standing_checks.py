@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.standing_motion import StandingMotion
+from models.machines.standing_motion import StandingMotion
 from ocp.builders.standing import Anywhere, IndexAtLeast, InFoot, Pinned
 from ocp.builders.standing_options import ZmpRule
 from scripts.drawing import Row

@@ -15,7 +15,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from models.kinematics import link_frames
-from models.standing_motion import StandingMotion
+from models.machines.standing_motion import StandingMotion
 from scripts.drawing import COLORS, DASHES
 from scripts.standing_cases import Array, Local, machine
 from scripts.standing_plans import Plan

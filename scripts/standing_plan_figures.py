@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from models.standing_motion import StandingMotion
+from models.machines.standing_motion import StandingMotion
 from scripts.drawing import COLORS, Row, sheet
 from scripts.standing_cases import ASSUMED, HORIZON, Array, machine
 from scripts.standing_drawing import Curve, curve_of, curves, strobe, time_bar

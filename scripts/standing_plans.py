@@ -8,8 +8,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from models.standing import PAPER_START
-from models.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import PAPER_START
+from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.standing import (
     Anywhere,

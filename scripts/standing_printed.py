@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from models.standing import Standing
-from models.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import Standing
+from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp.builders.tip_path import Path, linear_rows, path_derivatives
 from ocp.local import least_rates
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm import tqdm
 
-from models.standing_motion import StandingMotion
+from models.machines.standing_motion import StandingMotion
 from scripts.drawing import Row
 from scripts.standing_cases import Local, layer_rows, local_motions, stabiliser_rows
 from scripts.standing_checks import check

@@ -33,9 +33,9 @@ import casadi as ca
 import numpy as np
 
 from models.dynamics import Wrench
+from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
+from models.machines.standing_motion import StandingMotion
 from models.posture import joint_limit_index
-from models.standing import External, Standing, center_of_pressure, wrenches_at
-from models.standing_motion import StandingMotion
 from ocp.builders.standing_guess import local_guess
 from ocp.builders.standing_options import FreeTime, Limits, Weights
 from ocp.builders.standing_start import check_freedom, check_loads, check_slope, inside_limits, tip_demand
@@ -105,7 +105,7 @@ def standing_plan(
         horizon: Final time, s, or FreeTime(...).
         zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
-        external: Wrenches from outside as a function of time and tip position, for example models.standing.tip_spring.
+        external: Wrenches from outside as a function of time and tip position, for example models.machines.standing.tip_spring.
         weights: Of the parts of the cost. limits: Of joints and ground.
         control: What is held over an interval of the plan.
         along: What tip_path is a function of. A free final time needs "parameter", or a path that suits any horizon.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models.standing import External, Standing
+from models.machines.standing import External, Standing
 from ocp.builders.task import Array
 from ocp.builders.tip_path import Path
 from ocp.errors import ProblemError

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from models.standing import Standing
+from models.machines.standing import Standing
 from ocp.builders.task import Array
 from ocp.builders.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule, is_finite
 from ocp.errors import ProblemError

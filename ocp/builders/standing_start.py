@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models.dynamics import Wrench
-from models.standing import Standing
+from models.machines.standing import Standing
 from ocp.builders.task import Array
 from ocp.builders.tip_path import Path, path_derivatives
 from ocp.builders.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Machine, ModelError, center_of_mass
-from models.machine import with_tip
+from models.machines.machine import with_tip
 from models.spatial import on_scalars, skew
 from ocp.builders.task import Array, track_expression
 from ocp.builders.task_geometry import (

@@ -15,7 +15,7 @@ import numpy as np
 
 from models import ModelError
 from models.arrays import ArrayInput, checked_array
-from models.machine import checked_rows
+from models.machines.machine import checked_rows
 from models.paths.function import path_function
 from models.paths.orientation import exponential
 from models.paths.smooth import SmoothPath

@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
+from models.machines.standing import Standing
 from models.spatial import expression
-from models.standing import Standing
 from ocp.builders.task import Array
 from ocp.errors import ProblemError
 

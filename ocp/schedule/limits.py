@@ -53,7 +53,7 @@ class JointRates(Protocol):
 
 
 class JointPath(Protocol):
-    """Joints as a function of the distance: models.scara_path.ScaraPath is one."""
+    """Joints as a function of the distance: models.machines.scara_path.ScaraPath is one."""
 
     @property
     def names(self) -> Sequence[str]: ...

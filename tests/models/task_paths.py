@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import ModelError
+from models.machines.scara import Scara
+from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Arc, Line, Path, Segment, smooth
-from models.scara import Scara
-from models.scara_path import ScaraPath, scara_along
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from models.standing import External, Standing
-from models.standing_motion import StandingMotion
+from models.machines.standing import External, Standing
+from models.machines.standing_motion import StandingMotion
 from tests.models.oracles import mujoco_model
 from tests.models.trees import Array
 

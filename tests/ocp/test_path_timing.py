@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from models.machines.scara import Scara
+from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Line, Path, SmoothPath, smooth
-from models.scara import Scara
-from models.scara_path import ScaraPath, scara_along
 from ocp import Collocation, ProblemError, solve
 from ocp.builders import path_reference
 from ocp.builders.path_tables import largest_demand, table

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, center_of_mass, paper_example, planar_chain
-from models.machine import with_tip
+from models.machines.machine import with_tip
 from models.paths import Path, smooth
 from ocp import Collocation, solve
 from ocp.builders.redundancy import minimum_velocity

@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.standing import PAPER_START, Standing, center_of_pressure
-from models.standing_motion import standing_motion
-from models.support import Support, rectangle
+from models.machines.standing import PAPER_START, Standing, center_of_pressure
+from models.machines.standing_motion import standing_motion
+from models.machines.support import Support, rectangle
 from ocp import Collocation, MultipleShooting, Solution, solve, tighten
 from ocp.builders.standing import (
     Anywhere,
@@ -26,7 +26,7 @@ from ocp.builders.standing import (
 )
 from ocp.errors import ProblemError, SolveError
 from ocp.local_acceleration import Stabiliser, resolve_accelerations
-from tests.models.standing_machines import planar_machine
+from tests.models.machines.standing_machines import planar_machine
 from tests.models.trees import numeric
 from tests.ocp.standing_replay import replay
 from tests.ocp.standing_tasks import (

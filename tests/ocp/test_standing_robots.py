@@ -17,8 +17,8 @@ import pinocchio
 import pytest
 
 from models import Robot, Standing, Wrench, rectangle, simplified, with_load
-from models.standing import paper_example
-from models.standing_motion import StandingMotion
+from models.machines.standing import paper_example
+from models.machines.standing_motion import StandingMotion
 from ocp import Collocation, Solution, solve
 from ocp.builders.standing import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Machine, planar_chain
-from models.machine import with_tip
+from models.machines.machine import with_tip
 from models.paths import Path, smooth
 from ocp.builders.task_equations import bind, task_errors
 from ocp.builders.tip_task import TipTask, along, pose_line

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models.machines.scara import Scara
 from models.paths import Path as TaskPath
 from models.paths import smooth
-from models.scara import Scara
 from ocp.schedule import JointTrajectory, Limits, joint_motion, schedule
 from scripts import blend, blend_results
 from scripts.blend_example import ARM, ELBOW, JERK, MM, PAPER_GAMMA, PAPER_TIMES, REMAINING, SPEED, corner, example

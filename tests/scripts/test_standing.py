@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.standing import PAPER_START
-from models.standing_motion import StandingMotion
+from models.machines.standing import PAPER_START
+from models.machines.standing_motion import StandingMotion
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from ocp.local_acceleration import resolve_accelerations
 from scripts import reproduce, standing, standing_results

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from models import Joint, Link, Robot, planar_chain
-from models.standing import Standing
-from models.support import Support, rectangle
+from models.machines.standing import Standing
+from models.machines.support import Support, rectangle
 from tests.models.trees import Array, random_robot, random_rotation
 
 

@@ -19,7 +19,7 @@ from models import (
     paper_example,
     planar_chain,
 )
-from models.machine import jacobian_manipulability
+from models.machines.machine import jacobian_manipulability
 from tests.models.trees import (
     Base,
     few,

@@ -12,9 +12,9 @@ import numpy as np
 from models.arrays import Array, ArrayInput, checked_rotation
 from models.errors import ModelError
 from models.kinematics import link_frames
+from models.machines.support import Support
 from models.robot import Robot
 from models.spatial import Frame
-from models.support import Support
 from models.tree import absent
 from models.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from models import ModelError, Robot, link_frames, simplified
-from models.footprint import convex_hull, footprint
+from models.machines.footprint import convex_hull, footprint
 from tests.models.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.trees import numeric
 

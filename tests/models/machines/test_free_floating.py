@@ -24,8 +24,8 @@ from models import (
     paper_example,
     planar_chain,
 )
-from models.free_floating import PLANAR_ROWS
-from models.machine import with_tip
+from models.machines.free_floating import PLANAR_ROWS
+from models.machines.machine import with_tip
 from models.spatial import Frame, solve_spd
 from models.virtual_chain import VirtualChain
 from tests.models.pinocchio_robots import ROBOTS, Peer, random_state, swapped, urdf_file

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import ModelError, tip_jacobian, tip_pose
+from models.machines.scara import Scara
+from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Arc, Line, Path, smooth
-from models.scara import Scara
-from models.scara_path import ScaraPath, scara_along
 from ocp import ProblemError
 from ocp.schedule import JointLimits, Limits, schedule
 from tests.models.task_paths import random_arm_path, seeds, turned

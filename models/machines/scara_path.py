@@ -11,8 +11,8 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput
 from models.errors import ModelError
+from models.machines.scara import Elbow, Scara
 from models.paths import SmoothPath
-from models.scara import Elbow, Scara
 
 __all__ = ["JointsAlong", "ScaraPath", "scara_along"]
 

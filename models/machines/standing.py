@@ -18,12 +18,12 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.errors import ModelError
 from models.kinematics import checked_vector
-from models.machine import FixedBase
+from models.machines.machine import FixedBase
+from models.machines.support import Support, rectangle
 from models.parts import massless
 from models.rebuild import simplified
 from models.robot import Robot, planar_chain
 from models.spatial import Expression, expression
-from models.support import Support, rectangle
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 """Wrenches from outside as a function of time (s) and the tip's position in the world (3, 1)."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from models import ModelError
-from models.support import Support, rectangle
+from models.machines.support import Support, rectangle
 from tests.models.trees import few, numeric, seeds
 
 

@@ -1,0 +1,1 @@
+"""Machines: a robot on a fixed, floating or standing base, and the SCARA arm."""
