@@ -1,12 +1,11 @@
 """Task paths: lines and arcs with tool orientation, rounded at their corners, as functions of the distance."""
 
 from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature
-from models.paths.chain import Path
-from models.paths.function import path_function, turn_function
-from models.paths.mapping import gauss_newton, march, predictor_corrector
+from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
+from models.paths.path import Path
+from models.paths.rounding import smooth
 from models.paths.segments import Arc, Line, Segment
-from models.paths.smooth import Blend, Place, SmoothPath, Turn
-from models.paths.smoothing import smooth
+from models.paths.smooth_path import Blend, Place, SmoothPath, Turn
 
 __all__ = [
     "Arc",

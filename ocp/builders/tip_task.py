@@ -16,9 +16,9 @@ import numpy as np
 from models import ModelError
 from models.arrays import ArrayInput, checked_array
 from models.machines.machine import checked_rows
-from models.paths.function import path_function
+from models.paths.functions import path_function
 from models.paths.orientation import exponential
-from models.paths.smooth import SmoothPath
+from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.builders.task import Array, Velocity
 from ocp.errors import ProblemError

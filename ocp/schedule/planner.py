@@ -114,7 +114,9 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
     """
     missing = [name for name in ("length", "bounds", "by_piece", "curvature", "dense") if not hasattr(path, name)]
     if missing:
-        raise ProblemError(f"the path {path!r} has no {missing[0]}; give a SmoothPath, as models.paths.smooth makes it")
+        raise ProblemError(
+            f"the path {path!r} has no {missing[0]}; give a SmoothPath, as models.paths.smooth_path makes it"
+        )
     if not isinstance(limits, Limits):
         raise ProblemError(f"limits {limits!r} must be a Limits")
     if limits.joints is not None and joints is None:

@@ -15,7 +15,7 @@ from ocp.builders import path_reference
 from ocp.builders.path_tables import largest_demand, table
 from ocp.builders.path_timing import Fastest, minimum_time, timing_problem
 from ocp.schedule import JointLimits, Limits, Schedule, joint_motion, peak_acceleration, schedule
-from tests.models.test_paths import example
+from tests.models.paths.test_paths import example
 
 INTERVALS = 100
 JOINTS = JointLimits([3.0, 3.0, 1.0, 6.0], [15.0, 15.0, 5.0, 30.0], [300.0, 300.0, 200.0, 800.0])

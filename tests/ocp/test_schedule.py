@@ -16,8 +16,8 @@ from models import ModelError
 from models.paths import Path, SmoothPath, smooth
 from ocp import ProblemError
 from ocp.schedule import JointLimits, Limits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
-from tests.models.task_paths import random_path, seeds
-from tests.models.test_paths import example
+from tests.models.paths.task_paths import random_path, seeds
+from tests.models.paths.test_paths import example
 
 few = settings(max_examples=40)
 NAN = float("nan")

@@ -40,8 +40,8 @@ from ocp.schedule.limits import cause_names
 from ocp.schedule.relaxing import relax_ramps
 from ocp.schedule.slowing import slow_down
 from ocp.schedule.zones import plan as planned
-from tests.models.task_paths import random_arm_path, seeds
-from tests.models.test_paths import example
+from tests.models.paths.task_paths import random_arm_path, seeds
+from tests.models.paths.test_paths import example
 from tests.ocp.problems import Array
 
 ARM = Scara(0.4, 0.4)

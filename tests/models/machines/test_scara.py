@@ -18,7 +18,7 @@ from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Arc, Line, Path, smooth
 from ocp import ProblemError
 from ocp.schedule import JointLimits, Limits, schedule
-from tests.models.task_paths import random_arm_path, seeds, turned
+from tests.models.paths.task_paths import random_arm_path, seeds, turned
 
 few = settings(max_examples=40)
 EVEN = Scara(0.4, 0.4)

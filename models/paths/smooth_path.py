@@ -13,8 +13,8 @@ from models.arrays import Array, ArrayInput
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, by_arc_length, quintic
-from models.paths.chain import Path
 from models.paths.orientation import along_piece
+from models.paths.path import Path
 
 __all__ = ["Blend", "Place", "SmoothPath", "Turn"]
 

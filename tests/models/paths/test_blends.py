@@ -27,7 +27,7 @@ from models.paths import (
 )
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
-from tests.models.task_paths import random_path, seeds
+from tests.models.paths.task_paths import random_path, seeds
 
 ANGLES = (5.0, 11.0, 30.0, 45.0, 77.0, 90.0, 120.0, 150.0, 175.0, 179.0)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from models import ModelError
 from models.paths import Arc, Line, Path, smooth
-from tests.models.task_paths import seeds, turned
+from tests.models.paths.task_paths import seeds, turned
 
 
 def points_of(arc: Arc, count: int = 101) -> Any:

@@ -27,8 +27,8 @@ from models.paths import (
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
 from ocp.schedule import Limits, SpeedProfile, peak_acceleration, schedule
-from tests.models.task_paths import random_path
-from tests.models.test_paths import example
+from tests.models.paths.task_paths import random_path
+from tests.models.paths.test_paths import example
 
 MM = 1e-3
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from models import ModelError
 from models.paths import Line, Path, smooth
 from models.paths.orientation import rotation_vector
-from tests.models.task_paths import product, random_path, seeds, turned
+from tests.models.paths.task_paths import product, random_path, seeds, turned
 
 few = settings(max_examples=40)
 
