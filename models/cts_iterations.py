@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
-from models.cts import HOME, INCH, Branch, Rig, Tunnel, forward, inverse, task_jacobian
-from models.cts_optimal import checked_gain
-from models.cts_roll import index_harmonics
+from models.cts.best_roll import checked_gain
+from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, forward, inverse, task_jacobian
+from models.cts.roll import index_harmonics
+from models.cts.table import checked_targets
 from models.errors import ModelError
 from models.spatial import Expression, solve_spd
 
@@ -162,19 +163,3 @@ def null_space(
         else:
             q = sound
     return Run(joints, counts, done)
-
-
-def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Targets as an array of shape (samples, 5), samples >= 1; ModelError naming the first row that is wrong."""
-    try:
-        rows = np.array(targets, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError("targets are not an array of numbers of shape (samples, 5)") from error
-    if rows.size == 0:
-        raise ModelError("targets: the table is empty; give at least one row (x, y, z, yaw, pitch)")
-    if rows.ndim != 2 or rows.shape[1] != 5:
-        raise ModelError(f"targets have shape {rows.shape}, expected (samples, 5): x, y, z, yaw, pitch")
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if finite and bad.size:
-        raise ModelError(f"targets: row {bad[0]} is {rows[bad[0]].tolist()}, not finite")
-    return rows

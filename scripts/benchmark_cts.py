@@ -18,9 +18,9 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
-from models.cts import HOME, forward, inverse, reference_rig, reference_tunnel
+from models.cts.best_roll import optimal_inverse
+from models.cts.rig import HOME, forward, inverse, reference_rig, reference_tunnel
 from models.cts_iterations import combined, null_space
-from models.cts_optimal import optimal_inverse
 from scripts import drawing
 from scripts.compiled import FLAGS, has_compiler, least
 from scripts.cts_compiled import compiled_inverse

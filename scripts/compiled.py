@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from models.arrays import Array
-from models.c_export import export
+from models.cts.export import export
 
 __all__ = ["FLAGS", "compiled", "has_compiler", "least", "pointers"]
 

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from models.arrays import Array
-from models.clearance import rig_capsules
-from models.cts import INCH, Rig
+from models.cts.clearance import rig_capsules
+from models.cts.rig import INCH, Rig
 from scripts.cts_results import NOTE, SCALE, Results, corners, surroundings
 from scripts.drawing import COLORS, DASHES, gif, sheet
 

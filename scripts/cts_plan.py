@@ -10,10 +10,11 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
-from models.clearance import Box, Surroundings, clearances
-from models.cts import INCH, Rig, Tunnel, inverse
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import index_harmonics
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Surroundings, clearances
+from models.cts.rig import INCH, Rig, Tunnel, inverse
+from models.cts.roll import index_harmonics
+from models.shapes.capsules import Box
 from ocp import Collocation, solve
 from ocp.builders.cts import roll_plan
 from scripts.drawing import COLORS, DASHES, sheet

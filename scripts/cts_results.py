@@ -12,14 +12,25 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
-from models.clearance import Box, Surroundings, clearances
-from models.cts import HOME, INCH, Rig, Tunnel, forward, goose_neck_corner, inverse, reference_rig, reference_tunnel
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Surroundings, clearances
+from models.cts.rig import (
+    HOME,
+    INCH,
+    Rig,
+    Tunnel,
+    forward,
+    goose_neck_corner,
+    inverse,
+    reference_rig,
+    reference_tunnel,
+)
+from models.cts.roll import index_harmonics
+from models.cts.table import Table, solve_table
 from models.cts_iterations import Run, combined, newton_step, null_space, null_space_step
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import index_harmonics
-from models.cts_table import Table, solve_table
 from models.parts import Link
 from models.rigid_body import Ejector, SlenderAir, Store, release, yaw_pitch
+from models.shapes.capsules import Box
 from scripts.compiled import has_compiler
 from scripts.cts_compiled import compiled_inverse
 from scripts.cts_plan import RollPlan, plan_sweep

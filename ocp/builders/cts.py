@@ -14,12 +14,12 @@ import numpy as np
 
 from models import ModelError
 from models.arrays import Array
-from models.clearance import Radii, Surroundings, clearances, soft_minimum
-from models.cts import HOME, Branch, Rig, Tunnel, joints_of, posture_at
-from models.cts_clearance import nearness
-from models.cts_iterations import checked_targets
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import index_harmonics
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Radii, Surroundings, clearances, nearness
+from models.cts.rig import HOME, Branch, Rig, Tunnel, joints_of, posture_at
+from models.cts.roll import index_harmonics
+from models.cts.table import checked_targets
+from models.shapes.capsules import soft_minimum
 from ocp.builders.cts_guess import least_course
 from ocp.errors import ProblemError
 from ocp.guess import Samples

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.cts import HOME, INCH, forward, inverse, reference_rig, reference_tunnel
+from models.cts.best_roll import optimal_inverse
+from models.cts.rig import HOME, INCH, forward, inverse, reference_rig, reference_tunnel
 from models.cts_iterations import Run, combined, newton_step, null_space, null_space_step
-from models.cts_optimal import optimal_inverse
 from models.errors import ModelError
-from tests.models.cts_oracle import Array, random_targets
+from tests.models.cts.cts_oracle import Array, random_targets
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
 

@@ -8,13 +8,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.clearance import Box, Surroundings, clearances
-from models.cts import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
-from models.cts_optimal import optimal_inverse
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Surroundings, clearances
+from models.cts.rig import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
+from models.shapes.capsules import Box
 from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.cts import roll_plan, spline_targets
 from ocp.builders.cts_guess import least_course
-from tests.models.cts_oracle import index_by_geometry
+from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
 HORIZON = 10.0

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.cts import reference_rig, reference_tunnel
-from models.cts_optimal import optimal_inverse
+from models.cts.best_roll import optimal_inverse
+from models.cts.rig import reference_rig, reference_tunnel
 from scripts import benchmark, benchmark_cts, cts_compiled
 from scripts.cts_results import sweep_targets
 

@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.c_export import export
-from models.cts import reference_rig, reference_tunnel
-from models.cts_export import rig_functions
+from models.cts.export import export, rig_functions
+from models.cts.rig import reference_rig, reference_tunnel
 from models.errors import ModelError
 from scripts import cts
-from tests.models.cts_oracle import random_targets
+from tests.models.cts.cts_oracle import random_targets
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (

@@ -1,4 +1,15 @@
-"""Search for the globally best roll: which rolls to look at, in what order, and when no more can matter.
+"""Inverse kinematics of the rig with the globally best roll, in a bounded number of operations.
+
+The best roll on a set of arcs is a stationary point of the index inside an arc or an end of an arc. The least of all is
+found first, with a fixed number of operations (harmonics.least_point for I1, descents on convex intervals for I2);
+where it is within reach and limits that is all. Else the ends are looked at, those that cost most last and only where
+they can matter (cts_search).
+
+Minima of I2, the index with the squared change of roll: on intervals where it is convex, by Newton steps.
+
+What the search for the best roll answers with: joints, cost, the active constraint, or the reason for none.
+
+Search for the globally best roll: which rolls to look at, in what order, and when no more can matter.
 
 The best roll on a set of arcs is a stationary point of the index or an end of an arc. Ends by joints 4 to 6 and the
 reach of the pitch link are cheap and are all compared. The others are first known roughly: one is polished and checked
@@ -11,15 +22,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models.cts import Branch, Rig, Tunnel, posture_at
-from models.cts_answer import SIZE, answer, finish, reason
-from models.cts_convex import convex_minima, unrolled
-from models.cts_roll import (
+from models.cts.rig import HOME, Branch, Rig, Tunnel, corner_circle, joints_of, posture_at
+from models.cts.roll import (
     ANGLE_INSET,
     Candidate,
     index_harmonics,
@@ -28,13 +39,196 @@ from models.cts_roll import (
     sharp_level,
     sharp_point,
     simple_ends,
+    slide_limit,
+    slide_points,
     verdict,
     yaw_chart,
     yaw_levels,
 )
-from models.cts_slide import slide_limit, slide_points
-from models.harmonics import Harmonics, Point, least_point, polish, roots
+from models.cts.trigonometric import Harmonics, Point, least_point, polish, roots
+from models.errors import ModelError
 from models.spatial import Expression
+
+TURN = 2 * np.pi
+
+
+def optimal_inverse(
+    rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
+) -> Any:
+    """Function (target, previous) -> (joints, cost, active, status): the joints with the roll of least index.
+
+    Args:
+        rig: Lengths and joint limits.
+        tunnel: Centre, ranges and weights of the index.
+        branch: Which of the four joint sets.
+        rate_weight: w4 of I2 = I1 + w4 / (2 pi) (roll - previous)^2, (37); 0 for I1.
+        limits: Whether reach and joint limits bound the roll. Without them the stationary point of least index is
+            taken, in closed form only, and the status tells whether the pose is in reach and within limits.
+
+    Returns:
+        A casadi Function. Inputs: target (x, y, z, yaw, pitch), shape (5,); previous roll, rad. Outputs: joints,
+        shape (6,), nan unless the status is 0; the index; code of the active constraint in cts_roll.ACTIVE; code in
+        cts_roll.STATUS. The roll is given in the turn nearest to the previous one that the limits of joint 6 allow,
+        or, where they allow less than a turn, in theirs.
+
+    Raises:
+        ModelError: A negative or non-finite rate weight; limits=False with a rate weight.
+    """
+    gain = checked_gain(rate_weight)
+    if gain and not limits:
+        raise ModelError("limits=False is for the closed form of I1; with a rate weight leave limits on")
+    return _built(rig, tunnel, branch, gain, limits)
+
+
+@lru_cache(maxsize=32)  # rig and tunnel are frozen; a function asked for again is the same
+def _built(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) -> Any:
+    search = Search(rig, tunnel, branch, gain)
+    target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    result, done, state, rows = search.direct()(target, previous)
+    if limits:
+        result = choose(search.thorough(), (9, 1))(done, result, target, previous, state, rows)
+    out = ca.vertsplit(result, [0, 6, 7, 8, 9])
+    name = f"optimal_inverse_{'i2' if gain else 'i1'}{'' if limits else '_free'}"
+    labels = ["target", "previous"], ["joints", "cost", "active", "status"]
+    return ca.Function(name, [target, previous], list(out), *labels)
+
+
+def checked_gain(rate_weight: float) -> float:
+    """w4 / (2 pi); ModelError for a weight that is negative or not finite."""
+    if not (np.isfinite(rate_weight) and rate_weight >= 0):
+        raise ModelError(f"rate_weight {rate_weight} must be finite and not negative")
+    return float(rate_weight) / TURN
+
+
+CONVEX_STEPS, PIECE_STEPS = 12, 20
+
+
+def unrolled(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
+    """Roll of a point of the circle in the turn that is nearest to the previous roll, or in that of the limits."""
+    angle = ca.atan2(s, c)
+    if rig.limited(6):
+        middle = (rig.lower[5] + rig.upper[5]) / 2
+        return angle - TURN * ca.floor((angle - middle) / TURN + 0.5)
+    start = roll_window(rig, previous)[0]
+    return angle + TURN * ca.ceil((start - angle) / TURN)
+
+
+def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
+    """The turn, or less, of rolls within the limits of joint 6 in which each roll is nearest to the previous one."""
+    start = previous - np.pi
+    if not np.isfinite(rig.lower[5]):
+        return start, start + TURN
+    low, high = rig.lower[5], rig.upper[5]
+    start = ca.fmax(low, ca.fmin(start, high - TURN))
+    return start, ca.fmin(high, start + TURN)
+
+
+def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
+    """Function (target, previous) -> rolls, shape (5, 1), rad, among which are all minima of I1 + gain change^2.
+
+    Where I2 is convex one descent does; else the window of rolls is cut where I1'' = -2 gain, and every piece that is
+    convex has a minimum of its own.
+    """
+    target, previous = ca.SX.sym("target", 5), ca.SX.sym("previous")
+    f = index_harmonics(rig, tunnel, target)
+    start, end = roll_window(rig, previous)
+    start, end = start + 2 * ANGLE_INSET, end - 2 * ANGLE_INSET
+    first = ca.fmin(ca.fmax(previous, start), end)
+    whole = descend(f, gain, previous, start, end, first, CONVEX_STEPS)
+    convex = ca.Function("convex", [target, previous], [ca.repmat(whole, 5, 1)])
+    cuts = [start, *_sorted(_splits(f, gain, start, end)), end]
+    pieces = [descend(f, gain, previous, a, b, (a + b) / 2, PIECE_STEPS) for a, b in pairwise(cuts)]
+    cut = ca.Function("pieces", [target, previous], [ca.vertcat(*pieces)])
+    is_convex = ca.Function("is_convex", [target], [2 * gain >= f.slope_bound()])
+    x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    rolls = ca.Function.if_else("descend", convex, cut)(is_convex(x), x, before)
+    return ca.Function("convex_minima", [x, before], [rolls])
+
+
+def descend(
+    f: Harmonics, gain: float, previous: Expression, a: Expression, b: Expression, start: Expression, steps: int
+) -> Expression:
+    """Minimum of I2 on an interval [a, b] where it is convex, by Newton steps kept in a bracket that shrinks."""
+    slope, bend = f.derivative(), f.derivative().derivative()
+    x = start
+    for _ in range(steps):
+        c, s = ca.cos(x), ca.sin(x)
+        value = slope.value(c, s) + 2 * gain * (x - previous)
+        curvature = bend.value(c, s) + 2 * gain
+        a, b = ca.if_else(value > 0, a, x), ca.if_else(value > 0, x, b)
+        newton = x - value / curvature
+        x = ca.if_else(ca.logic_and(newton >= a, newton <= b), newton, (a + b) / 2)
+    return x
+
+
+def _splits(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
+    """Where I1'' = -2 k within the window, and rolls that mean nothing: I2 is convex or concave between them."""
+    bend = f.derivative().derivative()
+    found = []
+    for c, s in roots(bend._replace(a0=2 * gain)):
+        angle = ca.atan2(s, c)
+        found.append(ca.fmin(angle + TURN * ca.ceil((start - angle) / TURN), end))
+    return found
+
+
+def _sorted(values: Sequence[Expression]) -> list[Expression]:
+    """Four expressions in order, by a network of five exchanges."""
+    v = list(values)
+    for i, k in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):
+        v[i], v[k] = ca.fmin(v[i], v[k]), ca.fmax(v[i], v[k])
+    return v
+
+
+SIZE = 6
+"""Entries of a state of the search: cost, cosine, sine and code of the best roll, and the least costs of rolls that
+meet everything but the lower, or upper, limit of joint 1."""
+
+
+def finish(rig: Rig, branch: Branch) -> Any:
+    """Function (target, previous, state) -> answer with the best roll."""
+    target, previous, state = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("state", SIZE)
+    cost, c, s, code = ca.vertsplit(state[:4])
+    found = answer(rig, branch, target, previous, c, s, cost, code, 0)
+    return ca.Function("finish", [target, previous, state], ca.cse([found]))
+
+
+def reason(rig: Rig, branch: Branch) -> Any:
+    """Function (target) -> answer where no roll will do: without joints, with the status that tells why."""
+    target, rig = ca.SX.sym("target", 5), rig.unlimited()
+    axle, e_c, _ = corner_circle(rig, target)
+    pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
+    points: list[Point] = [(1.0, 0.0)]
+    points += [(end.c, end.s) for end in simple_ends(rig, target, branch)]
+    chart = yaw_chart(rig, branch)
+    for level in yaw_levels(rig, target, branch):
+        rough, above = level_points(rig, target, level.cosine), 1 if level.above else -1
+        points += [sharp_level(rig, chart, target, level.cosine, above, point) for point in rough]
+    yaw: Expression = 0
+    for c, s in points:
+        posture = posture_at(rig, target, c, s, branch)
+        yaw = ca.logic_or(yaw, verdict(rig, target, posture, c, s).relaxed())
+    status = ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
+    result = ca.vertcat(ca.DM.ones(7) * np.nan, 0, status)
+    return ca.Function("reason", [target], ca.cse([result]))
+
+
+def answer(
+    rig: Rig,
+    branch: Branch,
+    target: Expression,
+    previous: Expression,
+    c: Expression,
+    s: Expression,
+    cost: Expression,
+    code: Expression,
+    status: Expression,
+) -> Expression:
+    """Joints and index, nan unless the status is 0, code of ACTIVE and of STATUS. Shape (9, 1)."""
+    roll = unrolled(rig, c, s, previous)
+    joints = joints_of(rig, target, roll, posture_at(rig, target, c, s, branch))
+    spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
+    return ca.vertcat(joints + spoilt, cost + spoilt, code, status)
+
 
 NO_TABLE = ca.DM([[ca.inf] * 4, [1] * 4, [0] * 4, [0] * 4, [0] * 4, [0] * 4])
 NOTHING = ca.DM([ca.inf, 1, 0, 0, ca.inf, ca.inf])

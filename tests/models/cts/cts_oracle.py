@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.cts import Branch, Rig, Tunnel
+from models.cts.rig import Branch, Rig, Tunnel
 
 Array = NDArray[np.float64]
 

@@ -11,22 +11,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.clearance import (
+from models.cts.clearance import Surroundings, clearances, rig_capsules
+from models.cts.rig import dh_frames, reference_rig
+from models.errors import ModelError
+from models.parts import Link
+from models.rigid_body import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
+from models.shapes.capsules import (
     Box,
     Capsule,
-    Surroundings,
     box_distance,
     capsule_in_box,
     capsule_to_box,
     capsule_to_capsule,
-    clearances,
-    rig_capsules,
     soft_minimum,
 )
-from models.cts import dh_frames, reference_rig
-from models.errors import ModelError
-from models.parts import Link
-from models.rigid_body import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
 
 seeds = st.integers(0, 2**32 - 1)
 BODY = Link("store", 240.0, inertia=np.diag([6.0, 75.0, 80.0]))

@@ -8,14 +8,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.clearance import Box, Surroundings, clearances, soft_minimum
-from models.cts import HOME, INCH, inverse, reference_rig, reference_tunnel
-from models.cts_clearance import clear_inverse
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import ACTIVE, STATUS
-from models.cts_table import solve_table
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Surroundings, clear_inverse, clearances
+from models.cts.rig import HOME, INCH, inverse, reference_rig, reference_tunnel
+from models.cts.roll import ACTIVE, STATUS
+from models.cts.table import solve_table
 from models.errors import ModelError
-from tests.models.cts_oracle import Array, index_by_geometry, joints_by_geometry
+from models.shapes.capsules import Box, soft_minimum
+from tests.models.cts.cts_oracle import Array, index_by_geometry, joints_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
 AROUND = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))

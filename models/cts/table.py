@@ -11,13 +11,10 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput
-from models.clearance import Surroundings
-from models.cts import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
-from models.cts_clearance import clear_inverse
-from models.cts_iterations import checked_targets
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import ACTIVE, STATUS, angle_ends, limit_code, verdict
-from models.cts_slide import slide_ends
+from models.cts.best_roll import optimal_inverse
+from models.cts.clearance import Surroundings, clear_inverse
+from models.cts.rig import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
+from models.cts.roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
 from models.errors import ModelError
 
 TURN = 2 * np.pi
@@ -235,3 +232,19 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
         link, by = ("pitch", pitch * rig.pitch_link) if pitch < 0 else ("yaw", yaw * rig.yaw_link_1)
         raise ModelError(f"target {row.tolist()} with roll {roll} rad: the {link} link is {-by:.4g} m too short")
     return found
+
+
+def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
+    """Targets as an array of shape (samples, 5), samples >= 1; ModelError naming the first row that is wrong."""
+    try:
+        rows = np.array(targets, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError("targets are not an array of numbers of shape (samples, 5)") from error
+    if rows.size == 0:
+        raise ModelError("targets: the table is empty; give at least one row (x, y, z, yaw, pitch)")
+    if rows.ndim != 2 or rows.shape[1] != 5:
+        raise ModelError(f"targets have shape {rows.shape}, expected (samples, 5): x, y, z, yaw, pitch")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if finite and bad.size:
+        raise ModelError(f"targets: row {bad[0]} is {rows[bad[0]].tolist()}, not finite")
+    return rows

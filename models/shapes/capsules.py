@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import ArrayInput, checked_array, checked_rotation
-from models.cts import INCH, Rig, dh_frames
 from models.errors import ModelError
 from models.spatial import Expression, expression
 
@@ -154,66 +153,3 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     for value in values[1:]:
         least = ca.fmin(least, value)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
-
-
-@dataclass(frozen=True)
-class Radii:
-    """Radii of the rig's capsules, m: yaw links, pitch link, goose-neck and sting."""
-
-    yaw: float = 2.0 * INCH
-    pitch: float = 1.5 * INCH
-    sting: float = 0.75 * INCH
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What the rig must not touch.
-
-    Attributes:
-        walls: The tunnel, hollow; its floor is a wall. None for no walls.
-        solids: The floor's fittings, the parent aircraft, ... as boxes.
-        capsules: The same as capsules, in world.
-    """
-
-    walls: Box | None = None
-    solids: tuple[Box, ...] = ()
-    capsules: tuple[Capsule, ...] = ()
-
-
-def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, Capsule]:
-    """Links of the rig as capsules, by name, from joint 2 to the store."""
-    radii = radii or Radii()
-    frames = dh_frames(rig, q)
-    joint2, joint3, joint4 = (frames[k].position for k in (1, 2, 3))
-    side = frames[3].point((0, 0, rig.yaw_offset))
-    corner, tool = frames[4].position, frames[7]
-    behind = tool.point((-rig.sting, 0, 0))
-    return {
-        "yaw link 1": Capsule(joint2, joint3, radii.yaw),
-        "yaw link 2": Capsule(joint3, joint4, radii.yaw),
-        "yaw offset": Capsule(joint4, side, radii.yaw),
-        "pitch link": Capsule(side, corner, radii.pitch),
-        "goose-neck": Capsule(corner, behind, radii.sting),
-        "sting": Capsule(behind, tool.position, radii.sting),
-    }
-
-
-def clearances(
-    rig: Rig, q: Expression, surroundings: Surroundings, radii: Radii | None = None
-) -> dict[tuple[str, str], Expression]:
-    """Distance of every link to everything around it, by (link, thing). Each of shape (1, 1), m.
-
-    Raises:
-        ModelError: Nothing around.
-    """
-    found: dict[tuple[str, str], Expression] = {}
-    for name, capsule in rig_capsules(rig, q, radii).items():
-        if surroundings.walls is not None:
-            found[name, "walls"] = capsule_in_box(capsule, surroundings.walls)
-        for k, box in enumerate(surroundings.solids):
-            found[name, f"solid {k}"] = capsule_to_box(capsule, box)
-        for k, other in enumerate(surroundings.capsules):
-            found[name, f"capsule {k}"] = capsule_to_capsule(capsule, other)
-    if not found:
-        raise ModelError("clearances: the surroundings are empty; give walls, solids or capsules")
-    return found

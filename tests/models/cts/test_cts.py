@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.cts import (
+from models.cts.rig import (
     BRANCHES,
     HOME,
     INCH,
@@ -26,9 +26,15 @@ from models.cts import (
     task_jacobian,
     tool_frame,
 )
-from models.cts_roll import index_harmonics
+from models.cts.roll import index_harmonics
 from models.errors import ModelError
-from tests.models.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
+from tests.models.cts.cts_oracle import (
+    Array,
+    corner_by_rotation,
+    index_by_geometry,
+    joints_by_geometry,
+    random_targets,
+)
 
 lengths = st.lists(st.floats(0.02, 3.0), min_size=6, max_size=6)
 seeds = st.integers(0, 2**32 - 1)

@@ -10,14 +10,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.cts import BRANCHES, HOME, INCH, Branch, Rig, Tunnel, forward, reference_rig, reference_tunnel
-from models.cts_optimal import optimal_inverse
-from models.cts_roll import ACTIVE, STATUS
-from models.cts_table import Table, all_joint_sets, reachable_arcs, solve_table
+from models.cts.best_roll import optimal_inverse
+from models.cts.rig import (
+    BRANCHES,
+    HOME,
+    INCH,
+    Branch,
+    Rig,
+    Tunnel,
+    forward,
+    reference_rig,
+    reference_tunnel,
+)
+from models.cts.roll import ACTIVE, STATUS
+from models.cts.table import Table, all_joint_sets, reachable_arcs, solve_table
+from models.cts.trigonometric import Harmonics, least_point, roots, series_roots
 from models.errors import ModelError
-from models.harmonics import Harmonics, least_point, roots
-from models.series import series_roots
-from tests.models.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
+from tests.models.cts.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {
     "lower": (0.2, -3.0, -2.0, -1.2, 0.3, -2.0),

@@ -1,0 +1,1 @@
+"""The captive trajectory rig of a wind tunnel: its kinematics, and the roll that its task leaves open."""

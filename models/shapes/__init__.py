@@ -1,0 +1,1 @@
+"""Bodies in space and the distances between them, as expressions."""
