@@ -1,8 +1,13 @@
 """What a machine is: symbolic kinematics, geometry and momentum. Knows nothing of problems or solvers."""
 
-from models.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.errors import ModelError
-from models.kinematics import (
+from models.machines.footprint import Footprint, footprint
+from models.machines.free_floating import FreeFloating, paper_example
+from models.machines.machine import FixedBase, Machine
+from models.machines.standing import Standing
+from models.machines.support import Support, rectangle
+from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
+from models.robot.kinematics import (
     center_of_mass,
     center_of_mass_jacobian,
     centers_of_mass,
@@ -14,14 +19,9 @@ from models.kinematics import (
     tip_jacobian,
     tip_pose,
 )
-from models.machines.footprint import Footprint, footprint
-from models.machines.free_floating import FreeFloating, paper_example
-from models.machines.machine import FixedBase, Machine
-from models.machines.standing import Standing
-from models.machines.support import Support, rectangle
-from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
-from models.parts import Joint, Link
-from models.rebuild import (
+from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
+from models.robot.parts import Joint, Link
+from models.robot.rebuild import (
     attached,
     locked,
     merged,
@@ -33,7 +33,7 @@ from models.rebuild import (
     subtree,
     with_load,
 )
-from models.robot import Robot, planar_chain
+from models.robot.robot import Robot, planar_chain
 from models.spatial import Frame
 
 __all__ = [

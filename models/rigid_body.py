@@ -16,7 +16,7 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Link
+from models.robot.parts import Link
 from models.spatial import Expression, cross, expression, quaternion_product, rotation_from_quaternion
 
 GRAVITY = 9.80665

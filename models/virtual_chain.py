@@ -14,8 +14,8 @@ import numpy as np
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.machines.free_floating import PLANAR_ROWS, FreeFloating
-from models.parts import Joint, Link
-from models.robot import Robot
+from models.robot.parts import Joint, Link
+from models.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)

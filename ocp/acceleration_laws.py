@@ -15,8 +15,8 @@ import numpy as np
 
 from models.machines.machine import jacobian_manipulability
 from models.machines.standing import External, Standing, wrenches_at
-from models.motion import center_of_mass_motion, momentum
-from models.posture import joint_limit_index
+from models.robot.indices import joint_limit_index
+from models.robot.motion import center_of_mass_motion, momentum
 from ocp.builders.tip_path import Path, path_derivatives
 from ocp.builders.zmp_rules import is_finite
 from ocp.errors import ProblemError

@@ -28,8 +28,8 @@ from models.cts.rig import (
 from models.cts.roll import index_harmonics
 from models.cts.table import Table, solve_table
 from models.cts_iterations import Run, combined, newton_step, null_space, null_space_step
-from models.parts import Link
 from models.rigid_body import Ejector, SlenderAir, Store, release, yaw_pitch
+from models.robot.parts import Link
 from models.shapes.capsules import Box
 from scripts.compiled import has_compiler
 from scripts.cts_compiled import compiled_inverse

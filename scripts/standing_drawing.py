@@ -14,8 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from models.kinematics import link_frames
 from models.machines.standing_motion import StandingMotion
+from models.robot.kinematics import link_frames
 from scripts.drawing import COLORS, DASHES
 from scripts.standing_cases import Array, Local, machine
 from scripts.standing_plans import Plan

@@ -11,12 +11,12 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_rotation
 from models.errors import ModelError
-from models.kinematics import link_frames
 from models.machines.support import Support
-from models.robot import Robot
+from models.robot.kinematics import link_frames
+from models.robot.robot import Robot
+from models.robot.tree import absent
+from models.robot.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
 from models.spatial import Frame
-from models.tree import absent
-from models.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
 
 RIM = 32
 """Points by which the rim of a cylinder is described: its contact is this polygon, inside the true one."""

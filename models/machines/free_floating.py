@@ -25,7 +25,8 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.kinematics import (
+from models.machines.machine import TWIST_SIZE, jacobian_manipulability, require_joints
+from models.robot.kinematics import (
     center_of_mass,
     checked_vector,
     frames_and_axes,
@@ -35,10 +36,9 @@ from models.kinematics import (
     subtree_moments,
     tip_frame,
 )
-from models.kinematics import momentum_matrix as joint_momentum_matrix
-from models.machines.machine import TWIST_SIZE, jacobian_manipulability, require_joints
-from models.parts import Link, massless
-from models.robot import Robot, planar_chain
+from models.robot.kinematics import momentum_matrix as joint_momentum_matrix
+from models.robot.parts import Link, massless
+from models.robot.robot import Robot, planar_chain
 from models.spatial import (
     Expression,
     Frame,

@@ -11,8 +11,8 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
-from models.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
-from models.robot import Robot
+from models.robot.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
+from models.robot.robot import Robot
 from models.spatial import Expression, Frame, determinant, expression, on_scalars
 
 TWIST_SIZE = 6

@@ -19,8 +19,8 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.parts import Joint, Link
-from models.robot import Robot
+from models.robot.parts import Joint, Link
+from models.robot.robot import Robot
 from models.spatial import Expression, Frame, expression, rotation
 
 __all__ = ["Elbow", "Scara"]

@@ -15,14 +15,14 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
-from models.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.errors import ModelError
-from models.kinematics import checked_vector
 from models.machines.machine import FixedBase
 from models.machines.support import Support, rectangle
-from models.parts import massless
-from models.rebuild import simplified
-from models.robot import Robot, planar_chain
+from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
+from models.robot.kinematics import checked_vector
+from models.robot.parts import massless
+from models.robot.rebuild import simplified
+from models.robot.robot import Robot, planar_chain
 from models.spatial import Expression, expression
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]

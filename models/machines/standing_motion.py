@@ -11,9 +11,9 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.kinematics import center_of_mass
 from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
-from models.posture import joint_excess, joint_limit_index
+from models.robot.indices import joint_excess, joint_limit_index
+from models.robot.kinematics import center_of_mass
 
 SLACK = 1e-9
 """How far beyond a limit rounding may carry a motion that stands exactly at it; m, rad, N."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
-from models.kinematics import checked_vector
+from models.robot.kinematics import checked_vector
 from models.spatial import Expression
 
 FLAT = 1e-9

@@ -32,10 +32,10 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models.dynamics import Wrench
 from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
 from models.machines.standing_motion import StandingMotion
-from models.posture import joint_limit_index
+from models.robot.dynamics import Wrench
+from models.robot.indices import joint_limit_index
 from ocp.builders.standing_guess import local_guess
 from ocp.builders.standing_options import FreeTime, Limits, Weights
 from ocp.builders.standing_start import check_freedom, check_loads, check_slope, inside_limits, tip_demand

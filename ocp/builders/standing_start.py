@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.dynamics import Wrench
 from models.machines.standing import Standing
+from models.robot.dynamics import Wrench
 from ocp.builders.task import Array
 from ocp.builders.tip_path import Path, path_derivatives
 from ocp.builders.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges

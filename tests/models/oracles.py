@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio
 
 from models import Robot
-from models.dynamics import Wrench
-from tests.models.trees import Array, numeric_poses, random_inertia
+from models.robot.dynamics import Wrench
+from tests.models.robot.trees import Array, numeric_poses, random_inertia
 
 
 def with_masses(robot: Robot, rng: np.random.Generator) -> Robot:

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from models.costates import costate_rate, hamiltonian, state_rate
 from models.recursion import J, dJ
-from tests.models.chains import CLEARLY, TOLERANCE, Case, error, example, spatial_case
-from tests.models.trees import Array
+from tests.models.robot.chains import CLEARLY, TOLERANCE, Case, error, example, spatial_case
+from tests.models.robot.trees import Array
 
 LINEAR = [3, 4, 5]
 ABOVE_ROUNDING = 1e-3

@@ -23,7 +23,7 @@ from models.costates import (
     state_rate,
 )
 from models.recursion import D, J
-from tests.models.chains import (
+from tests.models.robot.chains import (
     CLEARLY,
     TOLERANCE,
     Case,
@@ -34,7 +34,7 @@ from tests.models.chains import (
     planar_case,
     spatial_case,
 )
-from tests.models.trees import Array, numeric, seeds
+from tests.models.robot.trees import Array, numeric, seeds
 
 
 @every_case

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.spatial import determinant, solve_spd
-from tests.models.trees import Array, numeric, seeds
+from tests.models.robot.trees import Array, numeric, seeds
 
 
 def random_spd(rng: np.random.Generator, size: int) -> Array:

@@ -18,8 +18,8 @@ from models import FreeFloating, Joint, Link, ModelError, Robot
 from models.costates import generalized_jacobian
 from models.recursion import D, J, dD, dJ
 from models.virtual_chain import VirtualChain, joint_transform, motion_cross, transforms
-from tests.models.chains import CLEARLY, TOLERANCE, Case, by_index, error, every_case, example, spatial_case
-from tests.models.trees import Array, numeric, vee
+from tests.models.robot.chains import CLEARLY, TOLERANCE, Case, by_index, error, every_case, example, spatial_case
+from tests.models.robot.trees import Array, numeric, vee
 
 
 @every_case

@@ -28,7 +28,7 @@ from models.spatial import (
     skew,
     spatial_inertia,
 )
-from tests.models.trees import (
+from tests.models.robot.trees import (
     Array,
     numeric,
     random_frame,

@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, FreeFloating, Link, Machine, Robot
-from models.rebuild import merged
+from models.robot.rebuild import merged
 from ocp import Solution
 from ocp.builders.task_equations import task_errors
 from ocp.builders.tip_task import PoseLine, pose_line
-from tests.models.pinocchio_robots import ROBOTS, urdf_file
-from tests.models.trees import Array, numeric
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+from tests.models.robot.trees import Array, numeric
 
 PANDA_START = np.array([0.1, -0.3, 0.3, -1.9, 0.4, 1.7, 0.7])
 UR5_START = np.array([0.3, -1.2, 1.5, -1.9, -1.55, 0.2])

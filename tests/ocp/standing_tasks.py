@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.dynamics import Wrench
 from models.machines.standing import PAPER_START, External, Standing, paper_example, tip_spring
 from models.machines.standing_motion import StandingMotion, standing_motion
+from models.robot.dynamics import Wrench
 from ocp import Problem, Solution
 from ocp.builders.standing import FreeTime, Limits, Weights, standing_plan
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm
-from tests.models.trees import Array
+from tests.models.robot.trees import Array
 
 HORIZON = 2 * np.pi
 ROWS = (4, 5)

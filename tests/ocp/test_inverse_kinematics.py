@@ -11,7 +11,7 @@ from models import FixedBase, Joint, Link, Robot, planar_chain
 from ocp.builders.tip_task import TipTask
 from ocp.errors import ProblemError
 from ocp.inverse_kinematics import Unreachable, inverse_kinematics
-from tests.models.trees import seeds
+from tests.models.robot.trees import seeds
 from tests.ocp.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
 
 

@@ -16,7 +16,7 @@ from ocp.builders.redundancy_plan import plan_minimum_velocity
 from ocp.builders.tip_task import TipTask
 from ocp.inverse_kinematics import Unreachable
 from ocp.local import resolve
-from tests.models.trees import seven_joint_arm
+from tests.models.robot.trees import seven_joint_arm
 
 START = np.deg2rad([60.0, -100.0, -20.0])
 SHORT = Collocation(intervals=10, degree=3)

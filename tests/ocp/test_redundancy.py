@@ -13,7 +13,7 @@ from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.errors import ProblemError
 from ocp.local import resolve
-from tests.models.trees import numeric, seven_joint_arm
+from tests.models.robot.trees import numeric, seven_joint_arm
 
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])
 PAPER_COST = 1.735114311245  # backward-shooting minimum principle, horizon 5 s

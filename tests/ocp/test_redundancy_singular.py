@@ -15,7 +15,7 @@ from ocp.builders.redundancy_plan import plan_minimum_velocity
 from ocp.builders.task_equations import task_errors
 from ocp.builders.tip_task import TipTask
 from ocp.local import resolve
-from tests.models.trees import numeric, seven_joint_arm
+from tests.models.robot.trees import numeric, seven_joint_arm
 
 HORIZON = 4.0
 

@@ -20,7 +20,7 @@ from ocp.builders.tip_task import TipTask, along
 from ocp.errors import ProblemError
 from ocp.inverse_kinematics import Unreachable
 from ocp.local import resolve
-from tests.models.trees import numeric, seven_joint_arm
+from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.space_tasks import (
     BASE,
     PANDA_START,

@@ -27,7 +27,7 @@ from ocp.builders.standing import (
 from ocp.errors import ProblemError, SolveError
 from ocp.local_acceleration import Stabiliser, resolve_accelerations
 from tests.models.machines.standing_machines import planar_machine
-from tests.models.trees import numeric
+from tests.models.robot.trees import numeric
 from tests.ocp.standing_replay import replay
 from tests.ocp.standing_tasks import (
     ARM_HORIZON,

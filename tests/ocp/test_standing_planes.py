@@ -18,7 +18,7 @@ from ocp.builders.zmp_rules import ZmpRule
 from ocp.errors import ProblemError
 from ocp.local_acceleration import resolve_accelerations
 from tests.models.machines.standing_machines import planar_machine
-from tests.models.trees import Array, numeric
+from tests.models.robot.trees import Array, numeric
 from tests.ocp.standing_tasks import PLANAR_HORIZON, planar_path, planar_start, quintic, sampled, tip_at
 
 SIZE = 5

@@ -25,8 +25,8 @@ from ocp.errors import ProblemError
 from ocp.local_acceleration import resolve_accelerations
 from scripts import gallery_pushing as pushing
 from scripts import gallery_standing as gallery
-from tests.models.pinocchio_robots import Peer, State
-from tests.models.trees import Array, numeric
+from tests.models.robot.pinocchio_robots import Peer, State
+from tests.models.robot.trees import Array, numeric
 from tests.ocp.standing_tasks import sampled, tip_error
 
 pytestmark = pytest.mark.xdist_group("standing robots")

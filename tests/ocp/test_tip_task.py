@@ -14,7 +14,7 @@ from ocp.builders.task_equations import bind, task_errors
 from ocp.builders.tip_task import TipTask, along, pose_line
 from ocp.errors import ProblemError
 from ocp.local import resolve
-from tests.models.trees import Array, numeric
+from tests.models.robot.trees import Array, numeric
 from tests.ocp.space_tasks import (
     BASE,
     PANDA_START,

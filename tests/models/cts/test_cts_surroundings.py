@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from models.cts.clearance import Surroundings, clearances, rig_capsules
 from models.cts.rig import dh_frames, reference_rig
 from models.errors import ModelError
-from models.parts import Link
 from models.rigid_body import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
+from models.robot.parts import Link
 from models.shapes.capsules import (
     Box,
     Capsule,

@@ -9,7 +9,7 @@ import numpy as np
 from models import Joint, Link, Robot, planar_chain
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
-from tests.models.trees import Array, random_robot, random_rotation
+from tests.models.robot.trees import Array, random_robot, random_rotation
 
 
 def standing_arm() -> Standing:

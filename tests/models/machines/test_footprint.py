@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull
 
 from models import ModelError, Robot, link_frames, simplified
 from models.machines.footprint import convex_hull, footprint
-from tests.models.pinocchio_robots import ROBOTS, urdf_file
-from tests.models.trees import numeric
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+from tests.models.robot.trees import numeric
 
 PLATFORM = """
 <robot name="cart">

@@ -20,7 +20,7 @@ from models import (
     planar_chain,
 )
 from models.machines.machine import jacobian_manipulability
-from tests.models.trees import (
+from tests.models.robot.trees import (
     Base,
     few,
     numeric,

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import Joint, Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
-from models.dynamics import Wrench
 from models.machines.standing import PAPER_START, Standing, center_of_pressure, paper_example, tip_spring
 from models.machines.standing_motion import standing_motion
 from models.machines.support import rectangle
-from models.motion import link_motions
+from models.robot.dynamics import Wrench
+from models.robot.motion import link_motions
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
 from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
-from tests.models.trees import Array, few, numeric, random_robot, random_rotation, seeds
+from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
 sizes = st.integers(1, 6)

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from models import ModelError
 from models.machines.support import Support, rectangle
-from tests.models.trees import few, numeric, seeds
+from tests.models.robot.trees import few, numeric, seeds
 
 
 @given(seeds, st.integers(3, 12), st.booleans())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from models.kinematics import joint_vector
-from models.robot import Robot
+from models.robot.kinematics import joint_vector
+from models.robot.robot import Robot
 from models.spatial import Expression
 
 

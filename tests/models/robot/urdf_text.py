@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from models import Robot
-from tests.models.trees import Array
+from tests.models.robot.trees import Array
 
 
 def numbers(values: Any) -> str:

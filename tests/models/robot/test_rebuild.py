@@ -34,8 +34,8 @@ from models import (
     tip_pose,
     with_load,
 )
-from tests.models.pinocchio_robots import ROBOTS, urdf_file
-from tests.models.trees import (
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+from tests.models.robot.trees import (
     Array,
     few,
     numeric,

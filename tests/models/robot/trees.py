@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from models import Joint, Link, Robot, link_frames
-from models.parts import Kind
+from models.robot.parts import Kind
 
 Array = NDArray[np.float64]
 Base = Literal["planar", "spatial"]

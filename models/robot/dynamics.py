@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 
 from models.errors import ModelError
-from models.kinematics import Placement, checked_vector, frames_and_axes
-from models.motion import LinkMotion, momentum_rates, motions_of
-from models.robot import Robot
+from models.robot.kinematics import Placement, checked_vector, frames_and_axes
+from models.robot.motion import LinkMotion, momentum_rates, motions_of
+from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars
 
 GRAVITY = (0.0, 0.0, -9.81)

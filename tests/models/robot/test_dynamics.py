@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import ModelError, center_of_mass, frame_jacobian, link_frames, momentum_matrix, planar_chain
-from models.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
-from models.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
+from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
+from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
-from tests.models.trees import (
+from tests.models.robot.trees import (
     Array,
     directional,
     few,

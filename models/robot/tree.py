@@ -10,7 +10,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from models.errors import ModelError
-from models.parts import Joint, Link
+from models.robot.parts import Joint, Link
 
 MANY = 12
 """More names than these are not listed in full in a message."""

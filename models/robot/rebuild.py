@@ -14,9 +14,9 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
-from models.parts import Joint, Link
-from models.robot import Robot
-from models.tree import reroot
+from models.robot.parts import Joint, Link
+from models.robot.robot import Robot
+from models.robot.tree import reroot
 
 
 def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
@@ -154,7 +154,7 @@ def renamed(robot: Robot, prefix: str) -> Robot:
 def rerooted(robot: Robot, root: str) -> Robot:
     """The robot hung up at another link, its new base: same links, frames, joint names, limits and signs.
 
-    See `models.tree.reroot` for the massless links that this takes.
+    See `models.robot.tree.reroot` for the massless links that this takes.
     """
     links, joints = reroot(robot.links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)

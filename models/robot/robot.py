@@ -11,9 +11,9 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
-from models.parts import Joint, Link
-from models.tree import absent, find_root, require_unique, reroot, tree_order
-from models.urdf import InertiaRule, MimicRule, Source, held_by_mimicry, read_urdf
+from models.robot.parts import Joint, Link
+from models.robot.tree import absent, find_root, require_unique, reroot, tree_order
+from models.robot.urdf import InertiaRule, MimicRule, Source, held_by_mimicry, read_urdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +80,13 @@ class Robot:
         mimic: MimicRule = "error",
         inertia: InertiaRule = "error",
     ) -> Robot:
-        """The robot of a URDF description, see `models.urdf.read_urdf` for what is read and what has which default.
+        """The robot of a URDF description, see `models.robot.urdf.read_urdf` for what is read and what has which default.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
             tip: Link that carries the tip; needed where the tree has several leaves.
             root: Link to hang the tree up at, the base of the robot; the root of the file if None. Links keep their
-                frames, joints their names, limits and signs, see `models.tree.reroot`.
+                frames, joints their names, limits and signs, see `models.robot.tree.reroot`.
             tip_translation: As of Robot.
             tip_rotation: As of Robot; no turn if None.
             lock: Joints to hold fixed at given positions (rad or m), by name.
@@ -96,7 +96,7 @@ class Robot:
             inertia: What to do about an inertia that no body can have: refuse it ("error") or take it "as_given".
 
         Raises:
-            ModelError: What read_urdf, Robot and `models.rebuild.locked` refuse.
+            ModelError: What read_urdf, Robot and `models.robot.rebuild.locked` refuse.
         """
         found = read_urdf(source, inertia=inertia)
         held = dict(lock or {})

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import Joint, Link, ModelError, Robot, planar_chain
-from tests.models.trees import random_inertia, random_robot, random_rotation, seeds
+from tests.models.robot.trees import random_inertia, random_robot, random_rotation, seeds
 
 
 def joint(name: str, parent: str, child: str, **fields: Any) -> Joint:

@@ -25,8 +25,8 @@ from models import (
     tip_jacobian,
     tip_pose,
 )
-from tests.models.pinocchio_robots import ROBOTS, Peer, State, random_state, swapped, urdf_file
-from tests.models.trees import Array, numeric
+from tests.models.robot.pinocchio_robots import ROBOTS, Peer, State, random_state, swapped, urdf_file
+from tests.models.robot.trees import Array, numeric
 
 pytestmark = pytest.mark.xdist_group("real robots")
 

@@ -22,10 +22,10 @@ from models import (
     rectangle,
     robot_inertia,
 )
-from models.urdf import read_urdf
-from tests.models.pinocchio_robots import Peer, random_state, urdf_file
-from tests.models.trees import few, numeric, numeric_poses, random_robot, seeds
-from tests.models.urdf_text import urdf_of
+from models.robot.urdf import read_urdf
+from tests.models.robot.pinocchio_robots import Peer, random_state, urdf_file
+from tests.models.robot.trees import few, numeric, numeric_poses, random_robot, seeds
+from tests.models.robot.urdf_text import urdf_of
 
 BODY = '<inertial><mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 ENDS = '<parent link="a"/><child link="b"/>'

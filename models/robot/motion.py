@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from models.kinematics import Placement, checked_vector, frames_and_axes, joint_vector
-from models.parts import Link, massless
-from models.robot import Robot
+from models.robot.kinematics import Placement, checked_vector, frames_and_axes, joint_vector
+from models.robot.parts import Link, massless
+from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars
 
 

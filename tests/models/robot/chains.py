@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from models import FreeFloating, Joint, Link, Robot, link_frames, paper_example, tip_pose
 from models.costates import generalized_jacobian
-from models.parts import Kind
+from models.robot.parts import Kind
 from models.spatial import rotation
 from models.virtual_chain import VirtualChain
-from tests.models.trees import (
+from tests.models.robot.trees import (
     Array,
     Base,
     momentum_by_differentiation,

@@ -25,7 +25,7 @@ from models import (
     tip_pose,
 )
 from models.spatial import Frame
-from tests.models.trees import (
+from tests.models.robot.trees import (
     Base,
     directional,
     few,

@@ -15,8 +15,8 @@ import numpy as np
 
 from models.arrays import Array
 from models.errors import ModelError
-from models.parts import massless
-from models.robot import Robot
+from models.robot.parts import massless
+from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, rotation, skew
 
 Placement = tuple[Expression, Expression]

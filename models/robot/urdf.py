@@ -18,9 +18,9 @@ import numpy as np
 
 from models.arrays import Array
 from models.errors import ModelError
-from models.parts import Joint, Kind, Link
+from models.robot.parts import Joint, Kind, Link
+from models.robot.tree import absent
 from models.spatial import rotation_from_rpy
-from models.tree import absent
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["error", "as_given"]

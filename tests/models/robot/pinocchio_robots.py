@@ -13,7 +13,7 @@ import pinocchio
 from scipy.spatial.transform import Rotation
 
 from models import Robot
-from tests.models.trees import Array
+from tests.models.robot.trees import Array
 
 DATA = "example-robot-data"
 ROBOTS: dict[str, tuple[str, str, dict[str, Any]]] = {

@@ -1,0 +1,1 @@
+"""Robots: trees of links and joints, their kinematics and dynamics as expressions."""
