@@ -6,11 +6,11 @@ from ocp.collocation import Collocation
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect import Indirect
 from ocp.problem import Problem
-from ocp.refine import refine
+from ocp.refinement import refine
 from ocp.shooting import MultipleShooting
 from ocp.solution import Solution
 from ocp.solve import prepare, solve
-from ocp.tighten import tighten
+from ocp.tightening import tighten
 
 __all__ = [
     "Audit",

@@ -13,8 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ocp.console import quiet
 from ocp.formulation import Formulation
-from ocp.quiet import quiet
 from ocp.reintegration import OPTIONS, basis
 from ocp.solution import Solution
 

@@ -13,13 +13,13 @@ import casadi as ca
 import numpy as np
 
 from ocp.adjoint import Adjoint, adjoint
+from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, unknown_name
 from ocp.formulation import Formulation
-from ocp.interpolation import PiecewisePolynomial
 from ocp.optimality import Optimality, minimum_principle
 from ocp.problem import Problem
 from ocp.reintegration import Reintegration, reintegrate
-from ocp.solution import Solution, unstack
+from ocp.solution import Solution, check_belongs, unstack
 from ocp.violations import violations
 
 __all__ = ["Audit", "Finding", "audit"]
@@ -231,18 +231,6 @@ def costate_findings(found: Adjoint, optimality: Optimality, limit: float) -> li
         relative = found.horizon / optimality.hamiltonian_scale
         findings.append(Finding("condition of the free horizon, relative", relative, limit, None, note))
     return findings
-
-
-def check_belongs(form: Formulation, solution: Solution) -> None:
-    """Raise ProblemError unless the states and controls of a plan are those of a problem."""
-    for what, places, pool in (
-        ("states", form.states, solution.states),
-        ("controls", form.controls, solution.controls),
-    ):
-        have = {name: values.shape[1] for name, values in pool.items()}
-        want = {name: place.stop - place.start for name, place in places.items()}
-        if have != want:
-            raise ProblemError(f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}")
 
 
 def state_scale(form: Formulation, plan: np.ndarray) -> np.ndarray:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.audit import Audit, audit, check_belongs
+from ocp.audit import Audit, audit
 from ocp.errors import ProblemError
 from ocp.formulation import Formulation
 from ocp.optimality import numbers
 from ocp.problem import Problem
-from ocp.solution import Solution
+from ocp.solution import Solution, check_belongs
 
 __all__ = ["Certificate", "Comparison", "certificate"]
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange, quadrature_weights
 from ocp.errors import ProblemError
 from ocp.formulation import Formulation
 from ocp.fragment import Block, Fragment
-from ocp.interpolation import PiecewisePolynomial, differentiation_matrix, lagrange
 from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["Collocation"]
@@ -168,9 +168,3 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
 
     costate_nodes = report[0] + (report[1] == 1.0)
     return build.finish(report, report_states, costate_rows, costate_nodes, costate_scale, interpolants)
-
-
-def quadrature_weights(points: np.ndarray) -> np.ndarray:
-    """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
-    at, weight = np.polynomial.legendre.leggauss(len(points))
-    return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))

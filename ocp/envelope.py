@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.collocation import quadrature_weights
+from ocp.curves import quadrature_weights
 from ocp.hamiltonian import Hamiltonian
 
 __all__ = ["Extremal", "cost_gradient"]

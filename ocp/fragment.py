@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ocp.interpolation import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial
 
 __all__ = ["Block", "Fragment", "InterpolantMaker", "Stages", "shifted"]
 

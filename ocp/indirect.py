@@ -16,19 +16,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit import check_belongs
 from ocp.boundary import NODES, BoundaryProblem
 from ocp.collocation import Collocation
+from ocp.curves import PiecewisePolynomial
 from ocp.envelope import Extremal, cost_gradient
 from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
-from ocp.interpolation import PiecewisePolynomial
 from ocp.minimality import not_least
 from ocp.newton import Found, newton
 from ocp.problem import Problem
 from ocp.seeding import read_unknowns
-from ocp.solution import Solution
+from ocp.solution import Solution, check_belongs
 from ocp.switching import Arcs, read_arcs
 
 __all__ = ["Indirect", "PreparedIndirect"]

@@ -8,9 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ocp.console import Interrupt, interruptible, quiet
 from ocp.errors import ProblemError
-from ocp.nlp import Interrupt, interruptible
-from ocp.quiet import quiet
 
 __all__ = ["Found", "newton"]
 

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from tqdm import tqdm
 
 from ocp.assembly import Program
+from ocp.console import Interrupt, Progress, interruptible
 from ocp.errors import ProblemError
 from ocp.fragment import Stages
 
-__all__ = ["SOLVERS", "Interrupt", "Outcome", "build_solver", "call_solver", "interruptible"]
+__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
 
 IPOPT = {
     "tol": 1e-10,
@@ -69,50 +64,6 @@ class Outcome:
     status: str
     iterations: int
     seconds: float
-
-
-class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two."""
-
-    def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
-        ca.Callback.__init__(self)
-        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
-        self.title, self.show = title, show
-        self.stop = False
-        self.bar: Any = None
-        self.construct("progress", {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
-        self.lower, self.upper, self.stop = lower, upper, False
-        disable = None if self.show else True
-        form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
-        self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
-
-    def eval(self, arguments: list[Any]) -> list[int]:
-        if self.bar is not None and not self.bar.disable:
-            g = np.asarray(arguments[2].full()).reshape(-1)
-            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-            cost = float(arguments[1])
-            self.bar.set_postfix_str(f"cost {cost:.6g}, infeasibility {worst:.1e}", refresh=False)
-            self.bar.update()
-        return [int(self.stop)]
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
 
 
 def build_solver(
@@ -259,31 +210,6 @@ def tightened(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             size = np.maximum(1.0, np.abs(np.where(move, bound, 0.0)))
             own[key] = np.where(move, bound + sign * FATROP_RELAXATION * size, bound)
     return own
-
-
-@dataclass
-class Interrupt:
-    """A request to stop between two iterations."""
-
-    stop: bool = False
-
-
-@contextmanager
-def interruptible(progress: Progress | Interrupt | None) -> Iterator[None]:
-    """Turn Ctrl-C into a request to stop, in the main thread; without anything to ask, leave it alone."""
-    if progress is None or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def request(number: int, frame: Any) -> None:
-        progress.stop = True
-
-    before: Callable[..., Any] | int | None = signal.getsignal(signal.SIGINT)
-    signal.signal(signal.SIGINT, request)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def last_line(error: BaseException) -> str:

@@ -11,10 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError
 from ocp.formulation import Formulation
 from ocp.fragment import Block, Fragment
-from ocp.interpolation import PiecewisePolynomial
 from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["MultipleShooting"]

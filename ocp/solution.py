@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
-from ocp.interpolation import PiecewisePolynomial
+from ocp.formulation import Formulation
+from ocp.problem import Problem
 
 if TYPE_CHECKING:
     from ocp.audit import Audit
     from ocp.problem import Problem
 
-__all__ = ["Refinement", "Sample", "Solution"]
+__all__ = ["Refinement", "Sample", "Solution", "check_belongs"]
 
 VERSION = 1
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
@@ -257,3 +259,15 @@ def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.nd
         values[name] = stacked[:, offset : offset + like.shape[1]]
         offset += like.shape[1]
     return values
+
+
+def check_belongs(form: Formulation, solution: Solution) -> None:
+    """Raise ProblemError unless the states and controls of a plan are those of a problem."""
+    for what, places, pool in (
+        ("states", form.states, solution.states),
+        ("controls", form.controls, solution.controls),
+    ):
+        have = {name: values.shape[1] for name, values in pool.items()}
+        want = {name: place.stop - place.start for name, place in places.items()}
+        if have != want:
+            raise ProblemError(f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}")

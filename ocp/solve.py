@@ -13,13 +13,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from ocp.assembly import assemble
+from ocp.curves import PiecewisePolynomial
 from ocp.diagnosis import diagnosis
 from ocp.errors import ProblemError, SolveError
 from ocp.formulation import Formulation
 from ocp.fragment import Fragment
 from ocp.guess import initial_point
 from ocp.indirect import Indirect, PreparedIndirect
-from ocp.interpolation import PiecewisePolynomial
 from ocp.nlp import SOLVERS, Outcome, build_solver, call_solver
 from ocp.problem import Problem
 from ocp.solution import Solution

@@ -30,10 +30,12 @@ from models.costates import costate_rate  # noqa: E402
 from models.virtual_chain import VirtualChain  # noqa: E402
 from ocp import Collocation, Problem, Solution, prepare  # noqa: E402
 from ocp.builders import redundancy  # noqa: E402
-from ocp.collocation import quadrature_weights  # noqa: E402
+from ocp.curves import (
+    differentiation_matrix,
+    quadrature_weights,
+)
 from ocp.formulation import Formulation  # noqa: E402
 from ocp.hamiltonian import Hamiltonian  # noqa: E402
-from ocp.interpolation import differentiation_matrix  # noqa: E402
 from scripts import drawing  # noqa: E402
 
 INTERVALS = (50, 100, 200, 400, 800)

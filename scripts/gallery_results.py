@@ -13,7 +13,7 @@ from models.arrays import Array
 from ocp import Audit, Solution
 from ocp.builders.task_equations import task_errors
 from ocp.builders.tip_task import TipTask
-from ocp.interpolation import differentiation_matrix
+from ocp.curves import differentiation_matrix
 from ocp.local import LocalSolution
 from scripts.gallery_robots import RobotFile
 

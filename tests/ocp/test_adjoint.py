@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
-from ocp.interpolation import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial
 from tests.ocp.extremals import EXTREMA
 from tests.ocp.problems import SOLVERS, Method, energy, started_anywhere, van_der_pol
 

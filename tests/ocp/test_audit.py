@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import Audit, Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.interpolation import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial
 from tests.ocp.problems import SWING, Array, LogarithmicRegulator, Method, energy, swing, van_der_pol
 
 FINE: dict[str, Method] = {

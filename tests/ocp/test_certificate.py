@@ -23,7 +23,7 @@ from ocp import (
     solve,
 )
 from ocp.builders.redundancy import minimum_velocity
-from ocp.interpolation import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial
 from tests.ocp.extremals import EXTREMA
 from tests.ocp.problems import energy, van_der_pol
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import Collocation, Problem, ProblemError, Solution, solve
-from ocp.collocation import quadrature_weights
+from ocp.curves import quadrature_weights
 from ocp.formulation import Formulation
 from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, relative, van_der_pol
 

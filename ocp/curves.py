@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["PiecewisePolynomial", "barycentric_weights", "differentiation_matrix", "lagrange"]
+__all__ = ["PiecewisePolynomial", "barycentric_weights", "differentiation_matrix", "lagrange", "quadrature_weights"]
 
 
 TOUCHING = 1e-100  # a place nearer to a node than this is the node: its barycentric weight would overflow
@@ -66,3 +66,9 @@ def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
     np.fill_diagonal(matrix, 0.0)
     np.fill_diagonal(matrix, -matrix.sum(axis=1))
     return np.asarray(matrix)
+
+
+def quadrature_weights(points: np.ndarray) -> np.ndarray:
+    """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
+    at, weight = np.polynomial.legendre.leggauss(len(points))
+    return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, RefinementWarning, SolveError, refine, solve
-from ocp.refine import MOST, split
+from ocp.refinement import MOST, split
 from tests.ocp.problems import SWING, Method, energy, swing, van_der_pol
 
 START: dict[str, Method] = {

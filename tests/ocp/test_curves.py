@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ocp.interpolation import PiecewisePolynomial, differentiation_matrix, lagrange
+from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange
 from tests.ocp.problems import Array
 
 DEGREES = range(1, 11)
