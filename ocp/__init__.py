@@ -1,7 +1,7 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it."""
 
-from ocp.audit import Audit, Finding
-from ocp.certificate import Certificate, certificate
+from ocp.audit.audit import Audit, Finding
+from ocp.audit.certificate import Certificate, certificate
 from ocp.collocation import Collocation
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect import Indirect

@@ -18,7 +18,7 @@ from ocp.formulation import Formulation
 from ocp.problem import Problem
 
 if TYPE_CHECKING:
-    from ocp.audit import Audit
+    from ocp.audit.audit import Audit
     from ocp.problem import Problem
 
 __all__ = ["Refinement", "Sample", "Solution", "check_belongs"]
@@ -160,12 +160,12 @@ class Solution:
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
 
     def audit(self, problem: Problem | None = None, **settings: Any) -> Audit:
-        """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit`.
+        """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit.audit`.
 
         Raises:
             AuditError: The solution was loaded from a file and no problem is given.
         """
-        from ocp.audit import audit
+        from ocp.audit.audit import audit
 
         known = problem if problem is not None else self.problem
         if known is None:

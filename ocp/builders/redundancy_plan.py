@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.audit import Audit
+from ocp.audit.audit import Audit
 from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy import minimum_velocity
 from ocp.builders.task_equations import bind

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from ocp.audit.costates import costates_at_samples
 from ocp.formulation import Formulation
-from ocp.sawtooth import costates_at_samples
 from ocp.solution import Solution
 
 __all__ = ["Optimality", "minimum_principle"]

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.adjoint import Adjoint, adjoint
+from ocp.audit.costates import Adjoint, adjoint
+from ocp.audit.principle import Optimality, minimum_principle
+from ocp.audit.reintegration import Reintegration, reintegrate
+from ocp.audit.violations import violations
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, unknown_name
 from ocp.formulation import Formulation
-from ocp.optimality import Optimality, minimum_principle
 from ocp.problem import Problem
-from ocp.reintegration import Reintegration, reintegrate
 from ocp.solution import Solution, check_belongs, unstack
-from ocp.violations import violations
 
 __all__ = ["Audit", "Finding", "audit"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from ocp.audit.reintegration import Reintegration
 from ocp.formulation import Formulation
-from ocp.reintegration import Reintegration
 
 __all__ = ["violations"]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.audit import Audit, audit
+from ocp.audit.audit import Audit, audit
+from ocp.audit.principle import numbers
 from ocp.errors import ProblemError
 from ocp.formulation import Formulation
-from ocp.optimality import numbers
 from ocp.problem import Problem
 from ocp.solution import Solution, check_belongs
 
