@@ -5,7 +5,7 @@ from ocp.audit.certificate import Certificate, certificate
 from ocp.collocation import Collocation
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect import Indirect
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.shooting import MultipleShooting
 from ocp.solution import Solution

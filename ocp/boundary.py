@@ -10,8 +10,8 @@ import numpy as np
 
 from ocp.console import quiet
 from ocp.errors import ProblemError
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian, numeric_bounds
+from ocp.problem.formulation import Formulation
 from ocp.switching import Arcs
 
 __all__ = ["NODES", "BoundaryProblem"]

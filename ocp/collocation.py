@@ -14,8 +14,8 @@ import numpy as np
 
 from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange, quadrature_weights
 from ocp.errors import ProblemError
-from ocp.formulation import Formulation
 from ocp.fragment import Block, Fragment
+from ocp.problem.formulation import Formulation
 from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["Collocation"]

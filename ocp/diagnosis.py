@@ -8,10 +8,10 @@ import numpy as np
 
 from ocp.assembly import Program
 from ocp.elastic import conflicts
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment
 from ocp.nlp import Outcome
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 
 __all__ = ["diagnosis"]
 

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.assembly import Program, sparse
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment
+from ocp.problem.formulation import Formulation
 
 __all__ = ["Conflict", "conflicts"]
 

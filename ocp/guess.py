@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ocp.errors import ProblemError, unknown_name
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment
+from ocp.problem.formulation import Formulation
+from ocp.problem.values import numeric, table
 from ocp.solution import Solution
-from ocp.values import numeric, table
 
 __all__ = ["Samples", "initial_point"]
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 
 __all__ = ["Hamiltonian"]
 

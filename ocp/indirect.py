@@ -21,11 +21,11 @@ from ocp.collocation import Collocation
 from ocp.curves import PiecewisePolynomial
 from ocp.envelope import Extremal, cost_gradient
 from ocp.errors import ProblemError, SolveError
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
 from ocp.minimality import not_least
 from ocp.newton import Found, newton
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 from ocp.seeding import read_unknowns
 from ocp.solution import Solution, check_belongs
 from ocp.switching import Arcs, read_arcs

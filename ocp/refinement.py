@@ -11,7 +11,7 @@ import numpy as np
 
 from ocp.collocation import Collocation
 from ocp.errors import ProblemError, RefinementWarning
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 from ocp.shooting import MultipleShooting
 from ocp.solution import Refinement, Solution
 from ocp.solve import solve

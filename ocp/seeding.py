@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.switching import Arcs
 

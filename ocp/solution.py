@@ -14,12 +14,12 @@ import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
-from ocp.formulation import Formulation
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 
 if TYPE_CHECKING:
     from ocp.audit.audit import Audit
-    from ocp.problem import Problem
+    from ocp.problem.problem import Problem
 
 __all__ = ["Refinement", "Sample", "Solution", "check_belongs"]
 

@@ -16,12 +16,12 @@ from ocp.assembly import assemble
 from ocp.curves import PiecewisePolynomial
 from ocp.diagnosis import diagnosis
 from ocp.errors import ProblemError, SolveError
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment
 from ocp.guess import initial_point
 from ocp.indirect import Indirect, PreparedIndirect
 from ocp.nlp import SOLVERS, Outcome, build_solver, call_solver
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
 __all__ = ["Method", "Prepared", "prepare", "solve"]

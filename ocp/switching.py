@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ocp.errors import ProblemError, SolveError
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
 __all__ = ["Arcs", "read_arcs"]

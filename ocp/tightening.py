@@ -14,8 +14,8 @@ import numpy as np
 
 from ocp.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment
+from ocp.problem.formulation import Formulation
 from ocp.shooting import MultipleShooting
 from ocp.solution import Solution
 from ocp.solve import Prepared

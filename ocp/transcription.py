@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.formulation import Formulation, Rows
 from ocp.fragment import Block, Fragment, InterpolantMaker, Stages
 from ocp.layout import Layout, plain_layout, staged_layout
+from ocp.problem.formulation import Formulation, Rows
 
 __all__ = ["FragmentBuilder", "check_intervals", "fractions", "settled"]
 

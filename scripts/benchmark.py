@@ -34,8 +34,8 @@ from ocp.curves import (
     differentiation_matrix,
     quadrature_weights,
 )
-from ocp.formulation import Formulation  # noqa: E402
 from ocp.hamiltonian import Hamiltonian  # noqa: E402
+from ocp.problem.formulation import Formulation  # noqa: E402
 from scripts import drawing  # noqa: E402
 
 INTERVALS = (50, 100, 200, 400, 800)

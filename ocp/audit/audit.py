@@ -18,8 +18,8 @@ from ocp.audit.reintegration import Reintegration, reintegrate
 from ocp.audit.violations import violations
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, unknown_name
-from ocp.formulation import Formulation
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs, unstack
 
 __all__ = ["Audit", "Finding", "audit"]

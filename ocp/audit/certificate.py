@@ -11,8 +11,8 @@ import numpy as np
 from ocp.audit.audit import Audit, audit
 from ocp.audit.principle import numbers
 from ocp.errors import ProblemError
-from ocp.formulation import Formulation
-from ocp.problem import Problem
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs
 
 __all__ = ["Certificate", "Comparison", "certificate"]

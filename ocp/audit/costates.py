@@ -23,7 +23,7 @@ import numpy as np
 
 from ocp.audit.reintegration import OPTIONS, basis
 from ocp.console import quiet
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
 __all__ = ["Adjoint", "adjoint", "costates_at_samples"]

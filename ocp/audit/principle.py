@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.costates import costates_at_samples
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
 __all__ = ["Optimality", "minimum_principle"]

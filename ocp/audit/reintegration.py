@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.console import quiet
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
 __all__ = ["TOLERANCE", "Reintegration", "reintegrate"]

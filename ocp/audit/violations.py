@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.reintegration import Reintegration
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 
 __all__ = ["violations"]
 

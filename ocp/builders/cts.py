@@ -23,7 +23,7 @@ from models.shapes.capsules import soft_minimum
 from ocp.builders.cts_guess import least_course
 from ocp.errors import ProblemError
 from ocp.guess import Samples
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 
 __all__ = ["roll_plan", "spline_targets"]
 

@@ -25,7 +25,7 @@ from ocp.builders.path_reference import cut, distinct, reference_mesh, reference
 from ocp.builders.path_tables import demand_of_pieces, path_columns, table
 from ocp.collocation import Collocation
 from ocp.errors import ProblemError
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
 from ocp.schedule.limits import JointPath, Limits, PathLike
 from ocp.schedule.planner import Schedule

@@ -21,7 +21,7 @@ from ocp.errors import ProblemError
 from ocp.guess import Samples
 from ocp.inverse_kinematics import inverse_kinematics
 from ocp.local import LocalSolution, least_rates, resolve
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 
 __all__ = ["minimum_velocity"]
 

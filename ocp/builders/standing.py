@@ -53,7 +53,7 @@ from ocp.builders.zmp_rules import (
     index_rows,
 )
 from ocp.errors import ProblemError
-from ocp.problem import Problem
+from ocp.problem.problem import Problem
 
 __all__ = [
     "Anywhere",

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from ocp import Collocation, MultipleShooting, Problem, solve
 from ocp.assembly import Program, assemble
 from ocp.curves import differentiation_matrix, lagrange
-from ocp.formulation import Formulation
 from ocp.fragment import Fragment, shifted
+from ocp.problem.formulation import Formulation
 from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, energy, swing, van_der_pol
 
 KINDS: dict[str, Callable[[Any], Problem]] = {

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ocp import Collocation, Problem, ProblemError, Solution, solve
 from ocp.curves import quadrature_weights
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, relative, van_der_pol
 
 TIGHT = {"tol": 1e-13, "constr_viol_tol": 1e-13, "dual_inf_tol": 1e-11}

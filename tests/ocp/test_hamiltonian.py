@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Indirect, Problem, ProblemError, Solution, SolveError, prepare, solve
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
+from ocp.problem.formulation import Formulation
 from tests.ocp.extremals import EXTREMA, bang_bang
 from tests.ocp.problems import Array, energy, swing, van_der_pol
 

@@ -14,7 +14,7 @@ import pytest
 from models import FixedBase, FreeFloating, Machine, paper_example
 from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, prepare, solve
 from ocp.builders.redundancy import minimum_velocity
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.extremals import EXTREMA
 from tests.ocp.problems import Array, energy

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ocp import Problem
 from ocp.envelope import Extremal
-from ocp.formulation import Formulation
 from ocp.hamiltonian import Hamiltonian
 from ocp.minimality import not_least, null_space
+from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 
 seeds = st.integers(0, 2**32 - 1)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ocp import MultipleShooting, Problem, ProblemError, solve
 from ocp.assembly import assemble
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, van_der_pol
 from tests.ocp.test_collocation import constrained, imposed
 

@@ -8,7 +8,7 @@ import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.audit.costates import costates_at_samples
-from ocp.formulation import Formulation
+from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 
 METHODS = [

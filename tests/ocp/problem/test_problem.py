@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import Collocation, Problem, ProblemError, solve
-from ocp.formulation import Formulation
-from ocp.values import constant
+from ocp.problem.formulation import Formulation
+from ocp.problem.values import constant
 from tests.ocp.problems import SWING, energy, swing
 
 nan, inf = np.nan, np.inf

@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, unknown_name
-from ocp.problem import Constraint, Problem, Variable
-from ocp.values import check_horizon, check_inside, check_order, constant, numeric
+from ocp.problem.problem import Constraint, Problem, Variable
+from ocp.problem.values import check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Formulation", "Rows"]
 

@@ -1,0 +1,1 @@
+"""What is asked: states, controls, parameters, dynamics, constraints, cost."""
