@@ -2,14 +2,14 @@
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate, certificate
-from ocp.collocation import Collocation
+from ocp.direct.collocation import Collocation
+from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect import Indirect
+from ocp.methods import prepare, solve
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
-from ocp.shooting import MultipleShooting
 from ocp.solution import Solution
-from ocp.solve import prepare, solve
 from ocp.tightening import tighten
 
 __all__ = [

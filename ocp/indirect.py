@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.boundary import NODES, BoundaryProblem
-from ocp.collocation import Collocation
 from ocp.curves import PiecewisePolynomial
+from ocp.direct.collocation import Collocation
 from ocp.envelope import Extremal, cost_gradient
 from ocp.errors import ProblemError, SolveError
 from ocp.hamiltonian import Hamiltonian

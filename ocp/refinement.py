@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ocp.collocation import Collocation
+from ocp.direct.collocation import Collocation
+from ocp.direct.shooting import MultipleShooting
+from ocp.direct.transcription import fractions
 from ocp.errors import ProblemError, RefinementWarning
+from ocp.methods import solve
 from ocp.problem.problem import Problem
-from ocp.shooting import MultipleShooting
 from ocp.solution import Refinement, Solution
-from ocp.solve import solve
-from ocp.transcription import fractions
 
 __all__ = ["refine", "split"]
 
@@ -42,7 +42,7 @@ def refine(
     round starts from the plan before.
 
     Args:
-        problem, parameters, solver, options, guess: As for :func:`ocp.solve`.
+        problem, parameters, solver, options, guess: As for :func:`ocp.methods`.
         method: The mesh to start from.
         tolerance: Largest integration error, relative to the size of each state.
         max_intervals: Cap on the number of intervals.

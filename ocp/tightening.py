@@ -12,13 +12,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.collocation import Collocation
+from ocp.direct.collocation import Collocation
+from ocp.direct.fragment import Fragment
+from ocp.direct.prepared import Prepared
+from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError
-from ocp.fragment import Fragment
 from ocp.problem.formulation import Formulation
-from ocp.shooting import MultipleShooting
 from ocp.solution import Solution
-from ocp.solve import Prepared
 
 __all__ = ["tighten"]
 
@@ -40,10 +40,10 @@ def tighten(
     """Solve so that every inequality holds between the points of the grid as well.
 
     The plan is the optimum under bounds that are drawn in where it would have exceeded them, so it costs a little more
-    than that of :func:`ocp.solve`; finer grids close the gap. Equalities are not touched: refine the grid for them.
+    than that of :func:`ocp.methods`; finer grids close the gap. Equalities are not touched: refine the grid for them.
 
     Args:
-        problem, parameters, solver, options, guess: As for :func:`ocp.solve`.
+        problem, parameters, solver, options, guess: As for :func:`ocp.methods`.
         method: Collocation or MultipleShooting.
         tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
 

@@ -21,8 +21,8 @@ from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.capsules import soft_minimum
 from ocp.builders.cts_guess import least_course
+from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.guess import Samples
 from ocp.problem.problem import Problem
 
 __all__ = ["roll_plan", "spline_targets"]

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 
 from ocp.builders.path_reference import cut, distinct, reference_mesh, reference_motion
 from ocp.builders.path_tables import demand_of_pieces, path_columns, table
-from ocp.collocation import Collocation
+from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError
+from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
 from ocp.schedule.limits import JointPath, Limits, PathLike
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, SpeedProfile
 from ocp.solution import Solution
-from ocp.solve import solve
 
 __all__ = ["Fastest", "TimingProblem", "minimum_time", "timing_problem"]
 

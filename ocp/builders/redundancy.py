@@ -17,8 +17,8 @@ from ocp.builders.task import Array, Velocity, checked_configuration, checked_ho
 from ocp.builders.task_checks import check_closed, checked_tasks, dependent_rows
 from ocp.builders.task_equations import TaskEquations, bind
 from ocp.builders.tip_task import TipTask, one_of
+from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.guess import Samples
 from ocp.inverse_kinematics import inverse_kinematics
 from ocp.local import LocalSolution, least_rates, resolve
 from ocp.problem.problem import Problem

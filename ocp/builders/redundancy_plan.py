@@ -15,11 +15,11 @@ from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy import minimum_velocity
 from ocp.builders.task_equations import bind
 from ocp.builders.tip_task import one_of
-from ocp.collocation import Collocation
+from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
 from ocp.local import LocalSolution, resolve
+from ocp.methods import solve
 from ocp.solution import Solution
-from ocp.solve import solve
 
 __all__ = ["plan_minimum_velocity"]
 

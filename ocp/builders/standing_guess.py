@@ -10,8 +10,8 @@ import numpy as np
 from models.machines.standing import External, Standing
 from ocp.builders.task import Array
 from ocp.builders.tip_path import Path
+from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.guess import Samples
 from ocp.local_acceleration import resolve_accelerations
 
 __all__ = ["local_guess"]

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, prepare, solve
-from ocp.guess import initial_point
+from ocp.direct.guess import initial_point
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import EVERY_METHOD, METHODS, SOLVERS, Array, Method, energy, van_der_pol
 

@@ -8,7 +8,8 @@ from typing import Any
 import casadi as ca
 import pytest
 
-from ocp import Collocation, MultipleShooting, Problem, SolveError, elastic, solve
+from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
+from ocp.direct import diagnosis as elastic
 
 METHODS = [Collocation(8), Collocation(8, scheme="legendre"), Collocation(8, control="held"), MultipleShooting(8)]
 NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"

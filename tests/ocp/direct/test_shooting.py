@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import MultipleShooting, Problem, ProblemError, solve
-from ocp.assembly import assemble
+from ocp.direct.assembly import assemble
 from ocp.problem.formulation import Formulation
+from tests.ocp.direct.test_collocation import constrained, imposed
 from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, van_der_pol
-from tests.ocp.test_collocation import constrained, imposed
 
 CONTROLS = ("held", "linear")
 TIGHT = {"tol": 1e-13, "constr_viol_tol": 1e-13, "dual_inf_tol": 1e-11}

@@ -1,4 +1,4 @@
-"""One way in: ``solve(problem, method)``, and ``prepare`` for problems that are solved many times."""
+"""A problem built once for a method and a solver, to be solved many times."""
 
 from __future__ import annotations
 
@@ -7,24 +7,20 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
-from ocp.assembly import assemble
 from ocp.curves import PiecewisePolynomial
-from ocp.diagnosis import diagnosis
+from ocp.direct.assembly import assemble
+from ocp.direct.diagnosis import diagnosis
+from ocp.direct.fragment import Fragment
+from ocp.direct.guess import initial_point
+from ocp.direct.nlp import Outcome, build_solver, call_solver
 from ocp.errors import ProblemError, SolveError
-from ocp.fragment import Fragment
-from ocp.guess import initial_point
-from ocp.indirect import Indirect, PreparedIndirect
-from ocp.nlp import SOLVERS, Outcome, build_solver, call_solver
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-
-__all__ = ["Method", "Prepared", "prepare", "solve"]
 
 
 class Method(Protocol):
@@ -216,64 +212,3 @@ def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.
         return np.asarray(controls.within(piece, place))
     mesh = fragment.mesh
     return np.asarray(controls(mesh[piece] + np.diff(mesh)[piece] * place))
-
-
-def prepare(
-    problem: Problem,
-    method: Method | Indirect,
-    *,
-    solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    compiled: bool = False,
-) -> Prepared | PreparedIndirect:
-    """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
-
-    Args:
-        problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end). For the
-            indirect method, of the direct solution that seeds it.
-        options: Passed to the solver, for example ``{"max_iter": 500}``.
-        compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
-
-    Raises:
-        ProblemError: The problem is not complete, or the method or solver cannot take it.
-    """
-    if isinstance(method, Indirect):
-        if solver not in SOLVERS:
-            raise ProblemError(f"unknown solver {solver!r}; known: {', '.join(SOLVERS)}")
-        seeder = partial(_seed, solver=solver, options=by_name("options", options), compiled=compiled)
-        return PreparedIndirect(problem, method, seeder)
-    return Prepared(problem, method, solver, options or {}, compiled)
-
-
-def _seed(problem: Problem, method: Method, parameters: Any, guess: Any, **how: Any) -> Solution:
-    return prepare(problem, method, **how).solve(parameters, guess)
-
-
-def solve(
-    problem: Problem,
-    method: Method | Indirect,
-    *,
-    parameters: Mapping[str, Any] | None = None,
-    solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    guess: Solution | Mapping[str, Any] | None = None,
-    check: bool = True,
-) -> Solution:
-    """Solve a problem by a method.
-
-    Args:
-        problem: What is asked. method: For example ``Collocation(intervals=20, degree=3)``.
-        parameters: Value of every parameter by name.
-        solver, options: See :func:`prepare`.
-        guess: An earlier solution (of any grid or method), or a dictionary by name of values, functions of time, or
-            samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
-        check: Raise where the solver fails, after a second solve that finds what would have to give way; False returns
-            the unsuccessful solution with its status.
-
-    Raises:
-        ProblemError: The problem, method or arguments cannot be right.
-        SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
-            worst residuals by constraint, state and time.
-    """
-    return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

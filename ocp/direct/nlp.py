@@ -9,10 +9,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.assembly import Program
 from ocp.console import Interrupt, Progress, interruptible
+from ocp.direct.assembly import Program
+from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError
-from ocp.fragment import Stages
 
 __all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
 

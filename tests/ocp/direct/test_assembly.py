@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, solve
-from ocp.assembly import Program, assemble
 from ocp.curves import differentiation_matrix, lagrange
-from ocp.fragment import Fragment, shifted
+from ocp.direct.assembly import Program, assemble
+from ocp.direct.fragment import Fragment, shifted
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, energy, swing, van_der_pol
 

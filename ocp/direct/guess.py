@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ocp.direct.fragment import Fragment
 from ocp.errors import ProblemError, unknown_name
-from ocp.fragment import Fragment
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Solution

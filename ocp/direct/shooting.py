@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import PiecewisePolynomial
+from ocp.direct.fragment import Block, Fragment
+from ocp.direct.transcription import FragmentBuilder, check_intervals, fractions, settled
 from ocp.errors import ProblemError
-from ocp.fragment import Block, Fragment
 from ocp.problem.formulation import Formulation
-from ocp.transcription import FragmentBuilder, check_intervals, fractions, settled
 
 __all__ = ["MultipleShooting"]
 

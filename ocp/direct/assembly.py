@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.fragment import Block, Fragment
+from ocp.direct.fragment import Block, Fragment
 
 __all__ = ["Program", "assemble"]
 
