@@ -5,7 +5,7 @@ from ocp.audit.certificate import Certificate, certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
-from ocp.indirect import Indirect
+from ocp.indirect.method import Indirect
 from ocp.methods import prepare, solve
 from ocp.problem.problem import Problem
 from ocp.refinement import refine

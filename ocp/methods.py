@@ -9,7 +9,7 @@ from typing import Any
 from ocp.direct.nlp import SOLVERS
 from ocp.direct.prepared import Method, Prepared, by_name
 from ocp.errors import ProblemError
-from ocp.indirect import Indirect, PreparedIndirect
+from ocp.indirect.method import Indirect, PreparedIndirect
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 

@@ -34,7 +34,7 @@ from ocp.curves import (
     differentiation_matrix,
     quadrature_weights,
 )
-from ocp.hamiltonian import Hamiltonian  # noqa: E402
+from ocp.indirect.hamiltonian import Hamiltonian  # noqa: E402
 from ocp.problem.formulation import Formulation  # noqa: E402
 from scripts import drawing  # noqa: E402
 

@@ -24,7 +24,7 @@ from ocp import (
 )
 from ocp.builders.redundancy import minimum_velocity
 from ocp.curves import PiecewisePolynomial
-from tests.ocp.extremals import EXTREMA
+from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, van_der_pol
 
 NAMES: dict[str, Any] = {

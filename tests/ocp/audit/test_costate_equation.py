@@ -12,7 +12,7 @@ import pytest
 
 from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
 from ocp.curves import PiecewisePolynomial
-from tests.ocp.extremals import EXTREMA
+from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import SOLVERS, Method, energy, started_anywhere, van_der_pol
 
 EQUATION, ENDS, HORIZON = (

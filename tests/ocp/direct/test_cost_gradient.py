@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, ProblemError, Solution, prepare, solve
-from tests.ocp.extremals import EXTREMA, regulator
+from tests.ocp.indirect.extremals import EXTREMA, regulator
 from tests.ocp.problems import EVERY_METHOD, SOLVERS, SWING, Array, swing
 
 STEP = 1e-4

@@ -10,9 +10,9 @@ import numpy as np
 
 from ocp.console import quiet
 from ocp.errors import ProblemError
-from ocp.hamiltonian import Hamiltonian, numeric_bounds
+from ocp.indirect.hamiltonian import Hamiltonian, numeric_bounds
+from ocp.indirect.seed import Arcs
 from ocp.problem.formulation import Formulation
-from ocp.switching import Arcs
 
 __all__ = ["NODES", "BoundaryProblem"]
 

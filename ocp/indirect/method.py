@@ -16,19 +16,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.boundary import NODES, BoundaryProblem
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
-from ocp.envelope import Extremal, cost_gradient
 from ocp.errors import ProblemError, SolveError
-from ocp.hamiltonian import Hamiltonian
-from ocp.minimality import not_least
-from ocp.newton import Found, newton
+from ocp.indirect.boundary import NODES, BoundaryProblem
+from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.minimality import not_least
+from ocp.indirect.newton import Found, newton
+from ocp.indirect.seed import Arcs, read_arcs, read_unknowns
+from ocp.indirect.sensitivity import Extremal, cost_gradient
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.seeding import read_unknowns
 from ocp.solution import Solution, check_belongs
-from ocp.switching import Arcs, read_arcs
 
 __all__ = ["Indirect", "PreparedIndirect"]
 

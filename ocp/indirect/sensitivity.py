@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import quadrature_weights
-from ocp.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Hamiltonian
 
 __all__ = ["Extremal", "cost_gradient"]
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Indirect, Problem, ProblemError, Solution, SolveError, prepare, solve
-from ocp.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Formulation
-from tests.ocp.extremals import EXTREMA, bang_bang
+from tests.ocp.indirect.extremals import EXTREMA, bang_bang
 from tests.ocp.problems import Array, energy, swing, van_der_pol
 
 SMOOTH = [name for name, case in EXTREMA.items() if case.switches == 0]

@@ -11,8 +11,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.envelope import Extremal
-from ocp.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.sensitivity import Extremal
 
 __all__ = ["not_least"]
 

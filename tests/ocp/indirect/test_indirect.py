@@ -16,7 +16,7 @@ from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, prep
 from ocp.builders.redundancy import minimum_velocity
 from ocp.problem.formulation import Formulation
 from tests.models.robot.trees import numeric, seven_joint_arm
-from tests.ocp.extremals import EXTREMA
+from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import Array, energy
 
 PAPER_COST = 1.735114311245  # two independent methods, to twelve digits

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import Problem
-from ocp.envelope import Extremal
-from ocp.hamiltonian import Hamiltonian
-from ocp.minimality import not_least, null_space
+from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.minimality import not_least, null_space
+from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 

@@ -1,0 +1,1 @@
+"""The indirect method: Pontryagin's minimum principle as a boundary value problem."""
