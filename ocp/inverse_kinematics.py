@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.builders.task import Array, checked_configuration
-from ocp.builders.task_equations import TaskEquations, bind
-from ocp.builders.tip_task import TipTask
 from ocp.errors import ProblemError
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.start import Array, checked_configuration
+from ocp.tasks.tip_task import TipTask
 
 __all__ = ["Posture", "Unreachable", "inverse_kinematics"]
 

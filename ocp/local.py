@@ -15,11 +15,11 @@ import numpy as np
 
 from models import Machine
 from models.spatial import solve_spd
-from ocp.builders.task import Array, Velocity, checked_configuration, checked_horizon, checked_weights
-from ocp.builders.task_checks import checked_tasks, dependent_rows
-from ocp.builders.task_equations import TaskEquations, bind
-from ocp.builders.tip_task import TipTask, one_of
 from ocp.errors import ProblemError
+from ocp.tasks.checks import checked_tasks, dependent_rows
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.start import Array, Velocity, checked_configuration, checked_horizon, checked_weights
+from ocp.tasks.tip_task import TipTask, one_of
 
 __all__ = ["LocalSolution", "least_rates", "resolve"]
 

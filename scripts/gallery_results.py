@@ -11,10 +11,10 @@ import numpy as np
 from models import FreeFloating, Machine
 from models.arrays import Array
 from ocp import Audit, Solution
-from ocp.builders.task_equations import task_errors
-from ocp.builders.tip_task import TipTask
 from ocp.curves import differentiation_matrix
 from ocp.local import LocalSolution
+from ocp.tasks.equations import task_errors
+from ocp.tasks.tip_task import TipTask
 from scripts.gallery_robots import RobotFile
 
 __all__ = ["FINE", "Example", "joint_return", "momentum_drift", "tip_error", "turning_angle"]

@@ -13,8 +13,8 @@ import numpy as np
 
 from models.machines.standing import Standing
 from models.machines.standing_motion import StandingMotion, standing_motion
-from ocp.builders.tip_path import Path, linear_rows, path_derivatives
 from ocp.local import least_rates
+from ocp.tasks.tip_path import Path, linear_rows, path_derivatives
 
 __all__ = ["printed_law"]
 

@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.builders.task import Array
-from ocp.builders.task_equations import bind
-from ocp.builders.task_geometry import pose_in_reference
-from ocp.builders.tip_task import ANGULAR, TipTask
 from ocp.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.local import LocalSolution
+from ocp.tasks.equations import bind
+from ocp.tasks.geometry import pose_in_reference
+from ocp.tasks.start import Array
+from ocp.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = ["check_reach", "leaves_limits"]
 

@@ -13,15 +13,15 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.builders.task import Array, Velocity, checked_configuration, checked_horizon, checked_weights
-from ocp.builders.task_checks import check_closed, checked_tasks, dependent_rows
-from ocp.builders.task_equations import TaskEquations, bind
-from ocp.builders.tip_task import TipTask, one_of
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.inverse_kinematics import inverse_kinematics
 from ocp.local import LocalSolution, least_rates, resolve
 from ocp.problem.problem import Problem
+from ocp.tasks.checks import check_closed, checked_tasks, dependent_rows
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.start import Array, Velocity, checked_configuration, checked_horizon, checked_weights
+from ocp.tasks.tip_task import TipTask, one_of
 
 __all__ = ["minimum_velocity"]
 

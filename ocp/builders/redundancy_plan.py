@@ -13,13 +13,13 @@ from models import Machine
 from ocp.audit.audit import Audit
 from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy import minimum_velocity
-from ocp.builders.task_equations import bind
-from ocp.builders.tip_task import one_of
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
 from ocp.local import LocalSolution, resolve
 from ocp.methods import solve
 from ocp.solution import Solution
+from ocp.tasks.equations import bind
+from ocp.tasks.tip_task import one_of
 
 __all__ = ["plan_minimum_velocity"]
 

@@ -39,9 +39,11 @@ from models.robot.indices import joint_limit_index
 from ocp.builders.standing_guess import local_guess
 from ocp.builders.standing_options import FreeTime, Limits, Weights
 from ocp.builders.standing_start import check_freedom, check_loads, check_slope, inside_limits, tip_demand
-from ocp.builders.task import Array, checked_start
-from ocp.builders.tip_path import Path, check_path, check_rest, linear_rows, path_derivatives
-from ocp.builders.zmp_rules import (
+from ocp.errors import ProblemError
+from ocp.problem.problem import Problem
+from ocp.tasks.start import Array, checked_start
+from ocp.tasks.tip_path import Path, check_path, check_rest, linear_rows, path_derivatives
+from ocp.tasks.zmp_rules import (
     Anywhere,
     Following,
     IndexAtLeast,
@@ -52,8 +54,6 @@ from ocp.builders.zmp_rules import (
     foot_rows,
     index_rows,
 )
-from ocp.errors import ProblemError
-from ocp.problem.problem import Problem
 
 __all__ = [
     "Anywhere",

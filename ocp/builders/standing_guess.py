@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from models.machines.standing import External, Standing
-from ocp.builders.task import Array
-from ocp.builders.tip_path import Path
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local_acceleration import resolve_accelerations
+from ocp.tasks.start import Array
+from ocp.tasks.tip_path import Path
 
 __all__ = ["local_guess"]
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from models.machines.standing import Standing
-from ocp.builders.task import Array
-from ocp.builders.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule, is_finite
 from ocp.errors import ProblemError
+from ocp.tasks.start import Array
+from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule, is_finite
 
 __all__ = [
     "Anywhere",

@@ -10,10 +10,10 @@ import numpy as np
 
 from models.machines.standing import Standing
 from models.robot.dynamics import Wrench
-from ocp.builders.task import Array
-from ocp.builders.tip_path import Path, path_derivatives
-from ocp.builders.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 from ocp.errors import ProblemError
+from ocp.tasks.start import Array
+from ocp.tasks.tip_path import Path, path_derivatives
+from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "tip_demand"]
 

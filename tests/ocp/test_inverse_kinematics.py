@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Robot, planar_chain
-from ocp.builders.tip_task import TipTask
 from ocp.errors import ProblemError
 from ocp.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seeds
-from tests.ocp.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
+from tests.ocp.tasks.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
 
 
 def test_a_six_joint_arm_has_its_eight_postures() -> None:

@@ -13,9 +13,9 @@ from models.spatial import rotation
 from ocp import Collocation, SolveError
 from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.builders.tip_task import TipTask
 from ocp.inverse_kinematics import Unreachable
 from ocp.local import resolve
+from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seven_joint_arm
 
 START = np.deg2rad([60.0, -100.0, -20.0])

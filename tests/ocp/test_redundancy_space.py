@@ -15,13 +15,13 @@ from models.paths import Path, smooth
 from ocp import Collocation, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.builders.task_equations import bind
-from ocp.builders.tip_task import TipTask, along
 from ocp.errors import ProblemError
 from ocp.inverse_kinematics import Unreachable
 from ocp.local import resolve
+from ocp.tasks.equations import bind
+from ocp.tasks.tip_task import TipTask, along
 from tests.models.robot.trees import numeric, seven_joint_arm
-from tests.ocp.space_tasks import (
+from tests.ocp.tasks.space_tasks import (
     BASE,
     PANDA_START,
     UR5_START,

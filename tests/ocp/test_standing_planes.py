@@ -14,9 +14,9 @@ from models.machines.support import Support, rectangle
 from ocp import Collocation, Solution, solve
 from ocp.acceleration_laws import Law
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, Weights, standing_plan
-from ocp.builders.zmp_rules import ZmpRule
 from ocp.errors import ProblemError
 from ocp.local_acceleration import resolve_accelerations
+from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.standing_tasks import PLANAR_HORIZON, planar_path, planar_start, quintic, sampled, tip_at

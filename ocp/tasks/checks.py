@@ -5,11 +5,11 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ocp.builders.task import Array
-from ocp.builders.task_equations import TaskEquations
-from ocp.builders.task_geometry import is_holonomic, target_size
-from ocp.builders.tip_task import ANGULAR, TipTask
 from ocp.errors import ProblemError
+from ocp.tasks.equations import TaskEquations
+from ocp.tasks.geometry import is_holonomic, target_size
+from ocp.tasks.start import Array
+from ocp.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = ["check_closed", "checked_tasks", "dependent_rows"]
 

@@ -20,8 +20,8 @@ from models.paths.functions import path_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
-from ocp.builders.task import Array, Velocity
 from ocp.errors import ProblemError
+from ocp.tasks.start import Array, Velocity
 
 __all__ = ["Axes", "PoseLine", "TipTask", "Track", "along", "one_of", "pose_line"]
 

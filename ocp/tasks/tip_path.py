@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.builders.task import Array, velocity_expression
 from ocp.errors import ProblemError
+from ocp.tasks.start import Array, velocity_expression
 
 __all__ = ["Path", "check_path", "check_rest", "linear_rows", "path_derivatives", "path_samples"]
 

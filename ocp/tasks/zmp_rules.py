@@ -12,8 +12,8 @@ import numpy as np
 
 from models.machines.standing import Standing
 from models.spatial import expression
-from ocp.builders.task import Array
 from ocp.errors import ProblemError
+from ocp.tasks.start import Array
 
 __all__ = [
     "Anywhere",

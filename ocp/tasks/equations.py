@@ -16,8 +16,8 @@ import numpy as np
 from models import FreeFloating, Machine, ModelError, center_of_mass
 from models.machines.machine import with_tip
 from models.spatial import on_scalars, skew
-from ocp.builders.task import Array, track_expression
-from ocp.builders.task_geometry import (
+from ocp.errors import ProblemError
+from ocp.tasks.geometry import (
     Bound,
     angular_velocity,
     cross_product,
@@ -36,8 +36,8 @@ from ocp.builders.task_geometry import (
     turning_rows,
     wanted_twist,
 )
-from ocp.builders.tip_task import ANGULAR, TipTask
-from ocp.errors import ProblemError
+from ocp.tasks.start import Array, track_expression
+from ocp.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = ["TaskEquations", "bind", "task_errors"]
 

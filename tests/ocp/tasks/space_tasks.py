@@ -11,8 +11,8 @@ import numpy as np
 from models import FixedBase, FreeFloating, Link, Machine, Robot
 from models.robot.rebuild import merged
 from ocp import Solution
-from ocp.builders.task_equations import task_errors
-from ocp.builders.tip_task import PoseLine, pose_line
+from ocp.tasks.equations import task_errors
+from ocp.tasks.tip_task import PoseLine, pose_line
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array, numeric
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from models import Machine
 from models.spatial import Frame, on_scalars, rotation_from_quaternion, skew
-from ocp.builders.task import Array
-from ocp.builders.tip_task import ANGULAR, TipTask
+from ocp.tasks.start import Array
+from ocp.tasks.tip_task import ANGULAR, TipTask
 
 
 class Bound(NamedTuple):

@@ -10,12 +10,12 @@ import pytest
 from models import FixedBase, Machine, planar_chain
 from models.machines.machine import with_tip
 from models.paths import Path, smooth
-from ocp.builders.task_equations import bind, task_errors
-from ocp.builders.tip_task import TipTask, along, pose_line
 from ocp.errors import ProblemError
 from ocp.local import resolve
+from ocp.tasks.equations import bind, task_errors
+from ocp.tasks.tip_task import TipTask, along, pose_line
 from tests.models.robot.trees import Array, numeric
-from tests.ocp.space_tasks import (
+from tests.ocp.tasks.space_tasks import (
     BASE,
     PANDA_START,
     UR5_START,
