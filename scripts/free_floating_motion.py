@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from models import FreeFloating, centers_of_mass, link_frames
 from ocp import Audit, Solution
 from ocp.curves import PiecewisePolynomial, differentiation_matrix
-from ocp.local import LocalSolution, least_rates
+from ocp.local.rates import LocalSolution, least_rates
 
 __all__ = ["Laws", "Motion", "laws", "momentum", "motion_of_local", "motion_of_plan", "outline", "total_center_of_mass"]
 

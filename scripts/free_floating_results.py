@@ -12,7 +12,7 @@ from tqdm import tqdm
 from models import FreeFloating, paper_example
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
-from ocp.local import resolve
+from ocp.local.rates import resolve
 from scripts import extremals, false_optima
 from scripts.drawing import Row
 from scripts.extremals import Search

@@ -20,7 +20,7 @@ from models.arrays import Array
 from models.machines.standing import External
 from ocp import Collocation, Problem, solve
 from ocp.builders.standing import InFoot, Limits, standing_plan
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery_standing as standing
 from scripts.gallery_frames import frames_along
 from scripts.gallery_mobile_manipulator import StandingExample, animated

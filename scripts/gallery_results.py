@@ -12,7 +12,7 @@ from models import FreeFloating, Machine
 from models.arrays import Array
 from ocp import Audit, Solution
 from ocp.curves import differentiation_matrix
-from ocp.local import LocalSolution
+from ocp.local.rates import LocalSolution
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask
 from scripts.gallery_robots import RobotFile

@@ -11,7 +11,7 @@ from models import FreeFloating
 from models.spatial import rotation_from_rpy
 from ocp import Collocation
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.local import resolve
+from ocp.local.rates import resolve
 from ocp.tasks.tip_task import TipTask, pose_line
 from scripts.drawing import COLORS, DASHES, sheet
 from scripts.gallery_drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid

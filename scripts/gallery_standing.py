@@ -22,7 +22,7 @@ from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve
 from ocp.builders.standing import InFoot, Limits, Weights, standing_plan
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from scripts.drawing import COLORS, DASHES, sheet
 
 __all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]

@@ -12,8 +12,8 @@ from models import FixedBase, Machine
 from models.arrays import Array
 from ocp import Collocation, Solution, SolveError
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.inverse_kinematics import Posture, inverse_kinematics
-from ocp.local import LocalSolution, resolve
+from ocp.local.inverse_kinematics import Posture, inverse_kinematics
+from ocp.local.rates import LocalSolution, resolve
 from ocp.tasks.tip_task import TipTask
 from scripts.drawing import COLORS, DASHES, sheet
 from scripts.gallery_drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid

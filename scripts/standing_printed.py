@@ -1,6 +1,6 @@
 """The null-space law (22) of Yoo et al. 2004 with the sign of C as it is printed: a likely cause of its Figure 4.
 
-The corrected law is ocp.acceleration_laws' "null_space". With -C the zero moment point is not held where it is asked
+The corrected law is ocp.local.laws' "null_space". With -C the zero moment point is not held where it is asked
 to be, and the machine does not fall.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from models.machines.standing import Standing
 from models.machines.standing_motion import StandingMotion, standing_motion
-from ocp.local import least_rates
+from ocp.local.rates import least_rates
 from ocp.tasks.tip_path import Path, linear_rows, path_derivatives
 
 __all__ = ["printed_law"]

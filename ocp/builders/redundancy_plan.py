@@ -11,11 +11,11 @@ import numpy as np
 
 from models import Machine
 from ocp.audit.audit import Audit
-from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy import minimum_velocity
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
-from ocp.local import LocalSolution, resolve
+from ocp.local.rates import LocalSolution, resolve
+from ocp.local.reach import check_reach, leaves_limits
 from ocp.methods import solve
 from ocp.solution import Solution
 from ocp.tasks.equations import bind
@@ -61,7 +61,7 @@ def plan_minimum_velocity(
     Raises:
         SolveError: No guess leads to a plan that passes; says what became of each.
         ProblemError: As minimum_velocity; Unreachable, which is one, where a machine on a fixed base cannot reach what
-            its tasks ask (see ocp.builders.reach).
+            its tasks ask (see ocp.local.reach).
     """
     if not len(dampings):
         raise ProblemError("dampings are empty: there is no guess to start from")

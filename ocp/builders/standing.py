@@ -1,6 +1,6 @@
 """Whole motions of a machine that stands on the ground: do a task of the tip, do not tip over, spend the freedom well.
 
-The global counterpart of ocp.local_acceleration (Yoo et al. 2004), for any Standing machine, planar or spatial.
+The global counterpart of ocp.local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial.
 
 Joint accelerations (or jerks) are the control. Two ways to keep the tip on its path:
 

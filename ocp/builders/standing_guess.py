@@ -10,7 +10,7 @@ import numpy as np
 from models.machines.standing import External, Standing
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from ocp.tasks.start import Array
 from ocp.tasks.tip_path import Path
 

@@ -12,7 +12,7 @@ from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_e
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.errors import ProblemError
-from ocp.local import resolve
+from ocp.local.rates import resolve
 from tests.models.robot.trees import numeric, seven_joint_arm
 
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])

@@ -12,7 +12,7 @@ from models import FixedBase, FreeFloating, Machine, planar_chain
 from ocp import Collocation, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.local import resolve
+from ocp.local.rates import resolve
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import numeric, seven_joint_arm

@@ -16,8 +16,8 @@ from ocp import Collocation, solve
 from ocp.builders.redundancy import minimum_velocity
 from ocp.builders.redundancy_plan import plan_minimum_velocity
 from ocp.errors import ProblemError
-from ocp.inverse_kinematics import Unreachable
-from ocp.local import resolve
+from ocp.local.inverse_kinematics import Unreachable
+from ocp.local.rates import resolve
 from ocp.tasks.equations import bind
 from ocp.tasks.tip_task import TipTask, along
 from tests.models.robot.trees import numeric, seven_joint_arm

@@ -25,7 +25,7 @@ from ocp.builders.standing import (
     standing_plan,
 )
 from ocp.errors import ProblemError, SolveError
-from ocp.local_acceleration import Stabiliser, resolve_accelerations
+from ocp.local.accelerations import Stabiliser, resolve_accelerations
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
 from tests.ocp.standing_replay import replay

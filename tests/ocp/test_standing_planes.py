@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from ocp import Collocation, Solution, solve
-from ocp.acceleration_laws import Law
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, Weights, standing_plan
 from ocp.errors import ProblemError
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
+from ocp.local.laws import Law
 from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric

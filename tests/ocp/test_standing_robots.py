@@ -22,7 +22,7 @@ from models.machines.standing_motion import StandingMotion
 from ocp import Collocation, Solution, solve
 from ocp.builders.standing import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery_pushing as pushing
 from scripts import gallery_standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State

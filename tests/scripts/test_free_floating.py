@@ -9,7 +9,7 @@ from PIL import Image
 
 from models import FreeFloating, paper_example
 from ocp import Collocation, solve
-from ocp.local import LocalSolution, resolve
+from ocp.local.rates import LocalSolution, resolve
 from scripts import free_floating_results
 from scripts.false_optima import FALSE, GUESSES, Trial
 from scripts.free_floating_motion import laws, momentum, motion_of_local, total_center_of_mass

@@ -19,7 +19,7 @@ from PIL import Image
 
 from models.arrays import Array
 from ocp import Solution, SolveError
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery, gallery_panda, gallery_pushing, gallery_robots, gallery_ur5
 from scripts.gallery_drawing import Scene, animate
 from scripts.gallery_frames import TIP, Frames, frames_along

@@ -17,7 +17,7 @@ from PIL import Image
 from models.machines.standing import PAPER_START
 from models.machines.standing_motion import StandingMotion
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
-from ocp.local_acceleration import resolve_accelerations
+from ocp.local.accelerations import resolve_accelerations
 from scripts import reproduce, standing, standing_results
 from scripts.standing_cases import HORIZON, LOCAL, ROWS, fails, machine, table_path
 from scripts.standing_checks import ALLOWED, STATIONARITY, check, failures, region_excess

@@ -11,7 +11,7 @@ from models import FixedBase, Machine, planar_chain
 from models.machines.machine import with_tip
 from models.paths import Path, smooth
 from ocp.errors import ProblemError
-from ocp.local import resolve
+from ocp.local.rates import resolve
 from ocp.tasks.equations import bind, task_errors
 from ocp.tasks.tip_task import TipTask, along, pose_line
 from tests.models.robot.trees import Array, numeric

@@ -13,9 +13,9 @@ from models.machines.machine import jacobian_manipulability
 from models.machines.standing import PAPER_START, Standing
 from models.robot.indices import joint_limit_index
 from models.robot.motion import momentum
-from ocp.acceleration_laws import Law, accelerations
 from ocp.errors import ProblemError
-from ocp.local_acceleration import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
+from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
+from ocp.local.laws import Law, accelerations
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
 from tests.ocp.standing_tasks import (

@@ -17,8 +17,8 @@ import numpy as np
 
 from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
-from ocp.acceleration_laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.errors import ProblemError
+from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.tasks.start import Array, checked_start
 from ocp.tasks.tip_path import Path, check_path, linear_rows, path_derivatives
 from ocp.tasks.zmp_rules import checked_place, is_finite

@@ -18,7 +18,7 @@ from models.machines.standing import External, Standing, wrenches_at
 from models.robot.indices import joint_limit_index
 from models.robot.motion import center_of_mass_motion, momentum
 from ocp.errors import ProblemError
-from ocp.local import least_rates
+from ocp.local.rates import least_rates
 from ocp.tasks.tip_path import Path, path_derivatives
 from ocp.tasks.zmp_rules import is_finite
 

@@ -11,10 +11,10 @@ import pytest
 from models import FixedBase, FreeFloating, Robot, planar_chain
 from models.spatial import rotation
 from ocp import Collocation, SolveError
-from ocp.builders.reach import check_reach, leaves_limits
 from ocp.builders.redundancy_plan import plan_minimum_velocity
-from ocp.inverse_kinematics import Unreachable
-from ocp.local import resolve
+from ocp.local.inverse_kinematics import Unreachable
+from ocp.local.rates import resolve
+from ocp.local.reach import check_reach, leaves_limits
 from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seven_joint_arm
 

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from ocp.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.local import LocalSolution
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.rates import LocalSolution
 from ocp.tasks.equations import bind
 from ocp.tasks.geometry import pose_in_reference
 from ocp.tasks.start import Array

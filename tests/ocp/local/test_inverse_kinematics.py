@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Robot, planar_chain
 from ocp.errors import ProblemError
-from ocp.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seeds
 from tests.ocp.tasks.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5

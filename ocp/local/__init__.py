@@ -1,0 +1,1 @@
+"""Instant by instant: redundancy resolved locally, inverse kinematics, reach."""
