@@ -22,7 +22,7 @@ from models import paths
 from models.machines.scara_path import scara_along
 from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
 from models.paths.arc_length import arc_length
-from ocp.builders.path_timing import minimum_time
+from ocp.builders.timing import minimum_time
 from ocp.schedule import Limits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.benchmark_blend_peers import GRID, peer_plans, roots

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import SmoothPath, gamma, smooth
 from models.paths.blends import polynomial
-from ocp.builders.path_timing import Fastest, minimum_time
+from ocp.builders.timing import Fastest, minimum_time
 from ocp.schedule import Limits, Schedule, joint_motion, peak_acceleration, schedule
 from scripts.blend_example import (
     ARM,

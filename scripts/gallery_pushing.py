@@ -19,7 +19,7 @@ from models import Footprint, Robot, Standing, Wrench, footprint, with_load
 from models.arrays import Array
 from models.machines.standing import External
 from ocp import Collocation, Problem, solve
-from ocp.builders.standing import InFoot, Limits, standing_plan
+from ocp.builders.standing.plan import InFoot, Limits, standing_plan
 from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery_standing as standing
 from scripts.gallery_frames import frames_along

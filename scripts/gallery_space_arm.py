@@ -10,7 +10,7 @@ import numpy as np
 from models import FreeFloating
 from models.spatial import rotation_from_rpy
 from ocp import Collocation
-from ocp.builders.redundancy_plan import plan_minimum_velocity
+from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.rates import resolve
 from ocp.tasks.tip_task import TipTask, pose_line
 from scripts.drawing import COLORS, DASHES, sheet

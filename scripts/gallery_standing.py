@@ -21,7 +21,7 @@ from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve
-from ocp.builders.standing import InFoot, Limits, Weights, standing_plan
+from ocp.builders.standing.plan import InFoot, Limits, Weights, standing_plan
 from ocp.local.accelerations import resolve_accelerations
 from scripts.drawing import COLORS, DASHES, sheet
 

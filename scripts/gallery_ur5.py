@@ -11,7 +11,7 @@ import numpy as np
 from models import FixedBase, Machine
 from models.arrays import Array
 from ocp import Collocation, Solution, SolveError
-from ocp.builders.redundancy_plan import plan_minimum_velocity
+from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.inverse_kinematics import Posture, inverse_kinematics
 from ocp.local.rates import LocalSolution, resolve
 from ocp.tasks.tip_task import TipTask

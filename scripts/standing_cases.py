@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from models.machines.standing import PAPER_START, External, Standing, paper_example, tip_spring
 from models.machines.standing_motion import StandingMotion
-from ocp.builders.standing import motion_cost
+from ocp.builders.standing.plan import motion_cost
 from ocp.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from scripts.drawing import Row
 from scripts.standing_printed import printed_law

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from models.machines.standing_motion import StandingMotion
-from ocp.builders.standing import Anywhere, IndexAtLeast, InFoot, Pinned
-from ocp.builders.standing_options import ZmpRule
+from ocp.builders.standing.options import ZmpRule
+from ocp.builders.standing.plan import Anywhere, IndexAtLeast, InFoot, Pinned
 from scripts.drawing import Row
 from scripts.standing_cases import machine
 from scripts.standing_plans import FINER, LIFT_LIMITS, LIMITS, METHOD_NAMES, Plan
@@ -27,7 +27,7 @@ ALLOWED = {
 
 STATIONARITY = "stationarity, relative"
 """The finding that a plan of held accelerations may miss: a constraint of the ground or a torque is active at one end
-of an interval only, where its multiplier belongs, and the audit looks inside it (ocp.builders.standing)."""
+of an interval only, where its multiplier belongs, and the audit looks inside it (ocp.builders.standing.plan)."""
 
 
 def check(key: str, plan: Plan) -> Row:

@@ -11,7 +11,8 @@ import numpy as np
 from models.machines.standing import PAPER_START
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.builders.standing import (
+from ocp.builders.standing.options import ZmpRule
+from ocp.builders.standing.plan import (
     Anywhere,
     FreeTime,
     IndexAtLeast,
@@ -21,7 +22,6 @@ from ocp.builders.standing import (
     Weights,
     standing_plan,
 )
-from ocp.builders.standing_options import ZmpRule
 from scripts.drawing import Row
 from scripts.standing_cases import HORIZON, ROWS, Array, machine, spring, start_tip, table_path
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from models.machines.standing import PAPER_START
 from models.machines.standing_motion import StandingMotion
-from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
+from ocp.builders.standing.plan import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from ocp.local.accelerations import resolve_accelerations
 from scripts import reproduce, standing, standing_results
 from scripts.standing_cases import HORIZON, LOCAL, ROWS, fails, machine, table_path

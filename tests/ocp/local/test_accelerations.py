@@ -18,7 +18,7 @@ from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser, res
 from ocp.local.laws import Law, accelerations
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
-from tests.ocp.standing_tasks import (
+from tests.ocp.builders.standing_tasks import (
     ARM_HORIZON,
     ARM_START,
     HORIZON,

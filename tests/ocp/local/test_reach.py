@@ -11,7 +11,7 @@ import pytest
 from models import FixedBase, FreeFloating, Robot, planar_chain
 from models.spatial import rotation
 from ocp import Collocation, SolveError
-from ocp.builders.redundancy_plan import plan_minimum_velocity
+from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.rates import resolve
 from ocp.local.reach import check_reach, leaves_limits

@@ -13,8 +13,7 @@ from models import FixedBase, FreeFloating, center_of_mass, paper_example, plana
 from models.machines.machine import with_tip
 from models.paths import Path, smooth
 from ocp import Collocation, solve
-from ocp.builders.redundancy import minimum_velocity
-from ocp.builders.redundancy_plan import plan_minimum_velocity
+from ocp.builders.redundancy import minimum_velocity, plan_minimum_velocity
 from ocp.errors import ProblemError
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.rates import resolve

@@ -10,8 +10,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Machine, planar_chain
 from ocp import Collocation, solve
-from ocp.builders.redundancy import minimum_velocity
-from ocp.builders.redundancy_plan import plan_minimum_velocity
+from ocp.builders.redundancy import minimum_velocity, plan_minimum_velocity
 from ocp.local.rates import resolve
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask

@@ -36,9 +36,9 @@ from models.machines.standing import External, Standing, center_of_pressure, wre
 from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
-from ocp.builders.standing_guess import local_guess
-from ocp.builders.standing_options import FreeTime, Limits, Weights
-from ocp.builders.standing_start import check_freedom, check_loads, check_slope, inside_limits, tip_demand
+from ocp.builders.standing.guess import local_guess
+from ocp.builders.standing.options import FreeTime, Limits, Weights
+from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, tip_demand
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem
 from ocp.tasks.start import Array, checked_start

@@ -20,14 +20,14 @@ from models import Robot, Standing, Wrench, rectangle, simplified, with_load
 from models.machines.standing import paper_example
 from models.machines.standing_motion import StandingMotion
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing import Anywhere, Limits, Pinned, standing_plan
+from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery_pushing as pushing
 from scripts import gallery_standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State
 from tests.models.robot.trees import Array, numeric
-from tests.ocp.standing_tasks import sampled, tip_error
+from tests.ocp.builders.standing_tasks import sampled, tip_error
 
 pytestmark = pytest.mark.xdist_group("standing robots")
 

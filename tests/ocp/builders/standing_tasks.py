@@ -12,7 +12,7 @@ from models.machines.standing import PAPER_START, External, Standing, paper_exam
 from models.machines.standing_motion import StandingMotion, standing_motion
 from models.robot.dynamics import Wrench
 from ocp import Problem, Solution
-from ocp.builders.standing import FreeTime, Limits, Weights, standing_plan
+from ocp.builders.standing.plan import FreeTime, Limits, Weights, standing_plan
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm
 from tests.models.robot.trees import Array
 

@@ -21,8 +21,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.builders.path_reference import cut, distinct, reference_mesh, reference_motion
-from ocp.builders.path_tables import demand_of_pieces, path_columns, table
+from ocp.builders.timing_tables import (
+    cut,
+    demand_of_pieces,
+    distinct,
+    path_columns,
+    reference_mesh,
+    reference_motion,
+    table,
+)
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError
 from ocp.methods import solve

@@ -11,9 +11,9 @@ from models.machines.scara import Scara
 from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Line, Path, SmoothPath, smooth
 from ocp import Collocation, ProblemError, solve
-from ocp.builders import path_reference
-from ocp.builders.path_tables import largest_demand, table
-from ocp.builders.path_timing import Fastest, minimum_time, timing_problem
+from ocp.builders import timing_tables as path_reference
+from ocp.builders.timing import Fastest, minimum_time, timing_problem
+from ocp.builders.timing_tables import largest_demand, table
 from ocp.schedule import JointLimits, Limits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
 

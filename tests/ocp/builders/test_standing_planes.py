@@ -12,14 +12,23 @@ from scipy.spatial.transform import Rotation
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, Weights, standing_plan
+from ocp.builders.standing.plan import (
+    Anywhere,
+    Following,
+    IndexAtLeast,
+    InFoot,
+    Limits,
+    Pinned,
+    Weights,
+    standing_plan,
+)
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from ocp.local.laws import Law
 from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
-from tests.ocp.standing_tasks import PLANAR_HORIZON, planar_path, planar_start, quintic, sampled, tip_at
+from tests.ocp.builders.standing_tasks import PLANAR_HORIZON, planar_path, planar_start, quintic, sampled, tip_at
 
 SIZE = 5
 START = planar_start(SIZE)

@@ -13,8 +13,7 @@ from models.cts.clearance import Surroundings, clearances
 from models.cts.rig import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
 from models.shapes.capsules import Box
 from ocp import Collocation, ProblemError, Solution, solve
-from ocp.builders.cts import roll_plan, spline_targets
-from ocp.builders.cts_guess import least_course
+from ocp.builders.cts import least_course, roll_plan, spline_targets
 from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()

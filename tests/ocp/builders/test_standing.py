@@ -12,7 +12,7 @@ from models.machines.standing import PAPER_START, Standing, center_of_pressure
 from models.machines.standing_motion import standing_motion
 from models.machines.support import Support, rectangle
 from ocp import Collocation, MultipleShooting, Solution, solve, tighten
-from ocp.builders.standing import (
+from ocp.builders.standing.plan import (
     Anywhere,
     Following,
     FreeTime,
@@ -28,8 +28,8 @@ from ocp.errors import ProblemError, SolveError
 from ocp.local.accelerations import Stabiliser, resolve_accelerations
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
-from tests.ocp.standing_replay import replay
-from tests.ocp.standing_tasks import (
+from tests.ocp.builders.standing_replay import replay
+from tests.ocp.builders.standing_tasks import (
     ARM_HORIZON,
     ARM_START,
     HORIZON,

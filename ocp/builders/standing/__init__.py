@@ -1,0 +1,1 @@
+"""Plans of machines that stand unfastened on the ground."""
