@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.attempt import TOLERANCE, Attempt
 from ocp.schedule.grid import make_grid
+from ocp.schedule.joints import TOLERANCE, Attempt, search
 from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names
 from ocp.schedule.profile import Array, Motion, SpeedProfile
-from ocp.schedule.search import search
 
 __all__ = ["Dip", "Schedule", "schedule"]
 

@@ -33,13 +33,10 @@ from ocp.schedule import (
     ramp_time,
     schedule,
 )
-from ocp.schedule.attempt import Attempt
-from ocp.schedule.easing import Broken, broken_ramps, ease_ramps
 from ocp.schedule.grid import Grid, make_grid
+from ocp.schedule.joints import Attempt, Broken, broken_ramps, ease_ramps, relax_ramps, slow_down
 from ocp.schedule.limits import cause_names
-from ocp.schedule.relaxing import relax_ramps
-from ocp.schedule.slowing import slow_down
-from ocp.schedule.zones import plan as planned
+from ocp.schedule.ramps import plan as planned
 from tests.models.paths.task_paths import random_arm_path, seeds
 from tests.models.paths.test_paths import example
 from tests.ocp.problems import Array
