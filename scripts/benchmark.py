@@ -26,8 +26,6 @@ if str(ROOT) not in sys.path:  # run as a file
     sys.path.insert(0, str(ROOT))
 
 from models import FreeFloating, Joint, Link, Robot, paper_example  # noqa: E402
-from models.costates import costate_rate  # noqa: E402
-from models.virtual_chain import VirtualChain  # noqa: E402
 from ocp import Collocation, Problem, Solution, prepare  # noqa: E402
 from ocp.builders import redundancy  # noqa: E402
 from ocp.curves import (
@@ -37,6 +35,8 @@ from ocp.curves import (
 from ocp.indirect.hamiltonian import Hamiltonian  # noqa: E402
 from ocp.problem.formulation import Formulation  # noqa: E402
 from scripts import drawing  # noqa: E402
+from scripts.papers.free_floating.costates import costate_rate  # noqa: E402
+from scripts.papers.free_floating.virtual_chain import VirtualChain  # noqa: E402
 
 INTERVALS = (50, 100, 200, 400, 800)
 DEGREE = 3

@@ -16,11 +16,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 import numpy as np
 
 from ocp.schedule import joint_trajectory
-from scripts.blend_example import CENTRIPETAL, MM, NOTE, PAPER_SPEED_ERROR, PAPER_TIMES, PERIOD, SPEED
-from scripts.blend_figures import draw_paper
-from scripts.blend_findings import draw_animation, draw_findings
-from scripts.blend_results import Results, asked_centripetal, compute, event_table, exit_steps, limit_table
 from scripts.drawing import Row, text_table, write_json, write_table, written
+from scripts.papers.blend.example import CENTRIPETAL, MM, NOTE, PAPER_SPEED_ERROR, PAPER_TIMES, PERIOD, SPEED
+from scripts.papers.blend.figures import draw_paper
+from scripts.papers.blend.findings import draw_animation, draw_findings
+from scripts.papers.blend.results import Results, asked_centripetal, compute, event_table, exit_steps, limit_table
 
 __all__ = ["NAME", "main", "summary", "write"]
 

@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 
 import numpy as np
 
-from scripts.cts_figures import draw, draw_release
-from scripts.cts_plan import draw_plan, plan_summary
-from scripts.cts_results import NOTE, PAPER_TIMES, REFERENCE, Results, compute
 from scripts.drawing import Row, text_table, write_json, write_table
+from scripts.papers.cts.figures import draw, draw_release
+from scripts.papers.cts.plan import draw_plan, plan_summary
+from scripts.papers.cts.results import NOTE, PAPER_TIMES, REFERENCE, Results, compute
 
 __all__ = ["NAME", "main", "summary", "write"]
 

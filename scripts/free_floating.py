@@ -16,14 +16,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 
 import numpy as np
 
-from scripts import extremals
 from scripts.drawing import Row, text_table, write_json, write_table, written
-from scripts.false_optima import EXTREMAL, FALSE
-from scripts.false_optima import HORIZON as FALSE_HORIZON
-from scripts.free_floating_figures import draw, draw_animation, draw_convergence, draw_false_optima
-from scripts.free_floating_optimality import PLAN, SECOND_OPINION, certificate_rows, indirect_summary
-from scripts.free_floating_optimality_figures import draw_costates, draw_extremals, draw_hamiltonian
-from scripts.free_floating_results import (
+from scripts.papers.free_floating import extremals
+from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE
+from scripts.papers.free_floating.false_optima import HORIZON as FALSE_HORIZON
+from scripts.papers.free_floating.figures import draw, draw_animation, draw_convergence, draw_false_optima
+from scripts.papers.free_floating.optimality import PLAN, SECOND_OPINION, certificate_rows, indirect_summary
+from scripts.papers.free_floating.optimality_figures import draw_costates, draw_extremals, draw_hamiltonian
+from scripts.papers.free_floating.results import (
     ASSUMED,
     CAVEATS,
     CHOSEN,

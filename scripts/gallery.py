@@ -27,7 +27,7 @@ from tqdm import tqdm
 from models import ModelError
 from ocp import ProblemError, SolveError
 from scripts.drawing import text_table, write_json, written
-from scripts.gallery_robots import missing
+from scripts.robots.robots import missing
 
 __all__ = ["EXAMPLES", "NAME", "Entry", "main", "noticed", "run"]
 
@@ -48,11 +48,11 @@ class Entry:
 
 
 EXAMPLES: Mapping[str, Entry] = {
-    "space_arm": Entry("scripts.gallery_space_arm", "spartpy"),
-    "panda": Entry("scripts.gallery_panda", "example-robot-data"),
-    "ur5": Entry("scripts.gallery_ur5", "example-robot-data"),
-    "mobile_manipulator": Entry("scripts.gallery_mobile_manipulator", "example-robot-data"),
-    "pushing": Entry("scripts.gallery_pushing", "example-robot-data"),
+    "space_arm": Entry("scripts.robots.space_arm", "spartpy"),
+    "panda": Entry("scripts.robots.panda", "example-robot-data"),
+    "ur5": Entry("scripts.robots.ur5", "example-robot-data"),
+    "mobile_manipulator": Entry("scripts.robots.mobile_manipulator", "example-robot-data"),
+    "pushing": Entry("scripts.robots.pushing", "example-robot-data"),
 }
 COLUMNS = ("dof", "task_rows", "cost_local", "cost_optimal", "tip_error", "joint_return_rad", "audit_passed")
 """Of the summary, printed."""

@@ -16,13 +16,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
 from scripts.drawing import Row, text_table, write_json, write_table, written
-from scripts.standing_animation import draw_animations
-from scripts.standing_cases import ASSUMED, CHOSEN, GAINS, machine
-from scripts.standing_checks import ALLOWED, STATIONARITY, failures
-from scripts.standing_figures import draw
-from scripts.standing_plan_figures import draw_convergence, draw_plans
-from scripts.standing_plans import LIFT_SETTINGS, SETTINGS
-from scripts.standing_results import (
+from scripts.papers.standing.animation import draw_animations
+from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS, machine
+from scripts.papers.standing.checks import ALLOWED, STATIONARITY, failures
+from scripts.papers.standing.figures import draw
+from scripts.papers.standing.plan_figures import draw_convergence, draw_plans
+from scripts.papers.standing.plans import LIFT_SETTINGS, SETTINGS
+from scripts.papers.standing.results import (
     Results,
     comparison_table,
     compute,

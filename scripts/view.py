@@ -21,7 +21,7 @@ import numpy as np
 from models import ModelError
 from models.spatial import rotation_from_rpy
 from ocp import ProblemError
-from scripts.view_plan import Played, play
+from scripts.viewer.plan import Played, play
 
 __all__ = ["main", "options_of", "parser", "read"]
 
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if lacking := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         print(f'view: {", ".join(lacking)} missing; pip install "selfmotion[view]"', file=sys.stderr)
         return 1
-    from scripts.view_scene import View
+    from scripts.viewer.scene import View
 
     try:
         played = read(options)

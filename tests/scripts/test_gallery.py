@@ -20,11 +20,23 @@ from PIL import Image
 from models.arrays import Array
 from ocp import Solution, SolveError
 from ocp.local.accelerations import resolve_accelerations
-from scripts import gallery, gallery_panda, gallery_pushing, gallery_robots, gallery_ur5
-from scripts.gallery_drawing import Scene, animate
-from scripts.gallery_frames import TIP, Frames, frames_along
-from scripts.gallery_results import turning_angle
-from scripts.view_plan import play
+from scripts import gallery
+from scripts.robots import (
+    panda as gallery_panda,
+)
+from scripts.robots import (
+    pushing as gallery_pushing,
+)
+from scripts.robots import (
+    robots as gallery_robots,
+)
+from scripts.robots import (
+    ur5 as gallery_ur5,
+)
+from scripts.robots.drawing import Scene, animate
+from scripts.robots.frames import TIP, Frames, frames_along
+from scripts.robots.results import turning_angle
+from scripts.viewer.plan import play
 
 pytestmark = pytest.mark.xdist_group("gallery")
 

@@ -19,10 +19,10 @@ from models.arrays import Array
 from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.redundancy import minimum_velocity
 from scripts import view
-from scripts.gallery_frames import TIP, frames_along, inertia_box
-from scripts.view_meshes import find_mesh, read_shapes
-from scripts.view_plan import Played, play, read_record, save_plan
-from scripts.view_scene import View
+from scripts.robots.frames import TIP, frames_along, inertia_box
+from scripts.viewer.meshes import find_mesh, read_shapes
+from scripts.viewer.plan import Played, play, read_record, save_plan
+from scripts.viewer.scene import View
 
 pytestmark = pytest.mark.xdist_group("view")
 

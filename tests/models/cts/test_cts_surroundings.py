@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from models.cts.clearance import Surroundings, clearances, rig_capsules
 from models.cts.rig import dh_frames, reference_rig
 from models.errors import ModelError
-from models.rigid_body import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
 from models.robot.parts import Link
 from models.shapes.capsules import (
     Box,
@@ -25,6 +24,7 @@ from models.shapes.capsules import (
     capsule_to_capsule,
     soft_minimum,
 )
+from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
 
 seeds = st.integers(0, 2**32 - 1)
 BODY = Link("store", 240.0, inertia=np.diag([6.0, 75.0, 80.0]))

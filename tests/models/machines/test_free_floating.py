@@ -27,7 +27,7 @@ from models import (
 from models.machines.free_floating import PLANAR_ROWS
 from models.machines.machine import with_tip
 from models.spatial import Frame, solve_spd
-from models.virtual_chain import VirtualChain
+from scripts.papers.free_floating.virtual_chain import VirtualChain
 from tests.models.robot.pinocchio_robots import ROBOTS, Peer, random_state, swapped, urdf_file
 from tests.models.robot.trees import (
     Array,

@@ -16,8 +16,8 @@ from models.machines.support import rectangle
 from models.robot.dynamics import Wrench
 from models.robot.motion import link_motions
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
-from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds
+from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
 sizes = st.integers(1, 6)

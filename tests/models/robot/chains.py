@@ -12,10 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models import FreeFloating, Joint, Link, Robot, link_frames, paper_example, tip_pose
-from models.costates import generalized_jacobian
 from models.robot.parts import Kind
 from models.spatial import rotation
-from models.virtual_chain import VirtualChain
+from scripts.papers.free_floating.costates import generalized_jacobian
+from scripts.papers.free_floating.virtual_chain import VirtualChain
 from tests.models.robot.trees import (
     Array,
     Base,

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from models import ModelError, center_of_mass, frame_jacobian, link_frames, momentum_matrix, planar_chain
 from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
 from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
-from tests.models.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.robot.trees import (
     Array,
     directional,
@@ -23,6 +22,7 @@ from tests.models.robot.trees import (
     seeds,
     twist_by_differentiation,
 )
+from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 
 bases = st.sampled_from(["planar", "spatial"])
 LIBRARY = 1e-9

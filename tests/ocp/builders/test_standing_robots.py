@@ -23,8 +23,8 @@ from ocp import Collocation, Solution, solve
 from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
-from scripts import gallery_pushing as pushing
-from scripts import gallery_standing as gallery
+from scripts.robots import pushing
+from scripts.robots import standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.builders.standing_tasks import sampled, tip_error

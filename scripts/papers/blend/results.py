@@ -1,0 +1,222 @@
+"""Everything that scripts/blend.py writes and draws about the example of Lee, Ryu, Cheong 2006."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from models.machines.scara_path import ScaraPath, scara_along
+from models.paths import SmoothPath, gamma, smooth
+from models.paths.blends import polynomial
+from ocp.builders.timing import Fastest, minimum_time
+from ocp.schedule import Limits, Schedule, joint_motion, peak_acceleration, schedule
+from scripts.drawing import Row
+from scripts.papers.blend.example import (
+    ARM,
+    CENTRIPETAL,
+    ELBOW,
+    JERK,
+    JOINT_LIMITS,
+    MEAN_ACCELERATION,
+    MM,
+    PAPER_GAMMA,
+    PAPER_TIMES,
+    REMAINING,
+    SPEED,
+    Array,
+    corner,
+    example,
+)
+from scripts.papers.blend.mapping import mapping_table, small_blend_table, speed_errors
+
+__all__ = ["Plan", "Results", "asked_centripetal", "compute", "event_table", "exit_steps", "limit_table"]
+
+SAMPLES = 20001
+"""At which a schedule's demands are looked at: 0.1 ms apart or less."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One path under some limits.
+
+    Attributes:
+        path: The example, with either blend.
+        joints: The arm along it.
+        schedule: The path's own schedule under the limits.
+        fastest: The minimum time under the same limits, by optimal control.
+    """
+
+    path: SmoothPath
+    joints: ScaraPath
+    schedule: Schedule
+    fastest: Fastest
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything computed for the paper.
+
+    Attributes:
+        cubic, quintic: The example with either blend.
+        mean, peak: Schedule of the cubic, 5000 mm/s^2 being the mean or the peak acceleration of a ramp.
+        joints: The arm along the cubic path.
+        gamma_table, mappings, small_blends: Rows of tables.
+        speed_error_times, speed_errors: What 2 ms differences of positions show of each mapping. Shape (M,), s, mm/s.
+        plans: The paths under more and more limits, by name.
+    """
+
+    cubic: SmoothPath
+    quintic: SmoothPath
+    mean: Schedule
+    peak: Schedule
+    joints: ScaraPath
+    gamma_table: list[Row]
+    mappings: list[Row]
+    small_blends: list[Row]
+    speed_error_times: Array
+    speed_errors: dict[str, Array]
+    plans: dict[str, Plan]
+
+
+def compute() -> Results:
+    """All of it, in under ten seconds."""
+    cubic, quintic = smooth(example(), REMAINING, kind="cubic"), smooth(example(), REMAINING, kind="quintic")
+    acceleration = peak_acceleration(MEAN_ACCELERATION, SPEED, JERK)
+    mean = schedule(cubic, Limits(SPEED, acceleration, JERK))
+    peak = schedule(cubic, Limits(SPEED, MEAN_ACCELERATION, JERK))
+    along, along_quintic = scara_along(ARM, cubic, ELBOW), scara_along(ARM, quintic, ELBOW)
+    line = Limits(SPEED, acceleration, JERK)
+    bent = Limits(SPEED, acceleration, JERK, CENTRIPETAL)
+    whole = Limits(SPEED, acceleration, JERK, CENTRIPETAL, JOINT_LIMITS)
+    cases = {
+        "cubic, line speed": (cubic, along, line),
+        "cubic, + centripetal": (cubic, along, bent),
+        "quintic, line speed": (quintic, along_quintic, line),
+        "quintic, + centripetal": (quintic, along_quintic, bent),
+        "quintic, + joints": (quintic, along_quintic, whole),
+    }
+    plans = {}
+    bar = tqdm(cases.items(), disable=None)
+    for name, (path, joints, limits) in bar:
+        bar.set_description(f"minimum time, {name}")
+        plan = schedule(path, limits, joints=joints)
+        plans[name] = Plan(path, joints, plan, minimum_time(path, limits, joints, guess=plan))
+    return Results(
+        cubic,
+        quintic,
+        mean,
+        peak,
+        along,
+        gamma_table(),
+        mapping_table(cubic, mean.profile),
+        small_blend_table(),
+        *speed_errors(cubic, mean),
+        plans,
+    )
+
+
+def measured_gamma(path: SmoothPath) -> float:
+    """Distance vertex to curve over the remaining distance, from the curve itself."""
+    points = polynomial(path.coefficients[:1], np.linspace(0, 1, 2001))
+    return float(np.linalg.norm(points, axis=1).min() / path.remaining[0])
+
+
+def gamma_table() -> list[Row]:
+    """Table 2: closed form, measured on the curve, printed."""
+    rows: list[Row] = []
+    for remaining, printed in PAPER_GAMMA.items():
+        cases = (
+            ("constant_30_90deg", 30 / remaining, 90.0),
+            ("shape_1_90deg", 1.0, 90.0),
+            ("shape_1_45deg", 1.0, 45.0),
+        )
+        row: dict[str, Any] = {"remaining_mm": remaining}
+        for (name, shape, degrees), paper in zip(cases, printed, strict=True):
+            row[name] = gamma(shape, np.radians(degrees))
+            row[f"{name}_measured"] = measured_gamma(corner(degrees, remaining * MM, shape))
+            row[f"{name}_paper"] = paper
+            row[f"{name}_difference"] = row[name] - paper
+        rows.append(row)
+    return rows
+
+
+def event_table(results: Results) -> list[Row]:
+    """When the blends begin and end, in both readings of the acceleration, beside the printed times."""
+    names = ("blend 1 begins", "blend 1 ends", "blend 2 begins", "blend 2 ends")
+    mean, peak = (plan.time_at(results.cubic.bounds[1:5]) for plan in (results.mean, results.peak))
+    rows: list[Row] = [
+        {
+            "event": name,
+            "paper_s": paper,
+            "mean_s": a,
+            "mean_difference_s": a - paper,
+            "peak_s": b,
+            "peak_difference_s": b - paper,
+        }
+        for name, paper, a, b in zip(names, PAPER_TIMES, mean.tolist(), peak.tolist(), strict=True)
+    ]
+    for blend in (0, 1):
+        paper = PAPER_TIMES[2 * blend + 1] - PAPER_TIMES[2 * blend]
+        a, b = (float(times[2 * blend + 1] - times[2 * blend]) for times in (mean, peak))
+        rows.append(
+            {
+                "event": f"blend {blend + 1} lasts",
+                "paper_s": paper,
+                "mean_s": a,
+                "mean_difference_s": a - paper,
+                "peak_s": b,
+                "peak_difference_s": b - paper,
+            }
+        )
+    return rows
+
+
+def limit_table(results: Results) -> list[Row]:
+    """Schedules under more and more limits, against the minimum of the optimal control problem.
+
+    A number "over limit" is the largest demand over its limit, whether the limit was asked for or not.
+    """
+    rows: list[Row] = []
+    bounds = [np.asarray(getattr(JOINT_LIMITS, kind)) for kind in ("velocity", "acceleration", "jerk")]
+    for name, plan in results.plans.items():
+        motion = plan.schedule.at(np.linspace(0, plan.schedule.duration, SAMPLES))
+        joints = joint_motion(plan.joints, motion)
+        used = [float((np.abs(value) / bound).max()) for value, bound in zip(joints[1:], bounds, strict=True)]
+        centripetal = motion.speed**2 * plan.path.curvature(motion.distance)
+        # where the curvature jumps, so do the joint accelerations, between any two samples
+        smooth_joints = plan.path.curvature_jumps().max() < 1e-9
+        rows.append(
+            {
+                "case": name,
+                "duration_s": plan.schedule.duration,
+                "minimum_s": plan.fastest.duration,
+                "over_minimum_percent": 100 * (plan.schedule.duration / plan.fastest.duration - 1),
+                "minimum_demand": plan.fastest.demand,
+                "dips": len(plan.schedule.dips),
+                "centripetal_over_limit": float(centripetal.max()) / CENTRIPETAL,
+                "joint_velocity_over_limit": used[0],
+                "joint_acceleration_over_limit": used[1],
+                "joint_jerk_over_limit": used[2] if smooth_joints else "unbounded",
+            }
+        )
+    return rows
+
+
+def exit_steps(results: Results, mapping: str = "predictor_corrector") -> list[float]:
+    """Speed error of the period in which each blend of the example ends: its drift is made good there, mm/s."""
+    ends = results.mean.time_at(results.cubic.bounds[[2, 4]])
+    after = np.searchsorted(results.speed_error_times, ends)
+    return [float(error) for error in results.speed_errors[mapping][after]]
+
+
+def asked_centripetal(path: SmoothPath) -> list[float]:
+    """Largest centripetal acceleration of each blend at the asked speed, m/s^2."""
+    peaks = []
+    for vertex in range(len(path.remaining)):
+        blend = path.blend(vertex)
+        s = np.linspace(blend.start, blend.end, 4001)
+        peaks.append(float(path.curvature(s).max()) * SPEED**2)
+    return peaks

@@ -1,0 +1,120 @@
+"""The mobile manipulator of gallery_standing in the gallery, and what it shares with others that stand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import Robot
+from models.arrays import Array
+from ocp import Audit
+from scripts.robots import standing
+from scripts.robots.drawing import Scene, animate
+from scripts.robots.frames import frames_along
+from scripts.robots.results import joint_return
+from scripts.viewer.plan import save_plan
+
+__all__ = ["StandingExample", "animated", "draw", "plan"]
+
+
+@dataclass(frozen=True, eq=False)
+class StandingExample:
+    """A standing robot's plan and its audit.
+
+    Attributes:
+        name: Of the robot, with what it carries.
+        results: The plan, and the local motion of the same task.
+        hand: Where the hand has to be, m, world, as a function of time, s.
+        audit: Of the plan. tolerances: Those of the audit that are not the default.
+    """
+
+    name: str
+    results: standing.Results
+    hand: standing.HandPath
+    audit: Audit
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """A row of the summary."""
+        found = self.results
+        time, motion = ca.SX.sym("time"), found.motion
+        hand = ca.Function("hand", [time], [ca.vertcat(*self.hand(time))])
+        wanted = np.array(hand.map(len(motion.t))(motion.t[None, :])).T
+        return {
+            "robot": self.name,
+            "dof": found.robot.dof,
+            "task_rows": len(standing.ROWS),
+            "duration_s": found.solution.horizon,
+            "cost_local": None,
+            "cost_optimal": float(found.solution.cost),
+            "tip_error": float(np.abs(motion.tip_in_world - wanted).max()),
+            "momentum_drift_relative": None,
+            "joint_return_rad": joint_return(found.solution),
+            "audit_passed": self.audit.passed,
+            "audit_tolerances": dict(self.tolerances),
+            "zmp_margin_local_m": float(found.local.foot_margin.min()),
+            "zmp_margin_optimal_m": float(motion.foot_margin.min()),
+        }
+
+
+def plan(coarse: bool = False) -> StandingExample:
+    """The plan and its audit; it has one mesh only, `coarse` or not."""
+    found = standing.plan()
+    audit = found.solution.audit(tolerances=standing.TOLERANCES)
+    hand = standing.timed(standing.circle(found.machine))
+    return StandingExample("TIAGo with a load in its hand", found, hand, audit, standing.TOLERANCES)
+
+
+def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
+    """mobile_manipulator.png, .gif and .npz."""
+    found = example.results
+    standing.draw(folder, found)
+    robot, machine = found.robot, found.machine
+    save_plan(
+        folder / "mobile_manipulator.npz",
+        found.solution,
+        robot,
+        {
+            "tip": standing.HAND,
+            "inertia": "as_given",
+            "lock": {joint.name: 0.0 for joint in _whole().moving_joints if joint.name not in standing.JOINTS},
+        },
+        package=(standing.PACKAGE, standing.FILE),
+        translation=machine.translation,
+        rotation=machine.rotation,
+    )
+    if not animation:
+        return
+    corners = np.asarray(found.footprint.support.vertices)
+    ground = np.column_stack([np.vstack([corners, corners[:1]]), np.zeros(len(corners) + 1)])
+    note = (
+        f"Grey: footprint; diamond: zero moment point; the arm from the wheels to the hand. A rope pulls the hand "
+        f"forward with {standing.PULL:g} N."
+    )
+    animated(folder / "mobile_manipulator.gif", found, ground, note=note)
+
+
+def animated(
+    path: Path,
+    found: standing.Results,
+    outline: Array,
+    *,
+    note: str,
+    view: tuple[float, float] = (16.0, -50.0),
+) -> None:
+    """A GIF of the local motion beside the plan, with their zero moment points; arguments as of Scene and animate."""
+    robot, machine, scenes = found.robot, found.machine, []
+    for title, motion, color in (("instant by instant", found.local, "orange"), ("planned", found.motion, "blue")):
+        frames = frames_along(robot, motion.joints, None, machine.translation, machine.rotation)
+        zmp = np.column_stack([motion.zero_moment_point, np.zeros(len(motion.t))])
+        scenes.append(Scene(title, robot, frames, motion.t, color, outline=outline, mark=zmp, view=view))
+    animate(path, scenes, frames=50, seconds=0.1, note=note)
+
+
+def _whole() -> Robot:
+    return Robot.from_urdf(standing.robot_file(), tip=standing.HAND, inertia="as_given")

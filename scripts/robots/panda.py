@@ -1,0 +1,154 @@
+"""A Panda goes round a closed tool path again and again: the pseudo-inverse drifts, the cyclic plan returns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase
+from models.arrays import Array
+from ocp import Collocation
+from ocp.builders.redundancy import plan_minimum_velocity
+from ocp.local.inverse_kinematics import inverse_kinematics
+from ocp.local.rates import resolve
+from ocp.tasks.tip_task import TipTask
+from scripts.drawing import COLORS, DASHES, sheet
+from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.robots.frames import frames_along
+from scripts.robots.results import Example
+from scripts.robots.robots import PANDA
+from scripts.viewer.plan import save_plan
+
+__all__ = ["circling", "draw", "plan"]
+
+HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
+"""The arm's ready posture, rad: inverse kinematics start there."""
+CENTER = (0.45, 0.0, 0.25)  # m
+RADIUS = 0.18  # m
+TILT = 0.4
+"""Tangent of the angle by which the tool leans outwards all round."""
+LAP = 6.0  # s
+LAPS = 6
+SAMPLES = 100  # a lap
+
+
+def circling(center: Any = CENTER, radius: float = RADIUS, tilt: float = TILT, lap: float = LAP) -> TipTask:
+    """A level circle at constant speed, the tool pointing down and leaning outwards: six rows, closed."""
+
+    def position(time: Any) -> Any:
+        angle = 2 * np.pi * time / lap
+        return ca.vertcat(center[0] + radius * ca.cos(angle), center[1] + radius * ca.sin(angle), center[2])
+
+    def orientation(time: Any) -> Any:
+        angle = 2 * np.pi * time / lap
+        axis = ca.vertcat(tilt * ca.cos(angle), tilt * ca.sin(angle), -1) / np.sqrt(1 + tilt**2)
+        side = ca.cross(axis, ca.DM([1, 0, 0]))
+        side = side / ca.norm_2(side)
+        return ca.horzcat(ca.cross(side, axis), side, axis)
+
+    return TipTask(position=position, orientation=orientation)
+
+
+def plan(coarse: bool = False) -> Example:
+    """Laps by the pseudo-inverse and one lap of the cyclic plan; `coarse` for what a test can afford."""
+    machine, task, laps = FixedBase(PANDA.read()), circling(), 3 if coarse else LAPS
+    start = inverse_kinematics(machine, task, near=HOME, starts=0)[0].joints
+    local = resolve(machine, task=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
+    solution = plan_minimum_velocity(
+        machine,
+        task=task,
+        start_joints=start,
+        horizon=LAP,
+        cyclic=True,
+        free_start=True,
+        method=Collocation(intervals=24 if coarse else 40, degree=4),
+    )
+    drift = drifts(local.joints)
+    facts = {
+        "laps": laps,
+        "cost_optimal": laps * float(solution.cost),
+        "cost_by_lap_local": np.diff(local.cost[::SAMPLES]),
+        "cost_by_lap_optimal": float(solution.cost),
+        "drift_by_lap_local_rad": drift,
+        "largest_drift_local_rad": float(drift.max()),
+        "first_leaves_limits_local_s": leaves_limits(machine, local.t, local.joints),
+        "closed_in_limits": leaves_limits(machine, solution.t, solution["joints"]) is None,
+    }
+    return Example(PANDA, machine, task, local, solution, solution.audit(), facts, {"laps": laps})
+
+
+def drifts(joints: Array) -> Array:
+    """Largest distance of a joint from its first position after 0, 1, 2, ... laps, rad."""
+    return np.asarray(np.abs(joints[::SAMPLES] - joints[0]).max(axis=1))
+
+
+def leaves_limits(machine: FixedBase, t: Array, joints: Array) -> float | None:
+    """When a joint first leaves its limits, s."""
+    outside = ((joints < machine.robot.lower - 1e-9) | (joints > machine.robot.upper + 1e-9)).any(axis=1)
+    return float(t[outside][0]) if outside.any() else None
+
+
+def repeated(example: Example) -> Array:
+    """The cyclic plan at the times of the local motion, lap after lap."""
+    into_lap = np.arange(len(example.local.t)) % SAMPLES * LAP / SAMPLES
+    return example.plan.at(into_lap)["joints"]
+
+
+def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
+    """panda.png, panda.gif and panda.npz."""
+    machine, local, laps = example.machine, example.local, example.more["laps"]
+    robot, again = machine.robot, repeated(example)
+    scenes = [
+        Scene("pseudo-inverse", robot, frames_along(robot, local.joints), local.t, "blue", view=VIEW),
+        Scene("optimal cyclic plan", robot, frames_along(robot, again), local.t, "orange", view=VIEW),
+    ]
+    note = (
+        f"{example.file.name} on a fixed base, fingers locked: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool "
+        f"leaning {np.degrees(np.arctan(TILT)):.0f} deg outwards; six task rows, seven joints. Cost: integral of half "
+        "the squared joint rates."
+    )
+    each = example.facts["cost_by_lap_local"]
+    note += (
+        f" A lap of the cyclic plan costs {example.plan.cost:.2f} rad²/s, the laps of the pseudo-inverse, which need "
+        f"not return, {each.min():.2f} to {each.max():.2f}."
+    )
+    above = f" Upper row: where the arm is at the start of each of {laps} laps, and at their end (darkest)."
+    with sheet(folder / "panda.png", rows=2, columns=6, size=(7.6, 6.6), note=note + above, height_ratios=(1.8, 1)) as (
+        figure,
+        axes,
+    ):
+        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
+            draw_scene(solid(figure, axes, 0, place, scenes), scene, [lap * LAP for lap in range(laps + 1)])
+        drift, left, right = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
+        for name, values, color, mark in (
+            ("pseudo-inverse", drifts(local.joints), "blue", "o"),
+            ("optimal cyclic", drifts(again), "orange", "D"),
+        ):
+            drift.plot(np.arange(laps + 1), values, "-" + mark, color=COLORS[color], ms=4, label=name)
+        drift.set(xlabel="laps", ylabel="largest |q − q(0)|, rad", xticks=range(laps + 1))
+        drift.legend(loc="upper left", fontsize=7)
+        middle, half = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
+        for ax, joints, title in ((left, local.joints, scenes[0].title), (right, again, scenes[1].title)):
+            share = (joints - middle) / half
+            for i in range(robot.dof):
+                ax.plot(local.t / LAP, share[:, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.0, label=str(i + 1))
+            ax.axhspan(1, 3, color=COLORS["grey"], alpha=0.25, lw=0)
+            ax.axhspan(-3, -1, color=COLORS["grey"], alpha=0.25, lw=0)
+            ax.set(xlabel="laps", title=title, ylim=(-1.9, 1.6))
+        left.set_ylabel("joint position, limits = ±1")
+        right.legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
+    save_plan(
+        folder / "panda.npz",
+        example.plan,
+        robot,
+        example.file.options,
+        package=(example.file.package, example.file.ending),
+    )
+    if animation:
+        animate(folder / "panda.gif", scenes, frames=24 * laps // 2, seconds=0.1, note=note)
+
+
+VIEW = (20.0, -50.0)

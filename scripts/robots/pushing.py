@@ -1,0 +1,160 @@
+"""Gallery: a legged mobile manipulator pushes against something that presses on its hand and would tip it over.
+
+ANYmal with a Kinova arm (the URDF of example-robot-data) stands on its four feet, legs locked, 1 kg in its hand. It
+pushes to its right with 60 N; the reaction, 60 N on its hand, acts to its left, +y. In 2.5 s the hand gives way to the
+left, backwards and up. Resolved instant by instant, the zero moment point leaves the feet; planned as a whole it stays
+inside, within all limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import Footprint, Robot, Standing, Wrench, footprint, with_load
+from models.arrays import Array
+from models.machines.standing import External
+from ocp import Collocation, Problem, solve
+from ocp.builders.standing.plan import InFoot, Limits, standing_plan
+from ocp.local.accelerations import resolve_accelerations
+from scripts.robots import standing
+from scripts.robots.frames import frames_along
+from scripts.robots.mobile_manipulator import StandingExample, animated
+from scripts.robots.robots import RobotFile
+from scripts.viewer.plan import save_plan
+
+__all__ = ["anymal", "draw", "plan", "problem", "reach", "reaction", "timed"]
+
+FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
+LEGS = {  # of the file's own standing posture
+    f"{side}{end}_{joint}": value
+    for side, roll in (("L", -0.1), ("R", 0.1))
+    for end, sign in (("F", 1), ("H", -1))
+    for joint, value in (("HAA", roll), ("HFE", 0.7 * sign), ("KFE", -1.0 * sign))
+}
+ANYMAL = RobotFile(
+    "ANYmal with a Kinova arm",
+    "example-robot-data",
+    "anymal_b_simple_description/robots/anymal-kinova.urdf",
+    {"tip": "j2s6s200_end_effector", "inertia": "as_given", "lock": LEGS},
+)
+ROWS = (3, 4, 5)
+START = np.array([-2.294, 3.884, 1.744, 2.895, 1.013, -1.85])
+STEP = (-0.2, 0.2, 0.1)  # of the hand, m
+SECONDS = 2.5
+LOAD = 1.0  # kg
+PUSH = (0.0, -60.0, 0.0)  # of the hand on what resists, N
+MARGIN = 0.01  # m
+FRICTION = 0.7
+METHOD = Collocation(16, degree=3, scheme="legendre")
+
+
+def anymal() -> tuple[Standing, Footprint]:
+    """ANYmal on its feet, the arm free, with its load."""
+    whole = ANYMAL.read()
+    ground = footprint(whole, ANYMAL.path, links=FEET)
+    robot = with_load(whole, str(whole.tip), LOAD)
+    return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
+
+
+def reaction(machine: Standing) -> External:
+    """What the push does to the hand: the same force, the other way."""
+
+    def acting(time: Any, tip: Any) -> Sequence[Wrench]:
+        return [machine.tip_wrench(tuple(-part for part in PUSH))]
+
+    return acting
+
+
+def reach(machine: Standing) -> standing.HandPath:
+    """The hand's place, m, world, when a share 0..1 of its straight way is done."""
+    begin = np.array(ca.DM(machine.tip_pose((), START).position)).ravel()
+    return lambda share: [value + step * share for value, step in zip(begin, STEP, strict=True)]
+
+
+def timed(machine: Standing) -> standing.HandPath:
+    """The same path as a function of time, s."""
+    return standing.timed(reach(machine), SECONDS)
+
+
+def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Problem:
+    """The plan to be made, at a given time law or with the time law left to the plan ("parameter").
+
+    Args:
+        changes: Of the options of standing_plan.
+    """
+    options: dict[str, Any] = {
+        "zmp": InFoot(MARGIN),
+        "limits": Limits(friction=FRICTION),
+        "external": reaction(machine),
+        "tip_level": "acceleration",
+        **changes,
+    }
+    path = timed(machine) if along == "time" else reach(machine)
+    return standing_plan(machine, path, ROWS, START, SECONDS, along=along, **options)
+
+
+def plan(coarse: bool = False) -> StandingExample:
+    """The plan, its audit and the local motion; it has one mesh only, `coarse` or not."""
+    machine, ground = anymal()
+    pressed = reaction(machine)
+    local = resolve_accelerations(
+        machine, timed(machine), ROWS, START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
+    ).motion
+    solution = solve(problem(machine), METHOD)
+    motion = standing.sampled(machine, solution, pressed)
+    found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
+    return StandingExample(ANYMAL.name, found, timed(machine), solution.audit())
+
+
+def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
+    """pushing.png, pushing.gif and pushing.npz."""
+    found = example.results
+    machine, robot = found.machine, found.robot
+    force = float(np.linalg.norm(PUSH))
+    note = (
+        f"ANYmal of {robot.total_mass - LOAD:.1f} kg, legs locked, with {LOAD:g} kg in its hand pushes to its right "
+        f"(-y) with {force:g} N; the reaction on its hand acts to its left, where the hand gives way by "
+        f"{STEP[1]:g} m in {SECONDS:g} s. Feet, inertias and limits from its URDF (example-robot-data); both motions "
+        f"have the same path and force. Plan: zero moment point {1000 * MARGIN:g} mm inside."
+    )
+    standing.figure(
+        folder / "pushing.png",
+        found,
+        note=note,
+        force="reaction of the push on the hand",
+        prefix="j2s6s200_",
+        inset=(0.36, 0.1, 0.5, 0.5),
+    )
+    save_plan(
+        folder / "pushing.npz",
+        found.solution,
+        robot,
+        ANYMAL.options,
+        package=(ANYMAL.package, ANYMAL.ending),
+        translation=machine.translation,
+        rotation=machine.rotation,
+    )
+    if animation:
+        note = (
+            f"Grey: legs, and the footprint of the feet; diamond: zero moment point. The hand pushes to the right (-y) "
+            f"with {force:g} N and gives way to the left."
+        )
+        outline = _legs(machine, robot)
+        animated(folder / "pushing.gif", found, outline, note=note, view=(24.0, -38.0))
+
+
+def _legs(machine: Standing, robot: Robot) -> Array:
+    """One line from foot to foot round the footprint, on the way up every leg and down again. Shape (k, 3), m."""
+    places = frames_along(robot, START[None], None, machine.translation, machine.rotation).positions
+    points: list[Array] = []
+    for leg in ("LF", "RF", "RH", "LH", "LF"):
+        x, y, _ = places[f"{leg}_FOOT"][0]
+        names = [*(f"{leg}_{part}" for part in ("FOOT", "SHANK", "THIGH", "HIP")), robot.root]
+        up = [np.array([x, y, 0.0]), *(places[name][0] for name in names)]
+        points += [*up, *up[::-1]]
+    return np.array(points)

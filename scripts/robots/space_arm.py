@@ -1,0 +1,108 @@
+"""A free-flying arm of seven joints carries its tip along a pose line: by the pseudo-inverse, and optimally."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from models import FreeFloating
+from models.spatial import rotation_from_rpy
+from ocp import Collocation
+from ocp.builders.redundancy import plan_minimum_velocity
+from ocp.local.rates import resolve
+from ocp.tasks.tip_task import TipTask, pose_line
+from scripts.drawing import COLORS, DASHES, sheet
+from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.robots.frames import frames_along
+from scripts.robots.results import FINE, Example, turning_angle
+from scripts.robots.robots import SPACE_ARM
+from scripts.viewer.plan import save_plan
+
+__all__ = ["draw", "plan"]
+
+START = (0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4)  # rad
+SHIFT = (0.5, 1.5, -0.5)  # m
+TURN = (0.4, 0.3, 0.8)  # roll, pitch, yaw in the axes of the tip, rad
+DURATION = 20.0  # s
+INSTANTS = 5
+
+
+def plan(coarse: bool = False) -> Example:
+    """Both motions; `coarse` for a mesh that a test can afford."""
+    machine = FreeFloating(SPACE_ARM.read())
+    home, start = machine.base_home(), np.array(START)
+    pose = machine.tip_pose(home, start)
+    rotation, position = np.array(ca.DM(pose.rotation)), np.array(ca.DM(pose.position)).ravel()
+    goal = rotation @ np.array(ca.DM(rotation_from_rpy(*TURN))), position + np.array(SHIFT)
+    line = pose_line((rotation, position), goal, DURATION)
+    task = TipTask(position=line.position, orientation=line.orientation)
+    local = resolve(machine, task=task, start_joints=start, horizon=DURATION, samples=FINE)
+    solution = plan_minimum_velocity(
+        machine,
+        task=task,
+        start_joints=start,
+        horizon=DURATION,
+        method=Collocation(intervals=20 if coarse else 50, degree=4),
+    )
+    facts = {
+        "base_turn_local_deg": float(np.degrees(turning_angle(local.base).max())),
+        "base_turn_optimal_deg": float(np.degrees(turning_angle(solution["base"]).max())),
+        "largest_rate_local_rad_s": float(np.abs(local.joint_rates).max()),
+        "largest_rate_optimal_rad_s": float(np.abs(solution["rates"]).max()),
+    }
+    return Example(SPACE_ARM, machine, task, local, solution, solution.audit(), facts)
+
+
+def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
+    """space_arm.png, space_arm.gif and space_arm.npz."""
+    robot, local, solution = example.machine.robot, example.local, example.plan
+    at = solution.at(local.t)
+    boxes = (robot.root,)
+    scenes = [
+        Scene("pseudo-inverse", robot, frames_along(robot, local.joints, local.base), local.t, "blue", boxes),
+        Scene("optimal", robot, frames_along(robot, at["joints"], at["base"]), local.t, "orange", boxes),
+    ]
+    base = robot.link(robot.root).mass
+    note = (
+        f"{example.file.name} ({base:.0f} kg base, {robot.total_mass - base:.0f} kg arm, no momentum); six task rows, "
+        "seven joints; the base reacts. Cost: integral of half the squared joint rates, which need not begin "
+        "at zero. Box: of even density, with the base's mass and inertia."
+    )
+    with sheet(folder / "space_arm.png", rows=2, columns=6, size=(7.6, 6.4), note=note, height_ratios=(1.7, 1)) as (
+        figure,
+        axes,
+    ):
+        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
+            draw_scene(solid(figure, axes, 0, place, scenes), scene, INSTANTS)
+        turn, rates, best = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
+        for name, poses, color, dash in (
+            ("pseudo-inverse", local.base, "blue", DASHES[0]),
+            ("optimal", at["base"], "orange", DASHES[1]),
+        ):
+            turn.plot(local.t, np.degrees(turning_angle(poses)), color=COLORS[color], ls=dash, label=name)
+        turn.set(xlabel="time, s", ylabel="turn of the base, deg")
+        turn.legend(loc="upper left", fontsize=7)
+        turn.set_ylim(top=1.35 * turn.get_ylim()[1])  # room for the legend
+        for ax, values, title in ((rates, local.joint_rates, scenes[0].title), (best, at["rates"], scenes[1].title)):
+            for i, name in enumerate(robot.joint_names):
+                ax.plot(
+                    local.t, values[:, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.1, label=name.split("_")[-1]
+                )
+            ax.set(xlabel="time, s", title=title)
+        rates.set_ylabel("joint rates, rad/s")
+        best.sharey(rates)
+        low, high = rates.get_ylim()
+        rates.set_ylim(low - 0.35 * (high - low), high)
+        best.legend(ncols=4, fontsize=6.5, loc="lower center", handlelength=1.6, columnspacing=0.8, title="joint")
+    save_plan(
+        folder / "space_arm.npz",
+        solution,
+        robot,
+        example.file.options,
+        package=(example.file.package, example.file.ending),
+        base="base",
+    )
+    if animation:
+        animate(folder / "space_arm.gif", scenes, frames=60, seconds=0.1, note=note)

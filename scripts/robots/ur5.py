@@ -1,0 +1,209 @@
+"""A UR5 sands a curved panel in lanes with the roll of its tool free: chosen instantly, or over the whole motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase, Machine
+from models.arrays import Array
+from ocp import Collocation, Solution, SolveError
+from ocp.builders.redundancy import plan_minimum_velocity
+from ocp.local.inverse_kinematics import Posture, inverse_kinematics
+from ocp.local.rates import LocalSolution, resolve
+from ocp.tasks.tip_task import TipTask
+from scripts.drawing import COLORS, DASHES, sheet
+from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.robots.frames import TIP, Frames, frames_along
+from scripts.robots.results import FINE, Example
+from scripts.robots.robots import TOOL_ANGLE, UR5
+from scripts.viewer.plan import save_plan
+
+__all__ = ["draw", "plan", "raster", "roll"]
+
+LANES = 5
+LENGTH, WIDTH = 0.6, 0.28  # m, of the field
+CENTER = (0.5, 0.25)  # m, x and z of the top of the panel
+CURVE = 0.9  # m, radius of the panel about the x axis
+DURATION = 20.0  # s
+CLEARANCE = 0.05  # m, of elbow and wrist above the top of the panel at the start
+BRANCHES = 4
+"""How many starts are tried, the best conditioned first."""
+OVERHEAD = ("forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
+
+
+def raster() -> TipTask:
+    """Lanes along y over a panel that is curved about x, from rest to rest, the tool along the normal: five rows."""
+
+    def place(time: Any) -> tuple[Any, Any]:
+        s = time / DURATION
+        phase = np.pi * LANES * s**3 * (10 + s * (-15 + 6 * s))
+        # sideways between the lanes: the integral of cos^6, so that the lanes are straight and the turns smooth
+        advance = 10 * phase + 7.5 * ca.sin(2 * phase) + 1.5 * ca.sin(4 * phase) + ca.sin(6 * phase) / 6
+        return -ca.cos(phase) * LENGTH / 2, (advance / (10 * np.pi * LANES) - 0.5) * WIDTH
+
+    def position(time: Any) -> Any:
+        along, across = place(time)
+        return ca.vertcat(CENTER[0] + across, along, CENTER[1] - CURVE + ca.sqrt(CURVE**2 - along**2))
+
+    def direction(time: Any) -> Any:
+        along, _ = place(time)
+        return ca.vertcat(0, -along, -ca.sqrt(CURVE**2 - along**2))
+
+    return TipTask(position=position, direction=direction)
+
+
+def plan(coarse: bool = False) -> Example:
+    """Both motions from each of some starts; `coarse` for what a test can afford.
+
+    The pseudo-inverse has no way to compare starts: its motion is the one from the best conditioned. The plan is the
+    cheapest of all.
+    """
+    machine, task = FixedBase(UR5.read()), raster()
+    method = Collocation(intervals=70 if coarse else 80, degree=5)
+    rows: list[dict[str, Any]] = []
+    locals_: list[LocalSolution] = []
+    alike: list[Solution | None] = []
+    plans: list[Solution] = []
+    for posture in starts(machine, task)[: 1 if coarse else BRANCHES]:
+        local = resolve(machine, task=task, start_joints=posture.joints, horizon=DURATION, samples=FINE)
+        free = _planned(machine, task, posture, method, True)
+        same = _planned(machine, task, posture, method, False)
+        locals_.append(local)
+        alike.append(same)
+        rows.append(
+            {
+                "start_rad": posture.joints,
+                "cost_local": float(local.cost[-1]),
+                "local_arrives": local.stopped is None,
+                "cost_optimal_same_start": None if same is None else float(same.cost),
+                "cost_optimal_free_start": None if free is None else float(free.cost),
+            }
+        )
+        if free is not None:
+            plans.append(free)
+    if not plans:
+        raise SolveError("no start of the raster leads to an audited plan")
+    local, solution = locals_[0], min(plans, key=lambda found: found.cost)
+    motions = [
+        ("pseudo-inverse", local.t, local.joints, local.cost),
+        *(_motion(name, found) for name, found in (("optimal, same start", alike[0]), ("optimal", solution)) if found),
+    ]
+    rolls = [roll(frames_along(machine.robot, joints)) for _, _, joints, _ in motions]
+    rolls = [angles - 2 * np.pi * np.round((angles[0] - rolls[0][0]) / (2 * np.pi)) for angles in rolls]
+    facts = {
+        "starts": rows,
+        "roll_range_local_deg": float(np.degrees(np.ptp(rolls[0]))),
+        "roll_range_optimal_deg": float(np.degrees(np.ptp(rolls[-1]))),
+    }
+    return Example(UR5, machine, task, local, solution, solution.audit(), facts, {"motions": motions, "rolls": rolls})
+
+
+def starts(machine: Machine, task: TipTask) -> list[Posture]:
+    """Postures at the start of the task with elbow and wrist above the panel, the best conditioned first."""
+    found = inverse_kinematics(machine, task)
+    frames = frames_along(machine.robot, [posture.joints for posture in found])
+    height = np.min([frames.positions[link][:, 2] for link in OVERHEAD], axis=0)
+    clear = [posture for posture, low in zip(found, height, strict=True) if low > CENTER[1] + CLEARANCE]
+    return clear or found
+
+
+def _planned(
+    machine: Machine, task: TipTask, posture: Posture, method: Collocation, free_start: bool
+) -> Solution | None:
+    try:
+        return plan_minimum_velocity(
+            machine,
+            task=task,
+            start_joints=posture.joints,
+            horizon=DURATION,
+            free_start=free_start,
+            method=method,
+        )
+    except SolveError:
+        return None
+
+
+def roll(frames: Frames) -> Array:
+    """Angle of the tool about its axis: of its x axis to the lanes' direction, seen along the tool. Shape (M,), rad."""
+    turn = frames.rotations[TIP]
+    axis, lanes = turn[:, :, 2], np.array([0.0, 1.0, 0.0])
+    first = lanes - axis * axis[:, 1:2]
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(axis, first)
+    x = turn[:, :, 0]
+    return np.unwrap(np.arctan2(np.sum(x * second, axis=1), np.sum(x * first, axis=1)))
+
+
+def panel() -> tuple[Array, Array, Array]:
+    """Points of the panel, (k, l) each, m."""
+    across, along = np.meshgrid(np.linspace(-0.6, 0.6, 7) * WIDTH, np.linspace(-0.55, 0.55, 15) * LENGTH)
+    return CENTER[0] + across, along, CENTER[1] - CURVE + np.sqrt(CURVE**2 - along**2)
+
+
+def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
+    """ur5.png, ur5.gif and ur5.npz."""
+    robot, local, solution = example.machine.robot, example.local, example.plan
+    at = solution.at(local.t)
+    look: dict[str, Any] = {"surface": panel(), "view": (24.0, -40.0), "tool": 0.1}
+    scenes = [
+        Scene(
+            "pseudo-inverse, best conditioned start", robot, frames_along(robot, local.joints), local.t, "blue", **look
+        ),
+        Scene("optimal over roll and start", robot, frames_along(robot, at["joints"]), local.t, "orange", **look),
+    ]
+    note = (
+        f"{example.file.name} ({np.degrees(TOOL_ANGLE):.0f} deg to the flange) on a fixed base: {LANES} lanes over a "
+        f"panel of radius {CURVE:g} m; position and axis of the tool are told (five rows), its roll is free. Cost: "
+        "integral of half the squared joint rates. The pseudo-inverse starts where the arm is best conditioned, the "
+        f"optimal plan is the best of {len(example.facts['starts'])} starts, its roll there free. No collision checks."
+    )
+    others = [row["cost_local"] for row in example.facts["starts"][1:] if row["local_arrives"]]
+    if others:
+        note += f" From the other starts the pseudo-inverse costs {min(others):.2f} to {max(others):.2f} rad²/s."
+    with sheet(folder / "ur5.png", rows=2, columns=6, size=(7.6, 6.2), note=note, height_ratios=(1.5, 1)) as (
+        figure,
+        axes,
+    ):
+        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
+            draw_scene(solid(figure, axes, 0, place, scenes), scene, 4)
+        rolling, spent, joints = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
+        for i, ((name, t, _, cost), angles) in enumerate(
+            zip(example.more["motions"], example.more["rolls"], strict=True)
+        ):
+            color = COLORS[{"pseudo-inverse": "blue", "optimal": "orange"}.get(name, "green")]
+            rolling.plot(t, np.degrees(angles - example.more["rolls"][0][0]), color=color, ls=DASHES[i], label=name)
+            spent.plot(t, cost, color=color, ls=DASHES[i], label=name)
+        rolling.set(xlabel="time, s", ylabel="roll of the tool, deg from the first")
+        spent.set(xlabel="time, s", ylabel="cost so far, rad²/s")
+        spent.set_ylim(top=1.45 * spent.get_ylim()[1])
+        spent.legend(loc="upper left", fontsize=7)
+        for i, name in enumerate(robot.joint_names):
+            joints.plot(
+                local.t, at["joints"][:, i] - at["joints"][0, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.1
+            )
+            joints.lines[-1].set_label(name.removesuffix("_joint").replace("_", " "))
+        low, high = joints.get_ylim()
+        joints.set(xlabel="time, s", ylabel="joints, optimal, less start, rad", ylim=(low - 0.45 * (high - low), high))
+        joints.legend(ncols=2, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8)
+    save_plan(
+        folder / "ur5.npz",
+        solution,
+        robot,
+        example.file.options,
+        package=(example.file.package, example.file.ending),
+    )
+    if animation:
+        animate(folder / "ur5.gif", scenes, frames=60, seconds=0.1, note=note)
+
+
+def _motion(name: str, plan: Solution) -> tuple[str, Array, Array, Array]:
+    """Name, times, joints and the cost up to each time of a plan."""
+    t = np.linspace(0.0, plan.horizon, FINE)
+    at = plan.at(t)
+    running = (at["rates"] ** 2).sum(axis=1) / 2
+    cost = np.concatenate([[0.0], np.cumsum(np.diff(t) * (running[:-1] + running[1:]) / 2)])
+    return name, t, at["joints"], cost

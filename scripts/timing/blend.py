@@ -1,0 +1,287 @@
+"""How fast a smooth path is planned and followed: samples in compiled C, mapped and by other means, plans, long paths.
+
+`scripts/benchmark.py` calls run and plot; alone: `python scripts/timing/blend.py [--out results] [--repeats 5]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
+
+import casadi as ca
+import numpy as np
+
+from models import paths
+from models.machines.scara_path import scara_along
+from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
+from models.paths.arc_length import arc_length
+from ocp.builders.timing import minimum_time
+from ocp.schedule import Limits, Schedule, peak_acceleration, schedule
+from scripts import drawing
+from scripts.papers.blend.compiled import march_compiled, place_compiled
+from scripts.papers.blend.example import (
+    ARM,
+    CENTRIPETAL,
+    ELBOW,
+    JERK,
+    JOINT_LIMITS,
+    MEAN_ACCELERATION,
+    REMAINING,
+    SPEED,
+    Array,
+    example,
+)
+from scripts.timing.blend_peers import GRID, peer_plans, roots
+from scripts.timing.compiled import has_compiler, least
+
+__all__ = ["plot", "random_task", "run"]
+
+PERIOD = 1e-3  # s
+SEED = 5
+TABLE = 1000  # entries of the lookup
+TARGET_NS, TARGET_PLAN_MS, TARGET_SCALE_S = 200.0, 20.0, 10.0
+DEFAULT = "gauss_newton, cubic, compiled"
+"""The row that the first target is for: the paper's example and the default mapping."""
+STEPS = (1e-3, 1e-2)  # m, shortest and longest segment of the random task
+TASK_SPEED, TASK_ACCELERATION, TASK_DEVIATION = 0.2, 5.0, 2e-4
+
+
+def run(repeats: int = 5, *, segments: Sequence[int] = (1000, 10_000)) -> dict[str, Any]:
+    """All times of one run on one machine.
+
+    Returns:
+        "rows": ns a sample and worst error of the distance (um), by method. "planning": ms. "scale": s, by number of
+        segments. "toppra": times and speeds, or "not installed". "profiles": speeds (m/s) over distances (m), by
+        planner. "targets": each with its figure.
+    """
+    cubic, quintic = (smooth(example(), REMAINING, kind=kind) for kind in ("cubic", "quintic"))
+    limits = Limits(SPEED, peak_acceleration(MEAN_ACCELERATION, SPEED, JERK), JERK)
+    plan = schedule(cubic, limits)
+    rows = [row for path in (cubic, quintic) for row in samples(path, schedule(path, limits), repeats)]
+    planned = planning(limits, repeats)
+    scale = [long_path(count) for count in segments]
+    peer = peer_plans(cubic, repeats)
+    s = np.linspace(0, cubic.length, 801)
+    profiles = {"ours": {"distance": s, "speed": plan.profile.at_distance(s).speed}}
+    profiles |= peer.pop("profiles") if peer else {}
+    compiled = next((row["ns_per_sample"] for row in rows if row["method"] == DEFAULT), None)
+    targets = {
+        "compiled_default_ns": {"figure": compiled, "target": TARGET_NS},
+        "planning_example_ms": {"figure": planned[0]["ms"], "target": TARGET_PLAN_MS},
+        "largest_scale_s": {"figure": scale[-1]["total_s"], "target": TARGET_SCALE_S, "segments": segments[-1]},
+    }
+    return {
+        "rows": rows,
+        "planning": planned,
+        "scale": scale,
+        "toppra": peer or "not installed",
+        "profiles": profiles,
+        "targets": targets,
+    }
+
+
+# ---- samples -------------------------------------------------------------------------------------------------
+
+
+def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, Any]]:
+    """From distance to parameter, by every method, at the control instants inside the first blend of the example."""
+    blend = path.blend(0)
+    instants = np.arange(int(plan.duration / PERIOD) + 1) * PERIOD
+    along = plan.at(instants).distance
+    s = along[(along > blend.start + 1e-12) & (along < blend.end)]
+    x, count = s - blend.start, len(s)
+    rows: list[dict[str, Any]] = []
+
+    def add(method: str, how: str, nanoseconds: float, u: Array) -> None:
+        error = float(np.abs(arc_length(blend.coefficients, u) - x).max()) * 1e6
+        rows.append(_row(method, path.kind, how, nanoseconds, error))
+
+    for make in (predictor_corrector, gauss_newton):
+        mapping = make(3 if path.kind == "cubic" else 5)
+        name = mapping.name()
+        if has_compiler():
+            u, nanoseconds = march_compiled(mapping, blend.coefficients, x, repeats)
+            add(name, "compiled", nanoseconds, u)
+        u = march(mapping, blend.coefficients, x)
+        inputs = mapped_inputs(mapping, blend.coefficients, x, u)
+        many = mapping.map(count)
+        found = np.array(many.call(inputs)[0])[1]
+        add(name, "map", 1e9 * least(lambda many=many, inputs=inputs: many.call(inputs), repeats) / count, found)  # type: ignore[misc]
+        add(name, "march", 1e9 * least(lambda m=mapping: march(m, blend.coefficients, x), repeats) / count, u)  # type: ignore[misc]
+    if has_compiler():
+        places, nanoseconds = place_compiled(path_function(path), s, repeats)
+        error = float(np.linalg.norm(places[:, :3] - path.at(s).position, axis=1).max()) * 1e6
+        rows.append(_row("path_function", path.kind, "compiled", nanoseconds, error))
+    add("SmoothPath.parameter", "numpy", 1e9 * least(lambda: path.parameter(s), repeats) / count, path.parameter(s))
+    knots = np.linspace(0, 1, TABLE)
+    table = arc_length(blend.coefficients, knots)
+    looked_up = np.interp(x, table, knots)
+    add("table lookup", "numpy", 1e9 * least(lambda: np.interp(x, table, knots), repeats) / count, looked_up)
+    root = roots(blend.coefficients)
+    if root is not None:
+        found = np.array([root(value) for value in x])
+        add("brentq", "scipy", 1e9 * least(lambda: [root(value) for value in x], max(1, repeats // 2)) / count, found)
+    return rows
+
+
+def _row(method: str, kind: str, how: str, nanoseconds: float, error: float) -> dict[str, Any]:
+    return {"method": f"{method}, {kind}, {how}", "ns_per_sample": nanoseconds, "worst_error_um": error}
+
+
+def mapped_inputs(mapping: Any, coefficients: Array, x: Array, u: Array) -> list[Any]:
+    """What the mapping sees at every sample, side by side."""
+    given, before = np.diff(x, prepend=0.0), np.concatenate([[0.0, 0.0], u])
+    steps = np.stack([np.concatenate([[0.0], given[:-1]]), given])
+    entries = np.repeat(coefficients.ravel()[: mapping.numel_in(1), None], len(x), axis=1)
+    return [ca.DM(np.stack([before[:-2], before[1:-1]])), ca.DM(entries), ca.DM(steps)]
+
+
+# ---- plans ---------------------------------------------------------------------------------------------------
+
+
+def planning(limits: Limits, repeats: int) -> list[dict[str, Any]]:
+    """From segments to a schedule, and under more limits than the paper's; minimum time beside it."""
+    more = Limits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL)
+    all_of_them = Limits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL, JOINT_LIMITS)
+
+    def limited() -> tuple[SmoothPath, Any, Schedule]:
+        path = smooth(example(), REMAINING)
+        arm = scara_along(ARM, path, ELBOW)
+        return path, arm, schedule(path, all_of_them, joints=arm)
+
+    path, arm, plan = limited()
+    works: dict[str, Callable[[], Any]] = {
+        "the paper's example: blends and schedule": lambda: schedule(
+            smooth(example(), REMAINING, kind="cubic"), limits
+        ),
+        "centripetal limit too": lambda: schedule(smooth(example(), REMAINING), more),
+        "centripetal and joint limits, arm included": limited,
+    }
+    rows = [{"plan": name, "ms": 1e3 * least(work, repeats), "duration_s": 0.0} for name, work in works.items()]
+    for row, found in zip(rows, (*(work() for work in list(works.values())[:2]), plan), strict=True):
+        row["duration_s"] = found.duration
+    best = minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
+    seconds = best.solution.seconds["build"] + best.solution.seconds["solve"]
+    name = "the same in minimum time, optimal control"
+    return [*rows, {"plan": name, "ms": 1e3 * seconds, "duration_s": best.duration}]
+
+
+# ---- long paths ----------------------------------------------------------------------------------------------
+
+
+def random_task(segments: int, seed: int = SEED) -> paths.Path:
+    """Random short lines, 1 to 10 mm each, in any direction."""
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(size=(segments, 3))
+    steps *= (rng.uniform(*STEPS, segments) / np.linalg.norm(steps, axis=1))[:, None]
+    return paths.Path.through(np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+
+
+def long_path(segments: int) -> dict[str, Any]:
+    """A random task blended, scheduled under a centripetal limit and sampled every ms; memory in a run of its own."""
+    limits = Limits(TASK_SPEED, TASK_ACCELERATION, JERK, TASK_ACCELERATION)
+
+    def work() -> tuple[list[float], Array, Schedule]:
+        times = [time.perf_counter()]
+
+        def lap() -> None:
+            times.append(time.perf_counter())
+
+        task = random_task(segments)
+        lap()
+        path = smooth(task, deviation=TASK_DEVIATION)
+        lap()
+        plan = schedule(path, limits)
+        lap()
+        motion = plan.sample(PERIOD)
+        place = path.at(motion.distance)
+        lap()
+        return np.diff(times).tolist(), np.linalg.norm(np.diff(place.position, axis=0), axis=1) / PERIOD, plan
+
+    (task_s, blend_s, schedule_s, sample_s), speeds, plan = work()
+    tracemalloc.start()
+    work()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return {
+        "segments": segments,
+        "length_m": plan.path.length,
+        "duration_s": plan.duration,
+        "samples": len(speeds) + 1,
+        "task_s": task_s,
+        "blend_s": blend_s,
+        "schedule_s": schedule_s,
+        "sample_s": sample_s,
+        "total_s": task_s + blend_s + schedule_s + sample_s,
+        "peak_memory_kB_per_segment": peak / 1e3 / segments,
+        "largest_chord_speed": float(speeds.max()),
+    }
+
+
+# ---- the page ------------------------------------------------------------------------------------------------
+
+
+def plot(path: Path, summary: dict[str, Any]) -> None:
+    """Time of a sample by every method, on a logarithmic axis, and the speed beside toppra's."""
+    shown = [row for row in summary["rows"] if "cubic" in row["method"] or "compiled" in row["method"]]
+    rows = sorted(shown, key=lambda row: -row["ns_per_sample"])
+    note = (
+        "Left: instants of 1 ms inside the first blend of the paper's example (line to line, Lr = 150 mm), one core, "
+        "least of several runs of one run; right of a bar: ns, worst error of the distance. Right: the paper's example "
+        f"at 1 m/s; toppra with {GRID} grid points, speed and acceleration of each axis limited, no jerk limit."
+    )
+    with drawing.sheet(path, columns=2, size=(10.4, 5.2), note=note, width_ratios=(1.25, 1)) as (_, axes):
+        ax = axes[0, 0]
+        plain = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
+        for k, row in enumerate(rows):
+            ours = "compiled" in row["method"]
+            ax.barh(k, row["ns_per_sample"], color=drawing.COLORS["blue" if ours else "sky"])
+            text = f"{row['ns_per_sample']:,.0f} ns, {row['worst_error_um']:.1g} µm"
+            ax.text(row["ns_per_sample"] * 1.15, k, text, va="center", fontsize=7, bbox=plain)
+        ax.set_yticks(range(len(rows)), [row["method"] for row in rows], fontsize=7)
+        least_ns, most_ns = rows[-1]["ns_per_sample"], rows[0]["ns_per_sample"]
+        ax.set_xscale("log")
+        ax.set_xlim(least_ns / 3, 300 * most_ns)
+        ax.axvline(TARGET_NS, color=drawing.COLORS["orange"], ls="--", label=f"target of the default, {TARGET_NS:g} ns")
+        ax.set(xlabel="time of one sample, ns", title="From distance to place on the curve")
+        ax.legend(loc="upper right")
+        ax = axes[0, 1]
+        ours = summary["profiles"]["ours"]
+        ax.plot(ours["distance"], ours["speed"], label="selfmotion", zorder=3)
+        others = [name for name in summary["profiles"] if name != "ours"]
+        for name, dash in zip(others, drawing.DASHES[1:], strict=False):
+            profile = summary["profiles"][name]
+            ax.plot(profile["distance"], profile["speed"], ls=dash, label=name)
+        ax.set(xlabel="distance along the path, m", ylabel="line speed, m/s", title="Speed on the same path")
+        ax.set_ylim(0, 1.3)
+        ax.legend(loc="lower center")
+
+
+def main() -> None:
+    """Run, write OUT/benchmark/blend.csv, blend.json and blend.png, and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the results")
+    parser.add_argument("--repeats", type=int, default=5, help="runs of which the least time is taken")
+    arguments = parser.parse_args()
+    summary = run(arguments.repeats)
+    folder = arguments.out / "benchmark"
+    drawing.write_table(folder / "blend.csv", summary["rows"], 6)
+    drawing.write_json(folder / "blend.json", summary)
+    plot(folder / "blend.png", summary)
+    for part in ("rows", "planning", "scale"):
+        print(drawing.text_table(summary[part], 4), end="\n\n")
+    if isinstance(summary["toppra"], dict):
+        print(drawing.text_table(summary["toppra"]["plans"], 4), end="\n\n")
+    for name, target in summary["targets"].items():
+        print(f"{name}: {target['figure']:.4g}, target {target['target']:g}" if target["figure"] else f"{name}: -")
+
+
+if __name__ == "__main__":
+    main()

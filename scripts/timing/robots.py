@@ -1,0 +1,295 @@
+"""Robots read from URDF: time to load them and to build their functions, and the generalized Jacobian of a space arm.
+
+`scripts/benchmark.py` calls run and plot; alone: `python scripts/timing/robots.py [--out results] [--repeats 5]`.
+The files come with the distributions example-robot-data and spartpy, the comparison with pin; what is not installed
+is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
+
+import casadi as ca
+import numpy as np
+
+from models import (
+    FreeFloating,
+    Robot,
+    center_of_mass,
+    center_of_mass_jacobian,
+    inverse_dynamics,
+    link_frames,
+    link_jacobians,
+    simplified,
+    tip_jacobian,
+)
+from models.arrays import Array
+from scripts import drawing
+from scripts.timing.compiled import FLAGS as FAST
+from scripts.timing.compiled import compiled, has_compiler, least, pointers
+
+__all__ = ["plot", "run"]
+
+DATA = "example-robot-data"
+ROBOTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "UR5": (DATA, "ur_description/urdf/ur5_robot.urdf", {"tip": "tool0"}),
+    "space arm": ("spartpy", "SPARTpy/urdf/floating_7dof_manipulator.urdf", {}),
+    "Panda": (DATA, "panda_description/urdf/panda.urdf", {"tip": "panda_hand_tcp", "mimic": "free"}),
+    "ANYmal with Kinova": (
+        DATA,
+        "anymal_b_simple_description/robots/anymal-kinova.urdf",
+        {"tip": "j2s6s200_end_effector", "inertia": "as_given"},
+    ),
+    "B1 with Z1": (DATA, "b1_description/urdf/b1-z1.urdf", {"tip": "gripperMover", "inertia": "as_given"}),
+    "TALOS reduced": (DATA, "talos_data/robots/talos_reduced.urdf", {"tip": "gripper_left_base_link"}),
+    "TALOS": (DATA, "talos_data/robots/talos_full_v2.urdf", {"tip": "gripper_left_base_link", "mimic": "free"}),
+    "TIAGo": (DATA, "tiago_description/robots/tiago.urdf", {"tip": "wrist_ft_tool_link", "inertia": "as_given"}),
+    "TIAGo, two arms": (
+        DATA,
+        "tiago_description/robots/tiago_dual.urdf",
+        {"tip": "wrist_right_ft_tool_link", "inertia": "as_given"},
+    ),
+}
+"""Distribution, end of the file's path, and what Robot.from_urdf needs to be told."""
+
+FLAGS = {"-O2": ("-O2",), "-O3, this processor": FAST}
+COUNT = 100
+SEED = 11
+GOALS = {"generalized Jacobian": 1.0, "its derivative": 5.0}
+"""us."""
+
+DRIVER = """
+#include "kernel.h"
+int run(const double* base, const double* q, double* out, int count, int loops) {{
+  static long long iw[{name}_SZ_IW + 1];
+  static double w[{name}_SZ_W + 1];
+  const double* arg[{name}_SZ_ARG + 1];
+  double* res[{name}_SZ_RES + 1];
+  int i, k;
+  for (k = 0; k < loops; ++k)
+    for (i = 0; i < count; ++i) {{
+      arg[0] = base + 7 * i; arg[1] = q + JOINTS * i; res[0] = out + SIZE * i;
+      if ({name}(arg, res, iw, w, 0)) return 1;
+    }}
+  return 0;
+}}
+"""
+
+
+def urdf_file(package: str, ending: str) -> Path | None:
+    """A file of a distribution; None where that is not installed."""
+    try:
+        owner = distribution(package)
+    except PackageNotFoundError:
+        return None
+    found = next((f for f in owner.files or [] if ("/" + f.as_posix()).endswith("/" + ending)), None)
+    return None if found is None else Path(str(owner.locate_file(found)))
+
+
+def build(robot: Robot) -> dict[str, Any]:
+    """The functions that planning needs, by name."""
+    machine = FreeFloating(robot)
+    base = ca.SX.sym("base", 7)
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    frames = [ca.horzcat(*frame) for frame in link_frames(robot, q).values()]
+    return {
+        "frames": ca.Function("frames", [q], frames),
+        "jacobians": ca.Function("jacobians", [q], list(link_jacobians(robot, q).values())),
+        "tip_jacobian": ca.Function("tip_jacobian", [q], [tip_jacobian(robot, q)]),
+        "center": ca.Function("center", [q], [center_of_mass(robot, q), center_of_mass_jacobian(robot, q)]),
+        "momentum": ca.Function("momentum", [base, q], list(machine.momentum_matrices(base, q))),
+        "generalized_jacobian": ca.Function("generalized_jacobian", [base, q], [machine.tip_jacobian(base, q)]),
+        "base_rate": ca.Function("base_rate", [base, q, qd], [machine.base_rate(base, q, qd)]),
+        "inverse_dynamics": ca.Function("inverse_dynamics", [q, qd, qdd], [inverse_dynamics(robot, q, qd, qdd)]),
+    }
+
+
+def loading(repeats: int) -> list[dict[str, Any]]:
+    """Seconds to load each robot and to build its functions."""
+    rows = []
+    for name, (package, ending, options) in ROBOTS.items():
+        path = urdf_file(package, ending)
+        if path is None:
+            continue
+        robot = Robot.from_urdf(path, **options)
+        load = least(lambda path=path, options=options: Robot.from_urdf(path, **options), repeats)  # type: ignore[misc]
+        functions = least(lambda robot=robot: build(robot), min(repeats, 3))  # type: ignore[misc]
+        rows.append(
+            {
+                "robot": name,
+                "joints": robot.dof,
+                "links": len(robot.links),
+                "load_s": load,
+                "build_s": functions,
+                "total_s": load + functions,
+            }
+        )
+    return rows
+
+
+def compiled_at(function: Any, base: Array, q: Array, repeats: int, flags: tuple[str, ...]) -> tuple[Array, float]:
+    """Compile a function of (base, q): its results at each row, column by column, and the least time of one call, s."""
+    out = np.empty((len(q), function.nnz_out(0)))
+    given = [np.ascontiguousarray(each, dtype=float) for each in (base, q)]
+    places = pointers(*given, out)
+    loops = 10  # bursts of about a millisecond: on a busy machine some of many run undisturbed
+    driver = DRIVER.replace("JOINTS", str(q.shape[1])).replace("SIZE", str(out.shape[1]))
+    with compiled(function, driver, flags) as run:
+        seconds = least(lambda: run(*places, len(q), loops), 100 * repeats) / (loops * len(q))
+    return out, seconds
+
+
+def space_arm(repeats: int) -> list[dict[str, Any]]:
+    """The generalized Jacobian of the free-floating arm of seven joints by several means, us a call."""
+    path = urdf_file(*ROBOTS["space arm"][:2])
+    if path is None:
+        return []
+    given = Robot.from_urdf(path)
+    robot = simplified(given)
+    machine = FreeFloating(robot)
+    rng = np.random.default_rng(SEED)
+    base = np.column_stack([rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 4))])
+    base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1, keepdims=True)
+    q = rng.uniform(-np.pi, np.pi, (COUNT, robot.dof))
+    x, y = ca.SX.sym("base", 7), ca.SX.sym("q", robot.dof)
+    jacobian = machine.tip_jacobian(x, y)
+    value = ca.Function("value", [x, y], [jacobian])
+    derivative = ca.Function("derivative", [x, y], [ca.jacobian(jacobian, ca.vertcat(x, y))])
+    rows: list[dict[str, Any]] = []
+
+    def add(what: str, by: str, seconds: float, instructions: int = 0) -> None:
+        rows.append({"function": what, "by": by, "us": 1e6 * seconds, "instructions": instructions})
+
+    many, columns = value.map(COUNT), [ca.DM(base.T), ca.DM(q.T)]
+    found = np.array(many.call(columns)[0]).reshape(6, COUNT, -1).transpose(1, 0, 2)
+    if has_compiler():
+        for name, flags in FLAGS.items():
+            out, seconds = compiled_at(value, base, q, repeats, flags)
+            check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), found, name)
+            add("generalized Jacobian", f"compiled, {name}", seconds, value.n_instructions())
+            _, seconds = compiled_at(derivative, base, q, repeats, flags)
+            add("its derivative", f"compiled, {name}", seconds, derivative.n_instructions())
+    add("generalized Jacobian", "map in CasADi", least(lambda: many.call(columns), repeats) / COUNT)
+    one = [[ca.DM(base[i]), ca.DM(q[i])] for i in range(COUNT)]
+    add(
+        "generalized Jacobian",
+        "one call from Python",
+        least(lambda: [value.call(each) for each in one], repeats) / COUNT,
+    )
+    if (peer := pinocchio_jacobian(path, given)) is not None:
+        theirs = np.array([peer(base[i], q[i]) for i in range(COUNT)])
+        check(theirs, found, "Pinocchio")
+        seconds = least(lambda: [peer(base[i], q[i]) for i in range(COUNT)], 10 * repeats) / COUNT
+        version = importlib.import_module("pinocchio").__version__
+        add("generalized Jacobian", f"Pinocchio {version} and numpy", seconds)
+    return rows
+
+
+def check(values: Array, expected: Array, what: str) -> None:
+    """RuntimeError when two ways to compute the same differ by more than rounding."""
+    error = float(np.abs(values - expected).max() / np.abs(expected).max())
+    if error > 1e-10:
+        raise RuntimeError(f"{what}: the generalized Jacobian differs by {error:.1e} relative")
+
+
+def pinocchio_jacobian(path: Path, robot: Robot) -> Callable[[Array, Array], Array] | None:
+    """G(base, q), rows (angular, linear), from Pinocchio's joint-space inertia; None where it is not installed."""
+    try:
+        pin = importlib.import_module("pinocchio")
+    except ImportError:
+        return None
+    text = path.read_text(encoding="utf-8").replace('"revolute"', '"continuous"')  # it wants limits of revolute joints
+    model = pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+    data = model.createData()
+    frame = model.getFrameId(str(robot.tip))
+    world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    rows = [3, 4, 5, 0, 1, 2]
+    configuration = np.empty(model.nq)
+    order = [model.joints[model.getJointId(name)].idx_q for name in robot.joint_names]
+    if order != list(range(7, 7 + 2 * robot.dof, 2)):
+        raise RuntimeError("Pinocchio orders the joints of the space arm otherwise")
+
+    def jacobian(base: Array, q: Array) -> Array:
+        configuration[0:3], configuration[3:6], configuration[6] = base[0:3], base[4:7], base[3]
+        configuration[7::2], configuration[8::2] = np.cos(q), np.sin(q)
+        inertia = pin.crba(model, data, configuration)  # its upper triangle
+        tip = pin.computeFrameJacobian(model, data, configuration, frame, world)
+        coupling = inertia[:6, 6:]
+        locked = np.triu(inertia[:6, :6])
+        locked += np.triu(locked, 1).T
+        found: Array = (tip[:, 6:] - tip[:, :6] @ np.linalg.solve(locked, coupling))[rows]
+        return found
+
+    return jacobian
+
+
+def run(repeats: int = 5) -> dict[str, Any]:
+    """All times of one run on one machine."""
+    rows, arm = loading(repeats), space_arm(repeats)
+    summary: dict[str, Any] = {"loading": rows, "space_arm": arm, "goals_us": GOALS}
+    values = [row for row in arm if row["function"] == "generalized Jacobian"]
+    ours = [row["us"] for row in values if row["by"] == "compiled, -O2"]
+    theirs = [row["us"] for row in values if row["by"].startswith("Pinocchio")]
+    if ours and theirs:
+        summary["pinocchio_over_compiled"] = theirs[0] / ours[0]
+    return summary
+
+
+def plot(path: Path, summary: dict[str, Any]) -> None:
+    """Left: seconds to load and to build, by robot. Right: us of a generalized Jacobian by each means."""
+    rows, arm = summary["loading"], summary["space_arm"]
+    note = (
+        "Built: frames and Jacobians of all links, tip Jacobian, centre of mass, momentum matrices, generalized "
+        f"Jacobian, base rate, inverse dynamics. Space arm: seven joints, {COUNT} random configurations. One core, "
+        "least of several runs in one run. The compiled functions are called from C, the others from Python."
+    )
+    with drawing.sheet(path, columns=2, size=(9.4, 3.9), note=note) as (_, axes):
+        left, right = axes[0]
+        for k, row in enumerate(reversed(rows)):
+            left.barh(k, row["load_s"], color=drawing.COLORS["sky"], label="load" if k == 0 else None)
+            left.barh(
+                k, row["build_s"], left=row["load_s"], color=drawing.COLORS["blue"], label="build" if k == 0 else None
+            )
+            left.text(row["total_s"], k, f" {row['total_s']:.2g}", va="center", fontsize=7)
+        left.set_yticks(range(len(rows)), [f"{row['robot']}, {row['joints']}" for row in reversed(rows)], fontsize=7)
+        left.set(xlabel="s", title="Load a robot and build its functions (robot, joints)")
+        left.margins(x=0.15)
+        left.legend(loc="upper right")
+        for k, row in enumerate(reversed(arm)):
+            peer = row["by"].startswith("Pinocchio")
+            right.barh(k, row["us"], color=drawing.COLORS["orange" if peer else "blue"])
+            right.text(row["us"] * 1.1, k, f"{row['us']:.3g}", va="center", fontsize=7)
+        right.set_yticks(range(len(arm)), [f"{row['function']}:\n{row['by']}" for row in reversed(arm)], fontsize=7)
+        right.set(xscale="log", xlabel="μs a call", title="Generalized Jacobian of a free-floating arm")
+        if arm:
+            right.set_xlim(0.1, 6 * max(row["us"] for row in arm))
+
+
+def main() -> None:
+    """Run, write OUT/benchmark/robots.csv, space_arm.csv, robots.json and robots.png, and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the results")
+    parser.add_argument("--repeats", type=int, default=5, help="runs of which the least time is taken")
+    arguments = parser.parse_args()
+    summary = run(arguments.repeats)
+    folder = arguments.out / "benchmark"
+    for name, rows in (("robots", summary["loading"]), ("space_arm", summary["space_arm"])):
+        if rows:
+            drawing.write_table(folder / f"{name}.csv", rows, 6)
+            print(drawing.text_table(rows, 4))
+    drawing.write_json(folder / "robots.json", summary)
+    plot(folder / "robots.png", summary)
+    if ratio := summary.get("pinocchio_over_compiled"):
+        print(f"Pinocchio and numpy take {ratio:.0f} x the generalized Jacobian compiled by -O2")
+
+
+if __name__ == "__main__":
+    main()
