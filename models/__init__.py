@@ -2,10 +2,11 @@
 
 from models.errors import ModelError
 from models.machines.footprint import Footprint, footprint
-from models.machines.free_floating import FreeFloating, paper_example
+from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
+from models.papers import paper_example
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.robot.kinematics import (
     center_of_mass,

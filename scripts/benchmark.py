@@ -28,10 +28,7 @@ if str(ROOT) not in sys.path:  # run as a file
 from models import FreeFloating, Joint, Link, Robot, paper_example  # noqa: E402
 from ocp import Collocation, Problem, Solution, prepare  # noqa: E402
 from ocp.builders import redundancy  # noqa: E402
-from ocp.curves import (
-    differentiation_matrix,
-    quadrature_weights,
-)
+from ocp.curves import differentiation_matrix, quadrature_weights  # noqa: E402
 from ocp.indirect.hamiltonian import Hamiltonian  # noqa: E402
 from ocp.problem.formulation import Formulation  # noqa: E402
 from scripts import drawing  # noqa: E402

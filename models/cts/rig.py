@@ -11,7 +11,7 @@ World is the rig's base frame: x along the prismatic joint towards the nose of t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -139,16 +139,6 @@ class Posture(NamedTuple):
     sin2: Expression
     cos2: Expression
     q1: Expression
-
-
-def reference_rig(**limits: Any) -> Rig:
-    """The rig of the reference numbers. The paper prints no lengths: these are chosen, 20, 20, 4, 30, 20, 10 in."""
-    return Rig(*(INCH * length for length in (20.0, 20.0, 4.0, 30.0, 20.0, 10.0)), **limits)
-
-
-def reference_tunnel() -> Tunnel:
-    """The tunnel of the reference numbers, chosen: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1."""
-    return Tunnel(INCH * np.array([80.0, 0.0, 0.0]), INCH * np.array([60.0, 48.0, 40.0]))
 
 
 # ---- forward ---------------------------------------------------------------------------------------------------

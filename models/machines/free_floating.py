@@ -37,8 +37,8 @@ from models.robot.kinematics import (
     tip_frame,
 )
 from models.robot.kinematics import momentum_matrix as joint_momentum_matrix
-from models.robot.parts import Link, massless
-from models.robot.robot import Robot, planar_chain
+from models.robot.parts import massless
+from models.robot.robot import Robot
 from models.spatial import (
     Expression,
     Frame,
@@ -263,26 +263,13 @@ class FreeFloating:
         return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
     def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> Reaction:
-        """As `models.machines.free_floating.reaction`, with the conserved momentum in the base's axes where rates are given."""
+        """As :func:`reaction`, with the conserved momentum in the base's axes where rates are given."""
         carried = None
         if joint_rates is not None and self._moves_by_itself:
             turn = self.world_from_base(base).rotation
             angular, push = (ca.mtimes(turn.T, part) for part in self._spatial_momentum())
             carried = angular, push
         return reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar")
-
-
-def paper_example() -> FreeFloating:
-    """The planar three-joint machine of Kim, Kim 2011, section 5.
-
-    Printed: base 100 kg and 66.67 kg m^2 (a plate of 2 m x 2 m), links of 2 kg and 0.7083 kg m^2 (plates of
-    2 m x 0.5 m). Not printed, identified from the pattern of Table 1 and therefore assumptions: links 2 m
-    long, arm mounted at (1, 0) m of the base, centres of mass at mid-link. The paper starts it from base pose
-    0 and joints at 45, 60, -60 deg, with the tip moving at (-1, -1) m/s and its orientation free.
-    """
-    base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
-    robot = planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
-    return FreeFloating(robot, base="planar")
 
 
 class Reaction(NamedTuple):

@@ -7,7 +7,7 @@ fixed base; whether it stays is read from the reaction that the ground would hav
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
@@ -17,12 +17,12 @@ import numpy as np
 from models.arrays import Array, ArrayInput, checked_array
 from models.errors import ModelError
 from models.machines.machine import FixedBase
-from models.machines.support import Support, rectangle
+from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.robot.kinematics import checked_vector
 from models.robot.parts import massless
 from models.robot.rebuild import simplified
-from models.robot.robot import Robot, planar_chain
+from models.robot.robot import Robot
 from models.spatial import Expression, expression
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
@@ -36,10 +36,6 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
     if not callable(external):
         raise ModelError(f"external must be a function of time and tip position, not {external!r}")
     return checked_wrenches(external(time, tip))
-
-
-PAPER_START = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
-"""Joint angles at the start of the tasks of Tables 1 and 2, rad."""
 
 
 class ZmpRows(NamedTuple):
@@ -236,26 +232,3 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
     k = checked_array(stiffness, (3,), "tip spring", "stiffness")
     relaxed = checked_array(rest, (3,), "tip spring", "rest")
     return lambda time, tip: [machine.tip_wrench(-ca.DM(k) * (tip - ca.DM(relaxed)))]
-
-
-def paper_example() -> Standing:
-    """The five-link machine of Tables 1 and 2, which moves in the y-z plane of the world.
-
-    Joint angles are relative to the link before, the first to +y, counter-clockwise seen from +x.
-
-    Not printed and therefore assumed: centres of mass at mid-link, slender rods, a massless foot with the ankle at
-    the world's origin and 0.1 m wide in x (of no effect), the foot from y = -0.1 to 0.2 m (from the text) with an
-    index about y = 0 of half-width 0.1 m (from the tables), the joint limits.
-    """
-    robot = planar_chain((0.44, 0.44, 0.52, 0.26, 0.18), (6.02, 14.0, 35.0, 3.92, 2.38))
-    limits = np.deg2rad([(30, 120), (0, 165), (190, 360), (135, 360), (0, 150)])
-    joints = tuple(
-        replace(joint, lower=lower, upper=upper) for joint, (lower, upper) in zip(robot.joints, limits, strict=True)
-    )
-    return Standing(
-        replace(robot, joints=joints),
-        rotation=[(0, 0, 1), (1, 0, 0), (0, 1, 0)],  # the chain's x, y, z become the world's y, z, x
-        support=rectangle((-0.05, 0.05), (-0.1, 0.2)),
-        most_stable_point=(0.0, 0.0),
-        half_widths=(0.05, 0.1),
-    )

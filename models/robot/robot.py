@@ -80,7 +80,7 @@ class Robot:
         mimic: MimicRule = "error",
         inertia: InertiaRule = "error",
     ) -> Robot:
-        """The robot of a URDF description, see `models.robot.urdf.read_urdf` for what is read and what has which default.
+        """The robot of a URDF description; `models.robot.urdf.read_urdf` says what is read, with which defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.

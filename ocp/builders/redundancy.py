@@ -87,7 +87,7 @@ def minimum_velocity(
         formulation: "rates" or "null_space".
         limits: Whether the robot's position limits bound the state "joints" and its velocity limits the joint rates (a
             bound of the control "rates", or the path constraint "velocity limits" of the null-space form).
-        guess_damping: Damping of the local solution (see ocp.local.rates.resolve) that is attached as the initial guess,
+        guess_damping: Damping of the local solution (ocp.local.rates.resolve) that is attached as the initial guess,
             relative to the root mean square of the singular values of the task's Jacobian at the start; raised where
             the local motion stops early. Small values start near the pseudo-inverse; large ones avoid its singular
             passages and may lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03

@@ -1,7 +1,7 @@
 """A partially separable nonlinear program: few small functions, each repeated over many index sets.
 
 A transcription says which variables exist, which small function (a *block*) reads which of them how many times, and
-which rows are linear. :mod:`ocp.direct.assembly` derives gradient, Jacobian and Hessian of every block once and scatters them,
+which rows are linear. :mod:`ocp.direct.assembly` derives the derivatives of every block once and scatters them,
 so building costs the same for 10 intervals and for 1000. Fragments of several phases can be joined at their ends.
 """
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import HOME, forward, inverse, reference_rig, reference_tunnel
+from models.cts.rig import HOME, forward, inverse
+from models.papers import reference_rig, reference_tunnel
 from scripts import drawing
 from scripts.papers.cts.compiled import compiled_inverse
 from scripts.papers.cts.iterations import combined, null_space

@@ -16,7 +16,7 @@ tip_level "acceleration": for controls at the collocation points, `Collocation(.
     on the grid (try one interval more). Not for plans that switch, as
     those of least time do: between the points of an interval with a switch the polynomials swing far.
 
-Either way limits hold at the points of the grid; `ocp.tighten(problem, method)` in place of `ocp.methods` makes those of
+Either way limits hold at the points of the grid; `ocp.tighten(problem, method)` in place of `solve` makes those of
 joints and ground hold between the points as well. Both ways have the tip within 1e-5 m of its path between the points
 where the grid is fine enough: 40 intervals with collocation, 80 with held controls, for tasks such as those of the
 paper. There a zero moment point that is pinned or follows a reference is within 1 mm of it by the second way, and by
@@ -105,7 +105,7 @@ def standing_plan(
         horizon: Final time, s, or FreeTime(...).
         zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
-        external: Wrenches from outside as a function of time and tip position, for example models.machines.standing.tip_spring.
+        external: Wrenches from outside as a function of time and tip position, for example `tip_spring`.
         weights: Of the parts of the cost. limits: Of joints and ground.
         control: What is held over an interval of the plan.
         along: What tip_path is a function of. A free final time needs "parameter", or a path that suits any horizon.

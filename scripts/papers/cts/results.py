@@ -14,19 +14,10 @@ import numpy as np
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clearances
-from models.cts.rig import (
-    HOME,
-    INCH,
-    Rig,
-    Tunnel,
-    forward,
-    goose_neck_corner,
-    inverse,
-    reference_rig,
-    reference_tunnel,
-)
+from models.cts.rig import HOME, INCH, Rig, Tunnel, forward, goose_neck_corner, inverse
 from models.cts.roll import index_harmonics
 from models.cts.table import Table, solve_table
+from models.papers import reference_rig, reference_tunnel
 from models.robot.parts import Link
 from models.shapes.capsules import Box
 from scripts.papers.cts.compiled import compiled_inverse

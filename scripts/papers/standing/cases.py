@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machines.standing import PAPER_START, External, Standing, paper_example, tip_spring
+from models.machines.standing import External, Standing, tip_spring
 from models.machines.standing_motion import StandingMotion
+from models.papers import STANDING_STARTS, standing_example
 from ocp.builders.standing.plan import motion_cost
 from ocp.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from scripts.drawing import Row
@@ -152,12 +153,12 @@ LOCAL: Mapping[str, Mapping[str, Case]] = {
 @cache
 def machine() -> Standing:
     """The five-link machine of the paper."""
-    return paper_example()
+    return standing_example()
 
 
 def start_tip(table: int) -> Array:
     """Where the tip starts. Shape (3,), m."""
-    return np.array(ca.DM(machine().tip_pose((), PAPER_START[table]).position)).ravel()
+    return np.array(ca.DM(machine().tip_pose((), STANDING_STARTS[table]).position)).ravel()
 
 
 def table_path(table: int) -> Callable[[Any], list[Any]]:
@@ -175,7 +176,7 @@ def spring() -> External:
 
 def run_case(case: Case) -> Local:
     """Simulate one law."""
-    path, start = table_path(case.table), PAPER_START[case.table]
+    path, start = table_path(case.table), STANDING_STARTS[case.table]
     if case.printed:
         motion, gap = printed_law(machine(), path, ROWS, start, HORIZON)
         return Local(case, motion, motion, motion_cost(motion), gap, *fails(motion), None)

@@ -8,8 +8,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from models.machines.standing import PAPER_START
 from models.machines.standing_motion import StandingMotion, standing_motion
+from models.papers import STANDING_STARTS
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.standing.options import ZmpRule
 from ocp.builders.standing.plan import (
@@ -144,10 +144,10 @@ def plan_problem(request: Request) -> Problem:
         settings["tip_level"] = "acceleration"
     if request.task == "minimum_time":
         settings |= {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter"}
-        return standing_plan(machine(), lift_path(), ROWS, PAPER_START[1], FreeTime(0.2, 3.0, 1.0), **settings)
+        return standing_plan(machine(), lift_path(), ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
     table = 1 if request.task == "table1" else 2
     settings |= {"limits": LIMITS, "external": spring() if table == 2 else None}
-    return standing_plan(machine(), table_path(table), ROWS, PAPER_START[table], HORIZON, **settings)
+    return standing_plan(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
 
 
 def method(transcription: Transcription, intervals: int) -> Any:

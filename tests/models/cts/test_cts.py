@@ -21,13 +21,12 @@ from models.cts.rig import (
     forward,
     goose_neck_corner,
     inverse,
-    reference_rig,
-    reference_tunnel,
     task_jacobian,
     tool_frame,
 )
 from models.cts.roll import index_harmonics
 from models.errors import ModelError
+from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import (
     Array,
     corner_by_rotation,

@@ -10,10 +10,11 @@ import pytest
 
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clear_inverse, clearances
-from models.cts.rig import HOME, INCH, inverse, reference_rig, reference_tunnel
+from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
 from models.cts.table import solve_table
 from models.errors import ModelError
+from models.papers import reference_rig, reference_tunnel
 from models.shapes.capsules import Box, soft_minimum
 from tests.models.cts.cts_oracle import Array, index_by_geometry, joints_by_geometry
 

@@ -11,21 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import (
-    BRANCHES,
-    HOME,
-    INCH,
-    Branch,
-    Rig,
-    Tunnel,
-    forward,
-    reference_rig,
-    reference_tunnel,
-)
+from models.cts.rig import BRANCHES, HOME, INCH, Branch, Rig, Tunnel, forward
 from models.cts.roll import ACTIVE, STATUS
 from models.cts.table import Table, all_joint_sets, reachable_arcs, solve_table
 from models.cts.trigonometric import Harmonics, least_point, roots, series_roots
 from models.errors import ModelError
+from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.cts.clearance import Surroundings, clearances, rig_capsules
-from models.cts.rig import dh_frames, reference_rig
+from models.cts.rig import dh_frames
 from models.errors import ModelError
+from models.papers import reference_rig
 from models.robot.parts import Link
 from models.shapes.capsules import (
     Box,

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import Joint, Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
-from models.machines.standing import PAPER_START, Standing, center_of_pressure, paper_example, tip_spring
+from models.machines.standing import Standing, center_of_pressure, tip_spring
 from models.machines.standing_motion import standing_motion
 from models.machines.support import rectangle
+from models.papers import STANDING_STARTS, standing_example
 from models.robot.dynamics import Wrench
 from models.robot.motion import link_motions
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
@@ -29,7 +30,7 @@ def hand(rng: np.random.Generator, machine: Standing) -> Wrench:
 
 @pytest.mark.parametrize(("table", "ahead"), [(1, 0.0073), (2, 0.0090)])
 def test_the_papers_machine_starts_with_its_centre_of_mass_over_the_foot(table: int, ahead: float) -> None:
-    machine, q = paper_example(), PAPER_START[table]
+    machine, q = standing_example(), STANDING_STARTS[table]
     center = numeric(center_of_mass(machine.robot, q, machine.world_from_base())).ravel()
     assert center[0] == 0
     assert center[1] == pytest.approx(ahead, abs=5e-5)
@@ -39,10 +40,10 @@ def test_the_papers_machine_starts_with_its_centre_of_mass_over_the_foot(table: 
 
 
 def test_the_papers_machine_moves_in_its_plane_counter_clockwise_from_y() -> None:
-    machine = paper_example()
-    frames = link_frames(machine.robot, PAPER_START[1], machine.world_from_base())
+    machine = standing_example()
+    frames = link_frames(machine.robot, STANDING_STARTS[1], machine.world_from_base())
     angle = 0.0
-    for i, joint in enumerate(PAPER_START[1]):
+    for i, joint in enumerate(STANDING_STARTS[1]):
         angle += joint
         heading = numeric(frames[f"link{i + 1}"].rotation)[:, 0]
         np.testing.assert_allclose(heading, [0, np.cos(angle), np.sin(angle)], atol=1e-12)
@@ -210,7 +211,7 @@ def test_accelerations_that_meet_the_rows_put_the_zero_moment_point_there(seed: 
 
 
 def test_the_index_is_1_at_the_most_stable_point_and_0_at_the_half_widths() -> None:
-    machine = paper_example()
+    machine = standing_example()
     for point, index in (((0, 0), (1, 1)), ((0.05, -0.1), (0, 0)), ((0, 0.05), (1, 0.75)), ((0, 0.2), (1, -3))):
         np.testing.assert_allclose(numeric(machine.stability_index(point)).ravel(), index, atol=1e-12)
     arm = standing_arm()  # by default that of the bounding box: positive exactly inside a rectangle
@@ -218,7 +219,7 @@ def test_the_index_is_1_at_the_most_stable_point_and_0_at_the_half_widths() -> N
 
 
 def test_a_spring_pulls_back_to_its_rest() -> None:
-    machine = paper_example()
+    machine = standing_example()
     (wrench,) = tip_spring(machine, (0, 150, 0), (0, 0.3, 1.0))(0.0, ca.DM([0.1, 0.5, 0.9]))
     np.testing.assert_allclose(numeric(wrench.force).ravel(), [0, -30, 0])
     assert wrench.link == machine.robot.tip
@@ -261,7 +262,7 @@ def test_a_sampled_motion_is_evaluated_point_by_point(seed: int, size: int) -> N
 
 
 def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
-    machine = paper_example()
+    machine = standing_example()
     q = np.array([machine.robot.lower, machine.robot.upper, (machine.robot.lower + machine.robot.upper) / 2])
     q = np.vstack([q, q[1] + [0, 0, 0.2, 0, 0]])
     found = standing_motion(machine, np.arange(4.0), q, 0 * q, 0 * q)
@@ -293,12 +294,12 @@ def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
 )
 def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        replace(paper_example(), **changes)
+        replace(standing_example(), **changes)
 
 
 def test_a_motion_of_a_wrong_shape_is_refused() -> None:
     with pytest.raises(ModelError, match=r"joint_velocities has shape \(2, 4\), expected \(2, 5\)"):
-        standing_motion(paper_example(), [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
+        standing_motion(standing_example(), [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
 
 
 def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
@@ -309,7 +310,7 @@ def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
 
 
 def test_a_support_that_is_none_and_wrenches_that_are_no_list_are_refused() -> None:
-    machine, rest = paper_example(), np.zeros(5)
+    machine, rest = standing_example(), np.zeros(5)
     wide: Any = "wide"
     with pytest.raises(ModelError, match=r"support must be a Support, .* not 'wide'"):
         replace(machine, support=wide)
@@ -323,4 +324,4 @@ def test_a_support_that_is_none_and_wrenches_that_are_no_list_are_refused() -> N
 def test_a_motion_of_no_times_is_refused(times: Any) -> None:
     rest = np.zeros((len(times), 5))
     with pytest.raises(ModelError, match="motion: "):
-        standing_motion(paper_example(), times, rest, rest, rest)
+        standing_motion(standing_example(), times, rest, rest, rest)

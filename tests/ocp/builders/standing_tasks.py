@@ -8,8 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.machines.standing import PAPER_START, External, Standing, paper_example, tip_spring
+from models.machines.standing import External, Standing, tip_spring
 from models.machines.standing_motion import StandingMotion, standing_motion
+from models.papers import STANDING_STARTS, standing_example
 from models.robot.dynamics import Wrench
 from ocp import Problem, Solution
 from ocp.builders.standing.plan import FreeTime, Limits, Weights, standing_plan
@@ -28,7 +29,7 @@ ARM_HORIZON = 1.2
 
 @cache
 def machine() -> Standing:
-    return paper_example()
+    return standing_example()
 
 
 @cache
@@ -42,7 +43,7 @@ def tip_at(standing: Standing, joints: Array) -> Array:
 
 def table_path(table: int) -> Any:
     """zdot = 0.4 sin t (Table 1) or ydot = 0.2 sin t (Table 2); the other coordinate is held."""
-    _, y, z = tip_at(machine(), PAPER_START[table])
+    _, y, z = tip_at(machine(), STANDING_STARTS[table])
     if table == 1:
         return lambda t: [y, z + 0.4 * (1 - ca.cos(t))]
     return lambda t: [y + 0.2 * (1 - ca.cos(t)), z]
@@ -50,20 +51,20 @@ def table_path(table: int) -> Any:
 
 def spring() -> External:
     """k = 150 N/m along y, relaxed where the tip of Table 2 starts."""
-    return tip_spring(machine(), (0, 150, 0), tip_at(machine(), PAPER_START[2]))
+    return tip_spring(machine(), (0, 150, 0), tip_at(machine(), STANDING_STARTS[2]))
 
 
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
     settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
-    return standing_plan(machine(), table_path(table), ROWS, PAPER_START[table], HORIZON, **settings)
+    return standing_plan(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
 
 
 def lift_plan(zmp: Any, **changes: Any) -> Problem:
     """The tip 0.8 m straight up in the least time."""
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}
     return standing_plan(
-        machine(), lambda s: [y, z + 0.8 * s], ROWS, PAPER_START[1], FreeTime(0.2, 3.0, 1.0), zmp=zmp, **settings
+        machine(), lambda s: [y, z + 0.8 * s], ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), zmp=zmp, **settings
     )
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clearances
-from models.cts.rig import HOME, INCH, Rig, inverse, reference_rig, reference_tunnel
+from models.cts.rig import HOME, INCH, Rig, inverse
+from models.papers import reference_rig, reference_tunnel
 from models.shapes.capsules import Box
 from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.cts import least_course, roll_plan, spline_targets

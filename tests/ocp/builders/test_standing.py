@@ -8,9 +8,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.machines.standing import PAPER_START, Standing, center_of_pressure
+from models.machines.standing import Standing, center_of_pressure
 from models.machines.standing_motion import standing_motion
 from models.machines.support import Support, rectangle
+from models.papers import STANDING_STARTS
 from ocp import Collocation, MultipleShooting, Solution, solve, tighten
 from ocp.builders.standing.plan import (
     Anywhere,
@@ -108,7 +109,7 @@ def test_plans_of_table_2_against_the_spring_cost_what_they_should(zmp: Any, cos
     motion = sampled(machine(), solution, spring())
     assert motion.stands
     assert tip_error(motion, table_path(2)) < 1e-5
-    stretch = motion.tip_in_world[:, 1] - tip_at(machine(), PAPER_START[2])[1]
+    stretch = motion.tip_in_world[:, 1] - tip_at(machine(), STANDING_STARTS[2])[1]
     np.testing.assert_allclose(motion.external_force[:, 1], -150 * stretch, atol=1e-9)
 
 
@@ -159,7 +160,7 @@ def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_mor
         "stabilised": {"law": "stabilised", "stabiliser": Stabiliser((3.5, 3.5, 3.5), gradient=1.8)},
     }
     for name, law in laws.items():
-        found = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], HORIZON, step=1e-2, **law)
+        found = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], HORIZON, step=1e-2, **law)
         costs[name] = motion_cost(found.motion)
         assert costs[name] > solution.cost
     assert costs["plain"] == pytest.approx(2.49, rel=0.01)
@@ -175,7 +176,7 @@ def test_the_fastest_lift_takes_longer_the_less_the_zero_moment_point_may_move(z
     assert solution.horizon == pytest.approx(seconds, rel=2e-3)
     assert solution["path"][-1, 0] == pytest.approx(1.0)
     motion = sampled(machine(), solution)
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     assert np.abs(motion.tip_in_world[:, 1] - y).max() < 1e-4  # straight up
     end = numeric(machine().tip_pose((), solution["joints"][-1]).position).ravel()
     np.testing.assert_allclose(end, [0, y, z + 0.8], atol=1e-8)
@@ -192,12 +193,12 @@ def test_the_fastest_lift_does_not_depend_on_the_first_guess() -> None:
 
 
 def replace_horizon(seconds: float) -> Any:
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     return standing_plan(
         machine(),
         lambda s: [y, z + 0.8 * s],
         ROWS,
-        PAPER_START[1],
+        STANDING_STARTS[1],
         seconds,
         zmp=IN_RANGE,
         limits=LIFT_LIMITS,
@@ -249,14 +250,14 @@ def test_free_ends_cost_less_than_rest_and_a_given_end_posture_more() -> None:
 def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
     knots = np.linspace(-0.1, HORIZON + 0.1, 61)
     rise = ca.interpolant("rise", "bspline", [knots], 0.4 * (1 - np.cos(knots)))
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     offset = float(rise(0.0))
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "end": "free", "start": "free"}
     problem = standing_plan(
         machine(),
         lambda t: ca.vertcat(y, z + rise(t) - offset),
         ROWS,
-        PAPER_START[1],
+        STANDING_STARTS[1],
         HORIZON,
         symbols=ca.MX,
         **settings,
@@ -379,7 +380,7 @@ def test_a_tightened_plan_holds_its_limits_between_the_points(
         standing,
         table_path(1),
         ROWS,
-        PAPER_START[1],
+        STANDING_STARTS[1],
         HORIZON,
         zmp=IN_RANGE,
         limits=limits,
@@ -401,7 +402,7 @@ def test_the_fastest_lift_holds_its_limits_between_the_points() -> None:
     assert max(found.values()) < 1e-6, found
     assert solution.horizon == pytest.approx(0.503, rel=2e-3)
     values = solution.at_fraction((np.arange(500) + 0.5) / 500)
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     tips = np.array([tip_at(machine(), joints) for joints in values["joints"]])
     wanted = np.column_stack([np.full(500, y), z + 0.8 * values["path"][:, 0]])
     assert np.abs(tips[:, 1:] - wanted).max() < 1e-5
@@ -412,7 +413,7 @@ def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() 
     times, tilts = replay(machine(), plan)
     assert times[-1] > 6.2
     assert tilts.max() < 1e-3
-    local = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], HORIZON, step=5e-3).motion
+    local = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], HORIZON, step=5e-3).motion
     times, tilts = replay(machine(), local)
     assert tilts[-1] > 0.3
     assert times[-1] == pytest.approx(6.17, abs=0.05)
@@ -446,9 +447,11 @@ def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
 
 def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) -> Any:
     """The tip led straight forward and up."""
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes}
-    return standing_plan(machine(), lambda s: [y + forward * s, z + up * s], ROWS, PAPER_START[1], horizon, **settings)
+    return standing_plan(
+        machine(), lambda s: [y + forward * s, z + up * s], ROWS, STANDING_STARTS[1], horizon, **settings
+    )
 
 
 @pytest.mark.parametrize("horizon", [3.0, FreeTime(0.5, 3.0, 2.0)], ids=["fixed", "free"])
@@ -464,12 +467,12 @@ def test_the_foot_that_the_error_asks_for_is_enough() -> None:
     problem = lean(3.0)
     _, amount, _ = misses(problem, MultipleShooting(20))[0]
     longer = replace(machine(), support=rectangle((-0.05, 0.05), (-0.1, 0.2 + amount + 0.02)))
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
 
     def path(s: Any) -> list[Any]:
         return [y + 0.9 * s, z + 0.5 * s]
 
-    problem = standing_plan(longer, path, ROWS, PAPER_START[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter")
+    problem = standing_plan(longer, path, ROWS, STANDING_STARTS[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter")
     assert held(problem, 20).success
 
 
@@ -546,7 +549,7 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
     arguments = {
         "tip_path": table_path(1),
         "rows": ROWS,
-        "start_joints": PAPER_START[1],
+        "start_joints": STANDING_STARTS[1],
         "horizon": HORIZON,
         **changes,
     }
@@ -563,9 +566,11 @@ def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
 
 
 def test_a_path_longer_than_the_arm_is_refused() -> None:
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     with pytest.raises(ProblemError, match=r"tip_path leads .* m away from the first joint .* at most 1.84 m long"):
-        standing_plan(machine(), lambda s: [y + 2 * s, z], ROWS, PAPER_START[1], 3.0, along="parameter", limits=LIMITS)
+        standing_plan(
+            machine(), lambda s: [y + 2 * s, z], ROWS, STANDING_STARTS[1], 3.0, along="parameter", limits=LIMITS
+        )
 
 
 @pytest.mark.parametrize(

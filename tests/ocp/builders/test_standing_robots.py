@@ -17,8 +17,8 @@ import pinocchio
 import pytest
 
 from models import Robot, Standing, Wrench, rectangle, simplified, with_load
-from models.machines.standing import paper_example
 from models.machines.standing_motion import StandingMotion
+from models.papers import standing_example
 from ocp import Collocation, Solution, solve
 from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_plan
 from ocp.errors import ProblemError
@@ -239,7 +239,7 @@ def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> No
 
 def test_a_start_in_a_singular_posture_may_be_left() -> None:
     """The arm of the paper stretched straight up: no local motion leaves there, the first guess is to stay."""
-    machine, start = paper_example(), np.array([np.pi / 2, 0.0, 2 * np.pi, 2 * np.pi, 0.0])
+    machine, start = standing_example(), np.array([np.pi / 2, 0.0, 2 * np.pi, 2 * np.pi, 0.0])
     _, y, z = numeric(machine.tip_pose((), start).position).ravel()
     limits = Limits(joints=False, velocity=6.0, acceleration=60.0)
     problem = standing_plan(

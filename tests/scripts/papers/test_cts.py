@@ -16,8 +16,8 @@ import pytest
 from PIL import Image
 
 from models.cts.export import export, rig_functions
-from models.cts.rig import reference_rig, reference_tunnel
 from models.errors import ModelError
+from models.papers import reference_rig, reference_tunnel
 from scripts import cts
 from tests.models.cts.cts_oracle import random_targets
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.machines.standing import PAPER_START
 from models.machines.standing_motion import StandingMotion
+from models.papers import STANDING_STARTS
 from ocp.builders.standing.plan import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from ocp.local.accelerations import resolve_accelerations
 from scripts import reproduce, standing
@@ -167,7 +167,7 @@ def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not
 
 
 def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
-    path, start, horizon = table_path(1), PAPER_START[1], 0.8
+    path, start, horizon = table_path(1), STANDING_STARTS[1], 0.8
     ours, gap = printed_law(machine(), path, ROWS, start, horizon, sign=1.0)
     other = resolve_accelerations(machine(), path, ROWS, start, horizon, law="null_space").motion
     assert gap < 1e-9

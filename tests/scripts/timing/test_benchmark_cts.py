@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import reference_rig, reference_tunnel
+from models.papers import reference_rig, reference_tunnel
 from scripts import benchmark
 from scripts.papers.cts import compiled as cts_compiled
 from scripts.papers.cts.results import sweep_targets
