@@ -62,7 +62,7 @@ def median(work: Callable[[], Any], repeats: int) -> float:
 def free_floating() -> Problem:
     """The paper's example at t_f = 5 s."""
     start = np.deg2rad([45.0, 60.0, -60.0])
-    return redundancy.minimum_velocity(paper_example(), [-1.0, -1.0], [3, 4], start, 5.0)
+    return redundancy.minimum_velocity_problem(paper_example(), [-1.0, -1.0], [3, 4], start, 5.0)
 
 
 def opti_loop(problem: Problem, intervals: int, guess: Solution) -> Any:
@@ -185,7 +185,7 @@ def costate_function(machine: FreeFloating, rows: list[int]) -> tuple[Any, Any]:
     """Functions (state, costate) -> costate rate and -> H of the redundancy problem, the control eliminated."""
     start = np.linspace(0.3, 0.6, machine.joint_size)
     velocity = np.full(len(rows), 0.05)
-    problem = redundancy.minimum_velocity(machine, velocity, rows, start, 0.1, limits=False)
+    problem = redundancy.minimum_velocity_problem(machine, velocity, rows, start, 0.1, limits=False)
     ham = Hamiltonian.of(Formulation(problem))
     x, lam = ca.SX.sym("x", ham.sizes[0]), ca.SX.sym("lam", ham.sizes[0])
     rest = [0, 1, [], [], np.zeros(ham.sizes[-1])]

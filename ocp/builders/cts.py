@@ -31,7 +31,7 @@ from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem
 
-__all__ = ["ROLLS", "least_course", "roll_plan", "spline_targets"]
+__all__ = ["ROLLS", "least_course", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
 REACH = 1 - 1e-9
@@ -63,7 +63,7 @@ def spline_targets(times: Any, targets: Any) -> Targets:
     return lambda time: curve(time)
 
 
-def roll_plan(
+def roll_problem(
     rig: Rig,
     tunnel: Tunnel,
     targets: Targets,
@@ -118,15 +118,15 @@ def roll_plan(
         ("clearance_weight", clearance_weight),
     ):
         if not value >= 0:
-            raise ProblemError(f"roll_plan: {name} {value} must not be negative")
+            raise ProblemError(f"roll_problem: {name} {value} must not be negative")
     if not clearance_width > 0:
-        raise ProblemError(f"roll_plan: clearance_width {clearance_width} m must be positive")
+        raise ProblemError(f"roll_problem: clearance_width {clearance_width} m must be positive")
     if np.isnan(clearance) or clearance == np.inf:
-        raise ProblemError(f"roll_plan: clearance {clearance} m must be a finite distance or -inf for none")
+        raise ProblemError(f"roll_problem: clearance {clearance} m must be a finite distance or -inf for none")
     if not (np.isfinite(horizon) and horizon > 0):
-        raise ProblemError(f"roll_plan: horizon {horizon} s must be positive and finite")
+        raise ProblemError(f"roll_problem: horizon {horizon} s must be positive and finite")
     if start_roll is not None and not np.isfinite(start_roll):
-        raise ProblemError(f"roll_plan: start_roll {start_roll} rad must be finite")
+        raise ProblemError(f"roll_problem: start_roll {start_roll} rad must be finite")
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
     posture = posture_at(rig, x, c, s, branch)
@@ -209,7 +209,7 @@ def _guess(
     status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         at = t[int(np.flatnonzero(status)[0])]
-        raise ProblemError(f"roll_plan: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
+        raise ProblemError(f"roll_problem: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
 
     def costs(times: Any, rolls: Any) -> Array:
         return np.asarray(np.array(cost.map(len(rolls))(rows[:, times], rolls[None]))[0])

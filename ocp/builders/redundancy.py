@@ -31,13 +31,13 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.start import Array, Velocity, checked_configuration, checked_horizon, checked_weights
 from ocp.tasks.tip_task import TipTask, one_of
 
-__all__ = ["minimum_velocity", "plan_minimum_velocity"]
+__all__ = ["minimum_velocity_problem", "plan_minimum_velocity"]
 
 GUESS_TOLERANCE = 1e-8
 LARGEST_DAMPING = 1.0
 
 
-def minimum_velocity(
+def minimum_velocity_problem(
     machine: Machine,
     tip_velocity: Velocity | None = None,
     rows: Sequence[int] | None = None,
@@ -258,7 +258,7 @@ def plan_minimum_velocity(
     options: Mapping[str, Any] | None = None,
     **asked: Any,
 ) -> Solution:
-    """Solve `minimum_velocity` and audit the plan; from other guesses and on finer meshes where it does not hold.
+    """Solve `minimum_velocity_problem` and audit the plan; from other guesses and finer meshes where it does not hold.
 
     The first plan that passes its audit and costs no more than the pseudo-inverse is returned; else the cheapest that
     passes. A plan that passes but whose re-integrated tip strays from its task by more than 1e-6 (m, rad) is solved
@@ -266,15 +266,15 @@ def plan_minimum_velocity(
     fails is solved again on a mesh twice as fine, and once more where that halved the failure.
 
     Args:
-        machine: As for minimum_velocity.
+        machine: As for minimum_velocity_problem.
         method: Collocation; 50 Radau intervals of degree 4 if None.
         dampings: Of the guesses, in the order in which they are tried.
         options: Of IPOPT, besides those above.
-        asked: The other arguments of minimum_velocity: tip_velocity and rows, or task, start_joints, horizon and so on.
+        asked: The other arguments of minimum_velocity_problem: tip_velocity and rows, or task, start_joints, ...
 
     Raises:
         SolveError: No guess leads to a plan that passes; says what became of each.
-        ProblemError: As minimum_velocity; Unreachable, which is one, where a machine on a fixed base cannot reach what
+        ProblemError: As minimum_velocity_problem; Unreachable, which is one, where a fixed machine cannot reach what
             its tasks ask (see ocp.local.reach).
     """
     if not len(dampings):
@@ -290,7 +290,7 @@ def plan_minimum_velocity(
     reasons: list[str] = []
     last: Solution | None = None
     for damping in dampings:
-        problem, guess, mesh = minimum_velocity(machine, guess_damping=damping, **asked), None, how
+        problem, guess, mesh = minimum_velocity_problem(machine, guess_damping=damping, **asked), None, how
         found: Solution | None = None
         before = np.inf
         for attempt in range(MESHES):

@@ -35,12 +35,12 @@ from ocp.errors import ProblemError
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import JointPath, Limits, PathLike
+from ocp.schedule.limits import JointPath, LineLimits, PathLike
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, SpeedProfile
 from ocp.solution import Solution
 
-__all__ = ["Fastest", "TimingProblem", "minimum_time", "timing_problem"]
+__all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "plan_minimum_time"]
 
 SPLIT = 2e-4
 """Intervals in which a limit is passed by more than this share are cut, into up to `PARTS`."""
@@ -133,9 +133,9 @@ class Fastest:
         return self.schedule.duration
 
 
-def minimum_time(
+def plan_minimum_time(
     path: PathLike,
-    limits: Limits,
+    limits: LineLimits,
     joints: JointPath | None = None,
     *,
     guess: Schedule | None = None,
@@ -157,9 +157,9 @@ def minimum_time(
         options: Of ipopt.
 
     Raises:
-        ProblemError: As timing_problem. SolveError: the solver failed, naming the worst residuals.
+        ProblemError: As minimum_time_problem. SolveError: the solver failed, naming the worst residuals.
     """
-    timing = timing_problem(path, limits, joints, guess=guess, intervals=intervals)
+    timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
         solution = solve(timing.problem, timing.method, guess=solution, options={**OPTIONS, **(options or {})})
@@ -174,15 +174,15 @@ def minimum_time(
     return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
 
 
-def timing_problem(
+def minimum_time_problem(
     path: PathLike,
-    limits: Limits,
+    limits: LineLimits,
     joints: JointPath | None = None,
     *,
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """The problem of `minimum_time`, for any method to solve.
+    """The problem of `plan_minimum_time`, for any method to solve.
 
     Path constraints "asked speed", "centripetal acceleration", "joint velocity", "joint acceleration" and "joint jerk"
     (those that are limited), each over its limit; "start at rest" and "end at rest", "start jerk" and "end jerk".
@@ -194,7 +194,7 @@ def timing_problem(
     if isinstance(intervals, bool) or not isinstance(intervals, int | np.integer) or intervals < 10:
         raise ProblemError(f"intervals = {intervals!r} must be a whole number, 10 or more")
     if limits.joints is not None and joints is None:
-        raise ProblemError("joint limits need the joints along the path: minimum_time(path, limits, arm)")
+        raise ProblemError("joint limits need the joints along the path: plan_minimum_time(path, limits, arm)")
     limited = joints if limits.joints is not None else None
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         raise ProblemError(f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m")
@@ -222,7 +222,7 @@ def timing_problem(
 
 def _declared(
     path: PathLike,
-    limits: Limits,
+    limits: LineLimits,
     joints: JointPath | None,
     reference: SpeedProfile,
     span: tuple[float, float],
@@ -271,7 +271,7 @@ def _declared(
     return problem
 
 
-def _demands(limits: Limits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
+def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
     """Everything limited along the path over its limit, by name; `values`: reference speed, then path_columns."""
     found: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
 from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import JointPath, Limits, PathLike, curvature_along, joint_demands, line_demands, rates_along
+from ocp.schedule.limits import (
+    JointPath,
+    LineLimits,
+    PathLike,
+    curvature_along,
+    joint_demands,
+    line_demands,
+    rates_along,
+)
 from ocp.schedule.planner import schedule
 from ocp.schedule.profile import Array, Motion, SpeedProfile
 
@@ -87,14 +95,14 @@ def table(columns: Columns, breaks: Array) -> Any:
     return ca.Function("along", [time], [value])
 
 
-def asked_speed(path: PathLike, limits: Limits, s: Array) -> Array:
+def asked_speed(path: PathLike, limits: LineLimits, s: Array) -> Array:
     """Asked line speed at distances (M,)."""
     of_pieces = path.by_piece(limits.speed)
     piece = np.clip(np.searchsorted(path.bounds, s, side="right") - 1, 0, len(of_pieces) - 1)
     return np.asarray(of_pieces[piece])
 
 
-def path_columns(path: PathLike, limits: Limits, joints: JointPath | None, s: Array) -> Array:
+def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
     """Asked speed, curvature, and three derivatives of the joints by the distance, at distances (M,). Shape (M, m).
 
     Zero curvature where centripetal acceleration is not limited; no joints if None.
@@ -110,7 +118,7 @@ def path_columns(path: PathLike, limits: Limits, joints: JointPath | None, s: Ar
     return np.column_stack([*found, rates.first, rates.second, rates.third])
 
 
-def largest_demand(path: PathLike, limits: Limits, joints: JointPath | None, motion: Motion) -> Array:
+def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: Motion) -> Array:
     """The largest of speed, acceleration, jerk, centripetal acceleration and joint demands over its limit. Shape (M,).
 
     Values of the path's derivatives where they jump are those after the jump.
@@ -131,7 +139,7 @@ def largest_demand(path: PathLike, limits: Limits, joints: JointPath | None, mot
     return np.asarray(np.max(rows, axis=0))
 
 
-def demand_of_pieces(path: PathLike, limits: Limits, joints: JointPath | None, profile: SpeedProfile) -> Array:
+def demand_of_pieces(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
     """Largest demand inside each piece of a profile, from either side where the path jumps. Shape (K,)."""
     count = INSIDE
     inside = (np.arange(count) + 0.5) / count
@@ -153,13 +161,13 @@ CLOSE = 1e-7
 """Nodes closer than this over the whole time count as one."""
 
 
-def reference_motion(path: PathLike, limits: Limits, joints: JointPath | None) -> SpeedProfile:
+def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
     """A schedule's motion; where none is found, an even slower one that surely keeps all limits."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
         make_grid(path, limits, joints)  # what no motion keeps is refused here
-    quick = schedule(path, Limits(limits.speed, limits.acceleration, limits.jerk)).profile
+    quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
     # slower by a factor in time: velocities shrink with it, accelerations with its square, jerks with its cube
     fractions = np.linspace(0, 1, 2001)
     motion = quick.at(quick.duration * fractions)

@@ -1,6 +1,6 @@
 """Time schedules: jerk-limited line speed along a path, at the asked speed wherever the limits allow it."""
 
-from ocp.schedule.limits import JointLimits, JointPath, JointRates, Limits, PathLike
+from ocp.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike
 from ocp.schedule.planner import Dip, Schedule, schedule
 from ocp.schedule.profile import Motion, SpeedProfile
 from ocp.schedule.ramps import peak_acceleration, ramp_distance, ramp_time
@@ -12,7 +12,7 @@ __all__ = [
     "JointPath",
     "JointRates",
     "JointTrajectory",
-    "Limits",
+    "LineLimits",
     "Motion",
     "PathLike",
     "Schedule",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath, Limits, PathLike, curvature_along, line_demands, rates_along
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, curvature_along, line_demands, rates_along
 from ocp.schedule.profile import Array
 
 __all__ = ["Grid", "make_grid"]
@@ -45,7 +45,7 @@ class Grid(NamedTuple):
     before: Array
 
 
-def make_grid(path: PathLike, limits: Limits, joints: JointPath | None) -> Grid:
+def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
     """Sample the permitted speed until neighbours agree, where it matters.
 
     Raises:
@@ -79,7 +79,9 @@ def make_grid(path: PathLike, limits: Limits, joints: JointPath | None) -> Grid:
     return Grid(s, permitted * (1 - SAFETY), cause, _asked(path, s, asked), before)
 
 
-def _permitted(path: PathLike, limits: Limits, joints: JointPath | None, s: Array) -> tuple[Array, NDArray[np.intp]]:
+def _permitted(
+    path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array
+) -> tuple[Array, NDArray[np.intp]]:
     curvature = curvature_along(path, s) if np.isfinite(limits.centripetal) else None
     demand, power = line_demands(limits, curvature, None if joints is None else rates_along(joints, s))
     with np.errstate(divide="ignore"):
@@ -108,7 +110,7 @@ def _uneven(path: PathLike, s: Array, permitted: Array, asked: Array) -> NDArray
     return np.asarray(matters & ((np.abs(np.diff(value)) > COARSE) | (error > UNSEEN)))
 
 
-def _check_smooth(path: PathLike, limits: Limits, count: int) -> None:
+def _check_smooth(path: PathLike, limits: LineLimits, count: int) -> None:
     if not np.isfinite(limits.of_joints(count)[2]).any():
         return
     jumps = path.curvature_jumps()

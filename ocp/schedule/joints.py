@@ -1,6 +1,6 @@
 """Limits lowered, stretch by stretch, until a plan keeps to what a steady speed and the joints permit.
 
-Limits along a path, stretch by stretch, and the plan that keeps them.
+LineLimits along a path, stretch by stretch, and the plan that keeps them.
 
 The speed lowered where a steady one breaks a limit.
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
 from ocp.schedule.grid import Grid
-from ocp.schedule.limits import JointPath, Limits, joint_demands, rates_along
+from ocp.schedule.limits import JointPath, LineLimits, joint_demands, rates_along
 from ocp.schedule.profile import Array, Motion, SpeedProfile
 from ocp.schedule.ramps import Memory, Zones, plan
 
@@ -32,7 +32,7 @@ GENTLER = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0)
 """Slower ramps tried where joint limits bind on ramps: acceleration over the square, jerk over the cube of these."""
 
 
-def search(grid: Grid, limits: Limits, joints: JointPath | None) -> Attempt:
+def search(grid: Grid, limits: LineLimits, joints: JointPath | None) -> Attempt:
     """The shortest plan found: with ramps as fast as asked, and where joint limits bind on them, with slower ones.
 
     Slower ones are tried all along the path, and then made faster again wherever the joints can follow.
@@ -68,7 +68,7 @@ def _found(best: Attempt | None, grid: Grid) -> Attempt:
 
 
 def _attempt(
-    grid: Grid, limits: Limits, joints: JointPath | None, gentler: float, passed: set[tuple[float, ...]]
+    grid: Grid, limits: LineLimits, joints: JointPath | None, gentler: float, passed: set[tuple[float, ...]]
 ) -> Attempt | None:
     count = len(grid.asked)
     acceleration = np.full(count, float(limits.acceleration) / gentler**2)
@@ -94,7 +94,7 @@ class Attempt:
 
     Attributes:
         grid: Where they are looked at.
-        speed, acceleration, jerk: Limits of each interval. Shape (G - 1,).
+        speed, acceleration, jerk: LineLimits of each interval. Shape (G - 1,).
         ramp_cause: Row of `cause_names` that made a ramp gentler there, or -1. Shape (G - 1,).
         memory: Motions of zones already found.
         passed: Phases that are known to keep the joint limits: distance, speed, acceleration, jerk, duration.
@@ -185,7 +185,7 @@ class Broken(NamedTuple):
     row: NDArray[np.intp]
 
 
-def broken_ramps(state: Attempt, limits: Limits, joints: JointPath) -> Broken | None:
+def broken_ramps(state: Attempt, limits: LineLimits, joints: JointPath) -> Broken | None:
     """Where the plan's ramps break joint limits; None when nowhere.
 
     Only phases not seen before are looked at: the others are known to keep the limits.
@@ -219,7 +219,7 @@ def broken_ramps(state: Attempt, limits: Limits, joints: JointPath) -> Broken | 
     return Broken(ramp, phase[over], motion.distance[over], motion.speed[over], demand[over], share[over], row[over])
 
 
-def ease_ramps(state: Attempt, limits: Limits, joints: JointPath) -> bool:
+def ease_ramps(state: Attempt, limits: LineLimits, joints: JointPath) -> bool:
     """Lower acceleration and jerk limits where a ramp breaks a joint limit; False when none does."""
     broken = broken_ramps(state, limits, joints)
     if broken is None:
@@ -309,7 +309,7 @@ TRIALS, PATIENCE = 24, 4
 """After each so many rounds one more neighbour on either side goes back with a stretch, so that long paths settle."""
 
 
-def relax_ramps(best: Attempt, limits: Limits, joints: JointPath) -> Attempt:
+def relax_ramps(best: Attempt, limits: LineLimits, joints: JointPath) -> Attempt:
     """The plan with full acceleration and jerk, or at least more of them, wherever the joints can follow.
 
     Args:
@@ -323,7 +323,7 @@ def relax_ramps(best: Attempt, limits: Limits, joints: JointPath) -> Attempt:
     return best
 
 
-def _trial(best: Attempt, limits: Limits, joints: JointPath, share: tuple[float, float]) -> Attempt | None:
+def _trial(best: Attempt, limits: LineLimits, joints: JointPath, share: tuple[float, float]) -> Attempt | None:
     """All stretches get more; those whose ramps then break a limit go back to what they had, until none does."""
     lost = limits.acceleration / best.acceleration, limits.jerk / best.jerk
     eased = np.maximum(*lost) > 1 + TOLERANCE

@@ -16,7 +16,7 @@ __all__ = [
     "JointLimits",
     "JointPath",
     "JointRates",
-    "Limits",
+    "LineLimits",
     "PathLike",
     "cause_names",
     "curvature_along",
@@ -70,7 +70,7 @@ class JointLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class LineLimits:
     """Limits of a schedule.
 
     Attributes:
@@ -168,7 +168,7 @@ def cause_names(joint_names: Sequence[str]) -> tuple[str, ...]:
 
 
 def line_demands(
-    limits: Limits, curvature: Array | None, rates: JointRates | None
+    limits: LineLimits, curvature: Array | None, rates: JointRates | None
 ) -> tuple[Array, NDArray[np.float64]]:
     """Demand over limit at unit, steady line speed, and the power of the speed it grows with.
 
@@ -187,7 +187,7 @@ def line_demands(
     return np.concatenate(rows), np.array(powers)
 
 
-def joint_demands(limits: Limits, rates: JointRates, motion: Motion) -> tuple[Array, Array]:
+def joint_demands(limits: LineLimits, rates: JointRates, motion: Motion) -> tuple[Array, Array]:
     """Joint acceleration and jerk over their limits during a motion, and the part of it that a steady speed has.
 
     q'' v^2 + q' a, and q''' v^3 + 3 q'' v a + q' j. Shape (2 n, M) each.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ocp.errors import ProblemError
 from ocp.schedule.grid import make_grid
 from ocp.schedule.joints import TOLERANCE, Attempt, search
-from ocp.schedule.limits import JointPath, Limits, PathLike, cause_names
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names
 from ocp.schedule.profile import Array, Motion, SpeedProfile
 
 __all__ = ["Dip", "Schedule", "schedule"]
@@ -59,7 +59,7 @@ class Schedule:
     """
 
     path: PathLike
-    limits: Limits
+    limits: LineLimits
     profile: SpeedProfile
     dips: tuple[Dip, ...]
     joints: JointPath | None = None
@@ -93,7 +93,7 @@ class Schedule:
         return self.profile.function()
 
 
-def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
+def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
     """Plan the line speed along a path from rest to rest.
 
     One jerk-limited motion if nothing but speed, acceleration and jerk binds; the speed is then constant at the asked
@@ -116,8 +116,8 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
         raise ProblemError(
             f"the path {path!r} has no {missing[0]}; give a SmoothPath, as models.paths.smooth_path makes it"
         )
-    if not isinstance(limits, Limits):
-        raise ProblemError(f"limits {limits!r} must be a Limits")
+    if not isinstance(limits, LineLimits):
+        raise ProblemError(f"limits {limits!r} must be a LineLimits")
     if limits.joints is not None and joints is None:
         raise ProblemError(
             "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
@@ -135,7 +135,7 @@ def schedule(path: PathLike, limits: Limits, *, joints: JointPath | None = None,
     return Schedule(path, limits, found.profile, dips, joints)
 
 
-def _dips(state: Attempt, limits: Limits, names: tuple[str, ...]) -> tuple[Dip, ...]:
+def _dips(state: Attempt, limits: LineLimits, names: tuple[str, ...]) -> tuple[Dip, ...]:
     grid = state.grid
     cause = _causes(state, limits)
     edges = np.flatnonzero(np.diff(cause, prepend=-1, append=-1))
@@ -159,7 +159,7 @@ def _dips(state: Attempt, limits: Limits, names: tuple[str, ...]) -> tuple[Dip, 
     return tuple(_joined(dips, state))
 
 
-def _causes(state: Attempt, limits: Limits) -> NDArray[np.intp]:
+def _causes(state: Attempt, limits: LineLimits) -> NDArray[np.intp]:
     """Row of cause_names that slows each interval of the grid, -1 where nothing does. Shape (G - 1,)."""
     grid, speed = state.grid, state.speed
     gentle = state.acceleration < limits.acceleration * (1 - TOLERANCE)

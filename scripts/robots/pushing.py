@@ -19,7 +19,7 @@ from models import Footprint, Robot, Standing, Wrench, footprint, with_load
 from models.arrays import Array
 from models.machines.standing import External
 from ocp import Collocation, Problem, solve
-from ocp.builders.standing.plan import InFoot, Limits, standing_plan
+from ocp.builders.standing.plan import InFoot, Limits, standing_problem
 from ocp.local.accelerations import resolve_accelerations
 from scripts.robots import standing
 from scripts.robots.frames import frames_along
@@ -85,7 +85,7 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
     """The plan to be made, at a given time law or with the time law left to the plan ("parameter").
 
     Args:
-        changes: Of the options of standing_plan.
+        changes: Of the options of standing_problem.
     """
     options: dict[str, Any] = {
         "zmp": InFoot(MARGIN),
@@ -95,7 +95,7 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
         **changes,
     }
     path = timed(machine) if along == "time" else reach(machine)
-    return standing_plan(machine, path, ROWS, START, SECONDS, along=along, **options)
+    return standing_problem(machine, path, ROWS, START, SECONDS, along=along, **options)
 
 
 def plan(coarse: bool = False) -> StandingExample:

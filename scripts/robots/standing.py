@@ -21,7 +21,7 @@ from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve
-from ocp.builders.standing.plan import InFoot, Limits, Weights, standing_plan
+from ocp.builders.standing.plan import InFoot, Limits, Weights, standing_problem
 from ocp.local.accelerations import resolve_accelerations
 from scripts.drawing import COLORS, DASHES, sheet
 
@@ -133,7 +133,7 @@ def timed(hand: HandPath, seconds: float = SECONDS) -> HandPath:
 def problem(machine: Standing, *, along: Any = "time") -> Problem:
     """The plan to be made: the circle at a given time law, or with the time law left to the plan ("parameter")."""
     robot, hand = machine.robot, circle(machine)
-    return standing_plan(
+    return standing_problem(
         machine,
         timed(hand) if along == "time" else hand,
         ROWS,

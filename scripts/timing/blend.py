@@ -22,8 +22,8 @@ from models import paths
 from models.machines.scara_path import scara_along
 from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
 from models.paths.arc_length import arc_length
-from ocp.builders.timing import minimum_time
-from ocp.schedule import Limits, Schedule, peak_acceleration, schedule
+from ocp.builders.timing import plan_minimum_time
+from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.papers.blend.compiled import march_compiled, place_compiled
 from scripts.papers.blend.example import (
@@ -62,7 +62,7 @@ def run(repeats: int = 5, *, segments: Sequence[int] = (1000, 10_000)) -> dict[s
         planner. "targets": each with its figure.
     """
     cubic, quintic = (smooth(example(), REMAINING, kind=kind) for kind in ("cubic", "quintic"))
-    limits = Limits(SPEED, peak_acceleration(MEAN_ACCELERATION, SPEED, JERK), JERK)
+    limits = LineLimits(SPEED, peak_acceleration(MEAN_ACCELERATION, SPEED, JERK), JERK)
     plan = schedule(cubic, limits)
     rows = [row for path in (cubic, quintic) for row in samples(path, schedule(path, limits), repeats)]
     planned = planning(limits, repeats)
@@ -146,10 +146,10 @@ def mapped_inputs(mapping: Any, coefficients: Array, x: Array, u: Array) -> list
 # ---- plans ---------------------------------------------------------------------------------------------------
 
 
-def planning(limits: Limits, repeats: int) -> list[dict[str, Any]]:
+def planning(limits: LineLimits, repeats: int) -> list[dict[str, Any]]:
     """From segments to a schedule, and under more limits than the paper's; minimum time beside it."""
-    more = Limits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL)
-    all_of_them = Limits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL, JOINT_LIMITS)
+    more = LineLimits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL)
+    all_of_them = LineLimits(limits.speed, limits.acceleration, limits.jerk, CENTRIPETAL, JOINT_LIMITS)
 
     def limited() -> tuple[SmoothPath, Any, Schedule]:
         path = smooth(example(), REMAINING)
@@ -167,7 +167,7 @@ def planning(limits: Limits, repeats: int) -> list[dict[str, Any]]:
     rows = [{"plan": name, "ms": 1e3 * least(work, repeats), "duration_s": 0.0} for name, work in works.items()]
     for row, found in zip(rows, (*(work() for work in list(works.values())[:2]), plan), strict=True):
         row["duration_s"] = found.duration
-    best = minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
+    best = plan_minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
     seconds = best.solution.seconds["build"] + best.solution.seconds["solve"]
     name = "the same in minimum time, optimal control"
     return [*rows, {"plan": name, "ms": 1e3 * seconds, "duration_s": best.duration}]
@@ -186,7 +186,7 @@ def random_task(segments: int, seed: int = SEED) -> paths.Path:
 
 def long_path(segments: int) -> dict[str, Any]:
     """A random task blended, scheduled under a centripetal limit and sampled every ms; memory in a run of its own."""
-    limits = Limits(TASK_SPEED, TASK_ACCELERATION, JERK, TASK_ACCELERATION)
+    limits = LineLimits(TASK_SPEED, TASK_ACCELERATION, JERK, TASK_ACCELERATION)
 
     def work() -> tuple[list[float], Array, Schedule]:
         times = [time.perf_counter()]

@@ -17,7 +17,7 @@ import trimesh
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, link_frames
 from models.arrays import Array
 from ocp import Collocation, ProblemError, Solution, solve
-from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem
 from scripts import view
 from scripts.robots.frames import TIP, frames_along, inertia_box
 from scripts.viewer.meshes import find_mesh, read_shapes
@@ -73,7 +73,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def planned(machine: Machine) -> Solution:
-    problem = minimum_velocity(machine, (0.1, -0.1), (3, 4), START, 1.5)
+    problem = minimum_velocity_problem(machine, (0.1, -0.1), (3, 4), START, 1.5)
     return solve(problem, Collocation(intervals=6, degree=3))
 
 
@@ -183,7 +183,7 @@ def test_joints_are_matched_by_name_whatever_their_order_in_the_plan(folder: Pat
 def test_a_saved_plan_with_its_robot_is_still_a_solution(folder: Path) -> None:
     solution = Solution.load(folder / "fixed.npz")
     robot = Robot.from_urdf(folder / "arm.urdf", **OPTIONS)
-    problem = minimum_velocity(FixedBase(robot, **MOUNT), (0.1, -0.1), (3, 4), START, 1.5)
+    problem = minimum_velocity_problem(FixedBase(robot, **MOUNT), (0.1, -0.1), (3, 4), START, 1.5)
     assert solution.audit(problem)["integration error, relative"].passed
     assert read_record(folder / "fixed.npz")["joint_names"] == ["shoulder", "elbow", "wrist"]
     assert read_record(folder / "bare.npz") == {}

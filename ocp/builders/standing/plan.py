@@ -65,11 +65,11 @@ __all__ = [
     "Pinned",
     "Weights",
     "motion_cost",
-    "standing_plan",
+    "standing_problem",
 ]
 
 
-def standing_plan(
+def standing_problem(
     machine: Standing,
     tip_path: Path,
     rows: Sequence[int],
@@ -127,7 +127,7 @@ def standing_plan(
     zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
     if not (isinstance(machine, Standing) and isinstance(weights, Weights) and isinstance(limits, Limits)):
         given = [type(one).__name__ for one in (machine, weights, limits)]
-        raise ProblemError(f"standing_plan takes a Standing machine, Weights and Limits, not {', '.join(given)}")
+        raise ProblemError(f"standing_problem takes a Standing machine, Weights and Limits, not {', '.join(given)}")
     _check_options(control=control, along=along, tip_level=tip_level, start=start, end=end)
     if tip_level == "acceleration" and control == "jerk":
         raise ProblemError("tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'")
@@ -269,7 +269,7 @@ def _rest(machine: Standing, rows: list[int], joints: Array, end: str, tip_level
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """The cost of standing_plan for a sampled motion, by the trapezoidal rule; without the weight of jerks."""
+    """The cost of standing_problem for a sampled motion, by the trapezoidal rule; without the weight of jerks."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)

@@ -83,7 +83,7 @@ def check_loads(
 
     Args:
         machine, joints, wrenches: At the start.
-        zmp, least_force, bounds: What may be, see standing_plan; bounds as Limits.bounds.
+        zmp, least_force, bounds: What may be, see standing_problem; bounds as Limits.bounds.
         tip: Rows T and values a of what the tip asks of them, T q'' = a; None where it asks nothing.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import SmoothPath, gamma, smooth
 from models.paths.blends import polynomial
-from ocp.builders.timing import Fastest, minimum_time
-from ocp.schedule import Limits, Schedule, joint_motion, peak_acceleration, schedule
+from ocp.builders.timing import Fastest, plan_minimum_time
+from ocp.schedule import LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from scripts.drawing import Row
 from scripts.papers.blend.example import (
     ARM,
@@ -85,12 +85,12 @@ def compute() -> Results:
     """All of it, in under ten seconds."""
     cubic, quintic = smooth(example(), REMAINING, kind="cubic"), smooth(example(), REMAINING, kind="quintic")
     acceleration = peak_acceleration(MEAN_ACCELERATION, SPEED, JERK)
-    mean = schedule(cubic, Limits(SPEED, acceleration, JERK))
-    peak = schedule(cubic, Limits(SPEED, MEAN_ACCELERATION, JERK))
+    mean = schedule(cubic, LineLimits(SPEED, acceleration, JERK))
+    peak = schedule(cubic, LineLimits(SPEED, MEAN_ACCELERATION, JERK))
     along, along_quintic = scara_along(ARM, cubic, ELBOW), scara_along(ARM, quintic, ELBOW)
-    line = Limits(SPEED, acceleration, JERK)
-    bent = Limits(SPEED, acceleration, JERK, CENTRIPETAL)
-    whole = Limits(SPEED, acceleration, JERK, CENTRIPETAL, JOINT_LIMITS)
+    line = LineLimits(SPEED, acceleration, JERK)
+    bent = LineLimits(SPEED, acceleration, JERK, CENTRIPETAL)
+    whole = LineLimits(SPEED, acceleration, JERK, CENTRIPETAL, JOINT_LIMITS)
     cases = {
         "cubic, line speed": (cubic, along, line),
         "cubic, + centripetal": (cubic, along, bent),
@@ -103,7 +103,7 @@ def compute() -> Results:
     for name, (path, joints, limits) in bar:
         bar.set_description(f"minimum time, {name}")
         plan = schedule(path, limits, joints=joints)
-        plans[name] = Plan(path, joints, plan, minimum_time(path, limits, joints, guess=plan))
+        plans[name] = Plan(path, joints, plan, plan_minimum_time(path, limits, joints, guess=plan))
     return Results(
         cubic,
         quintic,

@@ -16,7 +16,7 @@ from models.cts.rig import INCH, Rig, Tunnel, inverse
 from models.cts.roll import index_harmonics
 from models.shapes.capsules import Box
 from ocp import Collocation, solve
-from ocp.builders.cts import roll_plan
+from ocp.builders.cts import roll_problem
 from scripts.drawing import COLORS, DASHES, sheet
 
 __all__ = ["RollPlan", "draw_plan", "plan_summary", "plan_sweep"]
@@ -68,7 +68,7 @@ def obstacle() -> Surroundings:
 
 def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
     """Solve and audit the plan; evaluate it and the roll of each target by itself on a fine grid."""
-    problem = roll_plan(
+    problem = roll_problem(
         rig,
         tunnel,
         targets,

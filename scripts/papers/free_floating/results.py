@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from models import FreeFloating, paper_example
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.local.rates import resolve
 from scripts.drawing import Row
 from scripts.papers.free_floating import extremals, false_optima
@@ -102,8 +102,8 @@ class Results:
 
 
 def problem(horizon: float = HORIZON, **settings: Any) -> Problem:
-    """Problem (27) for the paper's example; the settings are those of `minimum_velocity`."""
-    return minimum_velocity(paper_example(), TIP_VELOCITY, ROWS, START_JOINTS, horizon, **settings)
+    """Problem (27) for the paper's example; the settings are those of `minimum_velocity_problem`."""
+    return minimum_velocity_problem(paper_example(), TIP_VELOCITY, ROWS, START_JOINTS, horizon, **settings)
 
 
 def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:

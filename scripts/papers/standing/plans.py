@@ -20,7 +20,7 @@ from ocp.builders.standing.plan import (
     Limits,
     Pinned,
     Weights,
-    standing_plan,
+    standing_problem,
 )
 from scripts.drawing import Row
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, machine, spring, start_tip, table_path
@@ -144,10 +144,10 @@ def plan_problem(request: Request) -> Problem:
         settings["tip_level"] = "acceleration"
     if request.task == "minimum_time":
         settings |= {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter"}
-        return standing_plan(machine(), lift_path(), ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
+        return standing_problem(machine(), lift_path(), ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
     table = 1 if request.task == "table1" else 2
     settings |= {"limits": LIMITS, "external": spring() if table == 2 else None}
-    return standing_plan(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
+    return standing_problem(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
 
 
 def method(transcription: Transcription, intervals: int) -> Any:

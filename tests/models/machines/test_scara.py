@@ -17,7 +17,7 @@ from models.machines.scara import Scara
 from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Arc, Line, Path, smooth
 from ocp import ProblemError
-from ocp.schedule import JointLimits, Limits, schedule
+from ocp.schedule import JointLimits, LineLimits, schedule
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
 
 few = settings(max_examples=40)
@@ -169,4 +169,4 @@ def test_the_singular_column_is_found_between_the_samples_of_a_long_path() -> No
 def test_a_schedule_of_a_path_that_ends_at_the_singular_reach_is_a_named_error() -> None:
     arm = along((0.3, 0, 0), (0.8, 0, 0), clearance=0.0)
     with pytest.raises(ProblemError, match=r"joint 'shoulder' is \w+, not finite, at 0\.5 m, the arm is singular"):
-        schedule(arm.path, Limits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 20.0)), joints=arm)
+        schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 20.0)), joints=arm)

@@ -26,7 +26,7 @@ from models.paths import (
 )
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
-from ocp.schedule import Limits, SpeedProfile, peak_acceleration, schedule
+from ocp.schedule import LineLimits, SpeedProfile, peak_acceleration, schedule
 from tests.models.paths.task_paths import random_path
 from tests.models.paths.test_paths import example
 
@@ -50,7 +50,7 @@ def errors(mapping: Any, blend: Blend, distances: NDArray[Any], period: float) -
 
 
 def profile(path: SmoothPath) -> SpeedProfile:
-    return schedule(path, Limits(1.0, peak_acceleration(5.0, 1.0, 200.0), 200.0)).profile
+    return schedule(path, LineLimits(1.0, peak_acceleration(5.0, 1.0, 200.0), 200.0)).profile
 
 
 def inside(blend: Blend, plan: SpeedProfile, period: float) -> NDArray[np.float64]:
@@ -175,7 +175,7 @@ def test_the_path_as_a_function_is_the_path(seed: int) -> None:
 
 def test_geometry_mappings_and_time_generate_c_that_agrees(tmp_path: File) -> None:
     path = smooth(random_path(np.random.default_rng(4), 4, turns=True), 0.05)
-    plan = schedule(path, Limits(0.5, 5.0, 200.0, centripetal=2.0))
+    plan = schedule(path, LineLimits(0.5, 5.0, 200.0, centripetal=2.0))
     blend = path.blend(0)
     step = [0.01 * blend.length] * 2
     state = [0.1, 0.11]

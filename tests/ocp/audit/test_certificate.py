@@ -22,7 +22,7 @@ from ocp import (
     certificate,
     solve,
 )
-from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, van_der_pol
@@ -42,7 +42,7 @@ def three() -> tuple[Problem, dict[str, Solution]]:
 
 def paper(damping: float = 0.005, formulation: Any = "rates") -> Problem:
     start = np.deg2rad([45.0, 60.0, -60.0])
-    return minimum_velocity(
+    return minimum_velocity_problem(
         paper_example(), [-1, -1], [3, 4], start, 5.0, guess_damping=damping, formulation=formulation
     )
 

@@ -13,7 +13,7 @@ from models.machines.standing_motion import StandingMotion, standing_motion
 from models.papers import STANDING_STARTS, standing_example
 from models.robot.dynamics import Wrench
 from ocp import Problem, Solution
-from ocp.builders.standing.plan import FreeTime, Limits, Weights, standing_plan
+from ocp.builders.standing.plan import FreeTime, Limits, Weights, standing_problem
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm
 from tests.models.robot.trees import Array
 
@@ -56,14 +56,14 @@ def spring() -> External:
 
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
     settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
-    return standing_plan(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
+    return standing_problem(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
 
 
 def lift_plan(zmp: Any, **changes: Any) -> Problem:
     """The tip 0.8 m straight up in the least time."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}
-    return standing_plan(
+    return standing_problem(
         machine(), lambda s: [y, z + 0.8 * s], ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), zmp=zmp, **settings
     )
 

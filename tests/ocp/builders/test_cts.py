@@ -14,7 +14,7 @@ from models.cts.rig import HOME, INCH, Rig, inverse
 from models.papers import reference_rig, reference_tunnel
 from models.shapes.capsules import Box
 from ocp import Collocation, ProblemError, Solution, solve
-from ocp.builders.cts import least_course, roll_plan, spline_targets
+from ocp.builders.cts import least_course, roll_problem, spline_targets
 from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
@@ -33,7 +33,7 @@ def targets_at(t: Any) -> Any:
 
 
 def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Solution:
-    return solve(roll_plan(rig, TUNNEL, falling, HORIZON, symbols=ca.SX, **options), method)
+    return solve(roll_problem(rig, TUNNEL, falling, HORIZON, symbols=ca.SX, **options), method)
 
 
 def test_without_weights_on_motion_the_plan_is_the_best_roll_of_each_target() -> None:
@@ -73,7 +73,7 @@ def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
     t = np.linspace(0, HORIZON, 101)
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(t), np.zeros((1, 101)))[0]
     assert np.array(gaps.map(101)(free)).min() < -0.02  # in its midst
-    problem = roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, clearance=0.01)
+    problem = roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, clearance=0.01)
     found = solve(problem, SMOOTH)
     x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
     joints = ca.Function("j", [x, phi], [inverse(RIG, x, phi, HOME)[0]]).map(len(found.t))
@@ -129,7 +129,7 @@ def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
         ({"clearance": np.nan}, "clearance nan"),
     ):
         with pytest.raises(ProblemError, match=name):
-            roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, **options)  # type: ignore[arg-type]
+            roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, **options)  # type: ignore[arg-type]
 
 
 def joints_along(rig: Rig, found: Solution) -> Any:
@@ -155,20 +155,20 @@ def test_a_roll_that_a_joint_limit_forbids_all_the_way_is_gone_round() -> None:
 
 def test_a_table_of_targets_is_followed_through_its_spline() -> None:
     times = np.linspace(0, HORIZON, 41)
-    problem = roll_plan(RIG, TUNNEL, spline_targets(times, targets_at(times).T), HORIZON)
+    problem = roll_problem(RIG, TUNNEL, spline_targets(times, targets_at(times).T), HORIZON)
     table = solve(problem, Collocation(intervals=25, degree=3))
     assert table.cost == pytest.approx(plan().cost, rel=1e-6)
 
 
 def test_what_cannot_be_planned_is_named() -> None:
     with pytest.raises(ProblemError, match="no roll reaches the target at 0 s"):
-        roll_plan(RIG, TUNNEL, lambda time: [9.0, 9.0, 9.0, 0.0, 0.0], HORIZON, symbols=ca.SX)
+        roll_problem(RIG, TUNNEL, lambda time: [9.0, 9.0, 9.0, 0.0, 0.0], HORIZON, symbols=ca.SX)
     with pytest.raises(ProblemError, match="start_roll nan"):
-        roll_plan(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, start_roll=np.nan)
+        roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, start_roll=np.nan)
     with pytest.raises(ProblemError, match="horizon"):
-        roll_plan(RIG, TUNNEL, falling, 0.0)
+        roll_problem(RIG, TUNNEL, falling, 0.0)
     with pytest.raises(ProblemError, match="rate_limit"):
-        roll_plan(RIG, TUNNEL, falling, HORIZON, rate_limit=-1.0)
+        roll_problem(RIG, TUNNEL, falling, HORIZON, rate_limit=-1.0)
     with pytest.raises(ProblemError, match="times"):
         spline_targets([0, 1, 1, 2], np.zeros((4, 5)))
     with pytest.raises(ProblemError, match="row 1"):

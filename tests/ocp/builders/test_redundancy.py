@@ -10,7 +10,7 @@ import pytest
 import models
 from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_example, planar_chain
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.errors import ProblemError
 from ocp.local.rates import resolve
 from tests.models.robot.trees import numeric, seven_joint_arm
@@ -21,7 +21,7 @@ ARM_START = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
 
 
 def paper_problem(**changes: Any) -> Problem:
-    return minimum_velocity(paper_example(), (-1.0, -1.0), (3, 4), PAPER_START, 5.0, **changes)
+    return minimum_velocity_problem(paper_example(), (-1.0, -1.0), (3, 4), PAPER_START, 5.0, **changes)
 
 
 def slides(**limits: float) -> FixedBase:
@@ -126,7 +126,7 @@ def test_an_arm_on_a_fixed_base_does_better_than_instantly(formulation: Any) -> 
         return [-0.3 * ca.cos(time), 0.3 * ca.sin(2 * time)]
 
     start = np.deg2rad([30.0, 40.0, 50.0])
-    problem = minimum_velocity(machine, velocity, (3, 4), start, 3.0, formulation=formulation)
+    problem = minimum_velocity_problem(machine, velocity, (3, 4), start, 3.0, formulation=formulation)
     solution = solve(problem, Collocation(intervals=20, degree=3))
     assert list(solution.states) == ["joints"]
     audit = solution.audit()
@@ -142,7 +142,7 @@ def test_both_formulations_have_one_optimum_on_a_fixed_base() -> None:
     start = np.deg2rad([30.0, 40.0, 50.0])
     costs = [
         solve(
-            minimum_velocity(machine, (-0.2, 0.1), (3, 4), start, 3.0, formulation=formulation),
+            minimum_velocity_problem(machine, (-0.2, 0.1), (3, 4), start, 3.0, formulation=formulation),
             Collocation(intervals=20, degree=3, scheme="legendre"),
         ).cost
         for formulation in ("rates", "null_space")
@@ -154,7 +154,7 @@ def test_both_formulations_have_one_optimum_on_a_fixed_base() -> None:
 def test_a_spatial_seven_joint_arm_on_a_floating_base_is_planned(rows: tuple[int, ...], horizon: float) -> None:
     machine = FreeFloating(seven_joint_arm(), "spatial")
     velocity = np.array([0.02, -0.03, 0.04, 0.1, -0.1, 0.05])[list(rows)]
-    problem = minimum_velocity(machine, velocity, rows, ARM_START, horizon)
+    problem = minimum_velocity_problem(machine, velocity, rows, ARM_START, horizon)
     solution = solve(problem, Collocation(intervals=12, degree=3, scheme="legendre"))
     audit = solution.audit()
     assert audit.passed, str(audit)
@@ -165,7 +165,7 @@ def test_a_spatial_seven_joint_arm_on_a_floating_base_is_planned(rows: tuple[int
 
 def test_two_slides_share_the_way() -> None:
     """Closed form: each moves at v / 2; cost = integral of v^2 / 4."""
-    problem = minimum_velocity(slides(), lambda t: [ca.sin(t)], (3,), (0.0, 0.0), 2.0)
+    problem = minimum_velocity_problem(slides(), lambda t: [ca.sin(t)], (3,), (0.0, 0.0), 2.0)
     solution = solve(problem, Collocation(intervals=10, degree=3, scheme="legendre"))
     at = collocated(solution)
     np.testing.assert_allclose(solution["rates"][at], np.sin(solution.t[at])[:, None] / 2 * [1.0, 1.0], atol=1e-8)
@@ -181,18 +181,18 @@ def test_limits_of_the_robot_bound_the_plan() -> None:
     method = Collocation(intervals=10, degree=3)
     for machine, share in ((slides(upper=0.5), 0.25), (slides(velocity=0.3), 0.3)):
         for formulation in ("rates", "null_space"):
-            problem = minimum_velocity(machine, (1.0,), (3,), (0.0, 0.0), 2.0, formulation=formulation)
+            problem = minimum_velocity_problem(machine, (1.0,), (3,), (0.0, 0.0), 2.0, formulation=formulation)
             solution = solve(problem, method)
             assert solution.cost == pytest.approx(share**2 + (1 - share) ** 2, abs=1e-6)
             assert (solution["joints"][:, 0] <= 2 * share + 1e-6).all()
-        free = solve(minimum_velocity(machine, (1.0,), (3,), (0.0, 0.0), 2.0, limits=False), method)
+        free = solve(minimum_velocity_problem(machine, (1.0,), (3,), (0.0, 0.0), 2.0, limits=False), method)
         assert free.cost == pytest.approx(0.5, abs=1e-8)
 
 
 def test_a_velocity_from_an_interpolant_needs_mx_symbols_and_is_met() -> None:
     knots = np.linspace(0, 2, 21)
     table = ca.interpolant("table", "bspline", [knots], np.sin(knots))
-    problem = minimum_velocity(slides(), lambda t: table(t), (3,), (0.0, 0.0), 2.0, symbols=ca.MX)
+    problem = minimum_velocity_problem(slides(), lambda t: table(t), (3,), (0.0, 0.0), 2.0, symbols=ca.MX)
     solution = solve(problem, Collocation(intervals=10, degree=3))
     assert solution.cost == pytest.approx((2.0 - np.sin(4.0) / 2) / 8, abs=1e-5)
 
@@ -219,10 +219,10 @@ def test_the_guess_is_the_damped_local_motion() -> None:
 def test_a_singular_start_is_planned_with_rates_and_refused_in_the_null_space_form() -> None:
     """A stretched arm can swing sideways: v is in the range of G although G has lost rank."""
     machine = FixedBase(planar_chain([1.0, 1.0, 1.0], [1.0] * 3))
-    problem = minimum_velocity(machine, lambda t: [-3 * ca.sin(t), 3 * ca.cos(t)], (3, 4), np.zeros(3), 0.2)
+    problem = minimum_velocity_problem(machine, lambda t: [-3 * ca.sin(t), 3 * ca.cos(t)], (3, 4), np.zeros(3), 0.2)
     assert problem.declared.path["task"].size == 2
     with pytest.raises(ProblemError, match="singular at the start joints"):
-        minimum_velocity(machine, (0.0, 1.0), (3, 4), np.zeros(3), 0.2, formulation="null_space")
+        minimum_velocity_problem(machine, (0.0, 1.0), (3, 4), np.zeros(3), 0.2, formulation="null_space")
 
 
 @pytest.mark.parametrize(
@@ -250,7 +250,7 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
         **changes,
     }
     with pytest.raises(ProblemError, match=message):
-        minimum_velocity(paper_example(), **arguments)
+        minimum_velocity_problem(paper_example(), **arguments)
 
 
 def test_a_start_outside_the_limits_is_refused_by_the_joints_name() -> None:
@@ -258,5 +258,5 @@ def test_a_start_outside_the_limits_is_refused_by_the_joints_name() -> None:
     second = dataclasses.replace(robot.joints[1], lower=-1.0, upper=1.0)
     machine = FixedBase(dataclasses.replace(robot, joints=(robot.joints[0], second)))
     with pytest.raises(ProblemError, match=r"'joint2' starts at 1.5, outside its limits -1 .. 1"):
-        minimum_velocity(machine, (0.1,), (3,), (0.3, 1.5), 1.0)
-    minimum_velocity(machine, (0.1,), (3,), (0.3, 1.5), 1.0, limits=False)
+        minimum_velocity_problem(machine, (0.1,), (3,), (0.3, 1.5), 1.0)
+    minimum_velocity_problem(machine, (0.1,), (3,), (0.3, 1.5), 1.0, limits=False)

@@ -10,7 +10,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Machine, planar_chain
 from ocp import Collocation, solve
-from ocp.builders.redundancy import minimum_velocity, plan_minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.local.rates import resolve
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask
@@ -62,7 +62,9 @@ def check(machine: Machine, asked: dict[str, Any], intervals: int) -> None:
     assert np.abs(stray).max() < 1e-6
     assert local.stopped is not None or plan.cost < local.cost[-1]
     again = solve(
-        minimum_velocity(machine, **asked), Collocation(intervals=4 * plan.method["intervals"], degree=4), guess=plan
+        minimum_velocity_problem(machine, **asked),
+        Collocation(intervals=4 * plan.method["intervals"], degree=4),
+        guess=plan,
     )
     assert plan.cost == pytest.approx(again.cost, rel=1e-4)
     joints = plan.at(np.linspace(0, plan.horizon, 2001))["joints"]  # no jump

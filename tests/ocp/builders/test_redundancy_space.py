@@ -13,7 +13,7 @@ from models import FixedBase, FreeFloating, center_of_mass, paper_example, plana
 from models.machines.machine import with_tip
 from models.paths import Path, smooth
 from ocp import Collocation, solve
-from ocp.builders.redundancy import minimum_velocity, plan_minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.errors import ProblemError
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.rates import resolve
@@ -48,7 +48,7 @@ def test_a_space_manipulator_follows_a_pose_line_optimally(momentum: Any) -> Non
     line = line_from(machine, BASE, MANIPULATOR_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.3, 10.0)
     task = TipTask(position=line.position, orientation=line.orientation)
     start: dict[str, Any] = {"start_joints": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
-    solution = solve(minimum_velocity(machine, task=task, **start), FINE)
+    solution = solve(minimum_velocity_problem(machine, task=task, **start), FINE)
     audit = solution.audit()
     assert audit.passed, str(audit)
     assert sum(values.shape[1] for values in solution.states.values()) == 14
@@ -81,7 +81,7 @@ def test_a_cyclic_plan_closes_the_joints_of_an_arm(kind: str) -> None:
     }
     task = TipTask(position=circle(position, 0.1, 6.0), **aims[kind])
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0}
-    solution = solve(minimum_velocity(panda(), cyclic=True, **start), FINE)
+    solution = solve(minimum_velocity_problem(panda(), cyclic=True, **start), FINE)
     audit = solution.audit()
     assert audit.passed, str(audit)
     assert np.abs(solution["joints"][-1] - solution["joints"][0]).max() <= 1e-8
@@ -96,8 +96,8 @@ def test_a_cyclic_plan_may_choose_where_to_start() -> None:
     task = TipTask(position=circle(position, 0.1, 6.0))
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0, "cyclic": True}
     method = Collocation(intervals=30, degree=4)
-    fixed = solve(minimum_velocity(panda(), **start), method)
-    free = solve(minimum_velocity(panda(), free_start=True, **start), method)
+    fixed = solve(minimum_velocity_problem(panda(), **start), method)
+    free = solve(minimum_velocity_problem(panda(), free_start=True, **start), method)
     audit = free.audit()
     assert audit.passed, str(audit)
     assert free.cost < fixed.cost - 1e-4
@@ -110,7 +110,7 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     task = TipTask(
         position=lambda t: ca.vertcat(position[0], position[1] + 0.05 * t, position[2]), direction=rotation[:, 2]
     )
-    problem = minimum_velocity(ur5(), task=task, horizon=2.0, free_start=True)
+    problem = minimum_velocity_problem(ur5(), task=task, horizon=2.0, free_start=True)
     solution = solve(problem, Collocation(intervals=15, degree=4))
     assert solution.audit().passed
     assert largest_error(ur5(), task, solution) < 1e-6
@@ -119,7 +119,7 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     asked: dict[str, Any] = {"tip_velocity": (-0.2, 0.1), "rows": (3, 4), "start_joints": start, "horizon": 3.0}
     costs = []
     for free in (False, True):
-        plan = solve(minimum_velocity(machine, free_start=free, **asked), Collocation(intervals=15))
+        plan = solve(minimum_velocity_problem(machine, free_start=free, **asked), Collocation(intervals=15))
         assert plan.audit().passed
         np.testing.assert_allclose(pose(machine, (), plan["joints"][0])[1], pose(machine, (), start)[1], atol=1e-8)
         costs.append(plan.cost)
@@ -154,7 +154,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
     _, position = pose(machine, BASE, PANDA_START)
     task = TipTask(position=circle(position, 0.05, 6.0))
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0, "start_base": BASE}
-    solution = solve(minimum_velocity(machine, cyclic=True, **start), Collocation(intervals=20, degree=4))
+    solution = solve(minimum_velocity_problem(machine, cyclic=True, **start), Collocation(intervals=20, degree=4))
     audit = solution.audit()
     assert audit.passed, str(audit)
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
@@ -166,11 +166,11 @@ def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base(
     _, position = pose(machine, BASE, PANDA_START)
     asked: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
     with pytest.raises(ProblemError, match="the linear momentum moves the centre of mass"):
-        minimum_velocity(machine, task=TipTask(position=circle(position, 0.05, 4.0)), **asked)
+        minimum_velocity_problem(machine, task=TipTask(position=circle(position, 0.05, 4.0)), **asked)
     frame = machine.world_from_base(BASE)
     beside = numeric(frame.rotation).T @ (position - numeric(frame.position).ravel())
     task = TipTask(position=circle(beside, 0.05, 4.0), relative_to="satellite")
-    solution = solve(minimum_velocity(machine, task=task, **asked), Collocation(intervals=20, degree=4))
+    solution = solve(minimum_velocity_problem(machine, task=task, **asked), Collocation(intervals=20, degree=4))
     assert solution.audit().passed
     assert largest_error(machine, task, solution) < 1e-6
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
@@ -181,13 +181,13 @@ def test_cyclic_tasks_that_are_open_are_refused() -> None:
     asked: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 2.0, "cyclic": True}
     open_path = TipTask(position=lambda time: ca.vertcat(position[0], position[1], position[2] + 0.01 * time))
     with pytest.raises(ProblemError, match=r"not closed: it ends 0\.02 "):
-        minimum_velocity(panda(), task=open_path, **asked)
+        minimum_velocity_problem(panda(), task=open_path, **asked)
     with pytest.raises(ProblemError, match=r"not closed: it ends 0\.2 "):
-        minimum_velocity(panda(), (0.1,), (4,), **asked)
+        minimum_velocity_problem(panda(), (0.1,), (4,), **asked)
     with pytest.raises(ProblemError, match=r"not closed: it ends 0\.6 "):
-        minimum_velocity(panda(), (0, 0, 0.3), (0, 1, 2), **asked)
+        minimum_velocity_problem(panda(), (0, 0, 0.3), (0, 1, 2), **asked)
     turning = TipTask(orientation=rotation, position=position, rows=(0, 1, 2))
-    minimum_velocity(panda(), task=turning, **asked)
+    minimum_velocity_problem(panda(), task=turning, **asked)
 
 
 def test_a_singular_passage_of_the_pseudo_inverse_is_planned_around() -> None:
@@ -206,7 +206,7 @@ def test_a_path_out_of_reach_is_refused_by_name_and_its_guess_is_whole() -> None
     machine = FixedBase(planar_chain([1.0, 0.5, 0.5], [1.0] * 3))
     start = np.deg2rad([60.0, -100.0, -20.0])
     asked: dict[str, Any] = {"tip_velocity": (1.0, 0.0), "rows": (3, 4), "start_joints": start, "horizon": 3.0}
-    problem = minimum_velocity(machine, guess_damping=1e-9, **asked)
+    problem = minimum_velocity_problem(machine, guess_damping=1e-9, **asked)
     for variable in (problem.declared.states["joints"], problem.declared.controls["rates"]):
         assert np.isfinite([variable.guess(time) for time in np.linspace(0, 3, 31)]).all()
     with pytest.raises(Unreachable, match=r"at 1\.\d+ s no joint positions"):
@@ -225,7 +225,7 @@ def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
         TipTask(rows=(0, 1, 2), velocity=(0, 0, 0), link="satellite"),
     ]
     asked: dict[str, Any] = {"task": task, "start_joints": start, "horizon": 3.0}
-    solution = solve(minimum_velocity(machine, **asked), Collocation(intervals=10, degree=4))
+    solution = solve(minimum_velocity_problem(machine, **asked), Collocation(intervals=10, degree=4))
     audit = solution.audit()
     assert audit.passed, str(audit)
     assert largest_error(machine, task, solution) < 1e-6
@@ -242,12 +242,12 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
     asked: dict[str, Any] = {"task": task, "start_joints": UR5_START, "horizon": horizon}
     local = resolve(ur5(), **asked)
     with pytest.raises(ProblemError, match=r"pass symbols=casadi\.MX"):
-        minimum_velocity(ur5(), **asked)
+        minimum_velocity_problem(ur5(), **asked)
     edges = np.asarray(path.bounds) / path.length
     pieces = [np.linspace(a, b, 7)[:-1] for a, b in pairwise(edges)]
     mesh = (*np.concatenate(pieces).tolist(), 1.0)
     method = Collocation(intervals=len(mesh) - 1, degree=4, mesh=mesh)
-    solution = solve(minimum_velocity(ur5(), symbols=ca.MX, **asked), method)
+    solution = solve(minimum_velocity_problem(ur5(), symbols=ca.MX, **asked), method)
     audit = solution.audit()
     assert audit.passed, str(audit)
     assert largest_error(ur5(), task, solution) < 1e-6
@@ -262,11 +262,13 @@ def test_weights_and_momentum_have_one_optimum_in_both_formulations() -> None:
     costs = []
     names: tuple[Any, ...] = ("rates", "null_space")
     for name in names:
-        problem = minimum_velocity(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=weights, formulation=name)
+        problem = minimum_velocity_problem(
+            machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=weights, formulation=name
+        )
         solution = solve(problem, Collocation(intervals=20, degree=4))
         assert solution.audit().passed
         costs.append(solution.cost)
     assert costs[0] == pytest.approx(costs[1], abs=1e-9)
     assert costs[0] < resolve(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=weights).cost[-1]
     with pytest.raises(ProblemError, match="must be positive"):
-        minimum_velocity(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=(1.0, 0.0, 1.0))
+        minimum_velocity_problem(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=(1.0, 0.0, 1.0))

@@ -23,7 +23,7 @@ from ocp.builders.standing.plan import (
     Pinned,
     Weights,
     motion_cost,
-    standing_plan,
+    standing_problem,
 )
 from ocp.errors import ProblemError, SolveError
 from ocp.local.accelerations import Stabiliser, resolve_accelerations
@@ -194,7 +194,7 @@ def test_the_fastest_lift_does_not_depend_on_the_first_guess() -> None:
 
 def replace_horizon(seconds: float) -> Any:
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    return standing_plan(
+    return standing_problem(
         machine(),
         lambda s: [y, z + 0.8 * s],
         ROWS,
@@ -253,7 +253,7 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     offset = float(rise(0.0))
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "end": "free", "start": "free"}
-    problem = standing_plan(
+    problem = standing_problem(
         machine(),
         lambda t: ca.vertcat(y, z + rise(t) - offset),
         ROWS,
@@ -269,7 +269,7 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
 def test_a_spatial_arm_stands_where_the_local_method_tips() -> None:
     local = resolve_accelerations(arm(), arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, external=tool, step=2e-3).motion
     assert not local.stands
-    problem = standing_plan(
+    problem = standing_problem(
         arm(),
         arm_path,
         (3, 4, 5),
@@ -303,7 +303,7 @@ def test_six_joints_stand_where_the_local_method_tips() -> None:
     assert local.index.min() < -0.01
     limits = Limits(friction=0.7, acceleration=100.0)
     settings: dict[str, Any] = {"zmp": InFoot(0.005), "external": six_tool, "limits": limits}
-    problem = standing_plan(six(), six_path, (3, 4, 5), SIX_START, 1.0, tip_level="acceleration", **settings)
+    problem = standing_problem(six(), six_path, (3, 4, 5), SIX_START, 1.0, tip_level="acceleration", **settings)
     motion = sampled(six(), points(problem, 12), six_tool, (3, 4, 5))
     assert motion.stands
     assert motion.index.min() >= 0
@@ -335,7 +335,7 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
 def test_other_machines_hold_tip_and_zero_moment_point_between_the_points(size: int) -> None:
     standing, path = planar_machine(size), planar_path(size)
     for method, level in ((MultipleShooting(80), "position"), (Collocation(30, scheme="legendre"), "acceleration")):
-        problem = standing_plan(
+        problem = standing_problem(
             standing,
             path,
             ROWS,
@@ -376,7 +376,7 @@ FREELY = Weights(joint_limits=0.0)  # nothing but the limits keeps the joints fr
 def test_a_tightened_plan_holds_its_limits_between_the_points(
     standing: Standing, limits: Limits, weights: Any, level: Any
 ) -> None:
-    problem = standing_plan(
+    problem = standing_problem(
         standing,
         table_path(1),
         ROWS,
@@ -424,7 +424,7 @@ def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() 
 def test_another_machine_stands_by_plan_and_tips_by_pseudo_inverse_in_a_contact_simulation() -> None:
     standing, path = planar_machine(5), planar_path(5, 0.75, -0.2)
     start, zmp = planar_start(5), InFoot(0.02)
-    plan = sampled(standing, held(standing_plan(standing, path, ROWS, start, PLANAR_HORIZON, zmp=zmp), 60))
+    plan = sampled(standing, held(standing_problem(standing, path, ROWS, start, PLANAR_HORIZON, zmp=zmp), 60))
     times, tilts = replay(standing, plan)
     assert times[-1] > 0.99 * PLANAR_HORIZON
     assert tilts.max() < 1e-3
@@ -449,7 +449,7 @@ def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) ->
     """The tip led straight forward and up."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes}
-    return standing_plan(
+    return standing_problem(
         machine(), lambda s: [y + forward * s, z + up * s], ROWS, STANDING_STARTS[1], horizon, **settings
     )
 
@@ -472,7 +472,9 @@ def test_the_foot_that_the_error_asks_for_is_enough() -> None:
     def path(s: Any) -> list[Any]:
         return [y + 0.9 * s, z + 0.5 * s]
 
-    problem = standing_plan(longer, path, ROWS, STANDING_STARTS[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter")
+    problem = standing_problem(
+        longer, path, ROWS, STANDING_STARTS[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter"
+    )
     assert held(problem, 20).success
 
 
@@ -554,7 +556,7 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
         **changes,
     }
     with pytest.raises(ProblemError, match=message):
-        standing_plan(machine(), **arguments)
+        standing_problem(machine(), **arguments)
 
 
 def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
@@ -562,13 +564,13 @@ def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
     triangle = replace(arm(), support=Support([(-0.1, -0.1), (0.2, -0.1), (-0.1, 0.1828427)]))
     settings: dict[str, Any] = {"zmp": InFoot(0.09)}
     with pytest.raises(ProblemError, match=r"margin 0.09 m leaves no room .* 0.08\d"):
-        standing_plan(triangle, arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, **settings)
+        standing_problem(triangle, arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, **settings)
 
 
 def test_a_path_longer_than_the_arm_is_refused() -> None:
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     with pytest.raises(ProblemError, match=r"tip_path leads .* m away from the first joint .* at most 1.84 m long"):
-        standing_plan(
+        standing_problem(
             machine(), lambda s: [y + 2 * s, z], ROWS, STANDING_STARTS[1], 3.0, along="parameter", limits=LIMITS
         )
 

@@ -20,7 +20,7 @@ from ocp.builders.standing.plan import (
     Limits,
     Pinned,
     Weights,
-    standing_plan,
+    standing_problem,
 )
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
@@ -68,7 +68,7 @@ def resting_point(machine: Standing) -> Array:
 
 def planned(machine: Standing, path: Any, rows: Any, zmp: ZmpRule, **settings: Any) -> Solution:
     options = {"zmp": zmp, "weights": WEIGHTS, "tip_level": "acceleration", **settings}
-    problem = standing_plan(machine, path, rows, START, PLANAR_HORIZON, **options)
+    problem = standing_problem(machine, path, rows, START, PLANAR_HORIZON, **options)
     return solve(problem, Collocation(10, degree=3, scheme="legendre"))
 
 
@@ -116,7 +116,7 @@ def test_what_pushes_a_planar_machine_sideways_is_felt(zmp: ZmpRule) -> None:
     assert motion.foot_margin.min() > -1e-3
     with pytest.raises(ProblemError, match="zero moment point"):
         planned(machine, PATH, (4, 5), rule, external=push(60.0), limits=limits)
-    standing_plan(machine, PATH, (4, 5), START, PLANAR_HORIZON, zmp=Anywhere(), external=push(60.0), limits=limits)
+    standing_problem(machine, PATH, (4, 5), START, PLANAR_HORIZON, zmp=Anywhere(), external=push(60.0), limits=limits)
 
 
 @pytest.mark.parametrize("start", ["rest", "free"])
@@ -142,10 +142,10 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
 def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str | None) -> None:
     arguments = (planar_machine(SIZE), PATH, (4, 5), START, PLANAR_HORIZON)
     if message is None:
-        assert standing_plan(*arguments, zmp=zmp, tip_level="acceleration").name == "standing plan"
+        assert standing_problem(*arguments, zmp=zmp, tip_level="acceleration").name == "standing plan"
         return
     with pytest.raises(ProblemError, match=message):
-        standing_plan(*arguments, zmp=zmp)
+        standing_problem(*arguments, zmp=zmp)
 
 
 def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() -> None:
@@ -153,7 +153,7 @@ def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() 
     path = planar_path(3, 0.02, -0.02)
     arguments = (machine, path, (4, 5), start, PLANAR_HORIZON)
     with pytest.raises(ProblemError, match=r"2 rows and 1 of the zero moment point leave the 3 joints no freedom"):
-        standing_plan(*arguments, zmp=Pinned(), tip_level="acceleration")
+        standing_problem(*arguments, zmp=Pinned(), tip_level="acceleration")
     two, begin = planar_machine(2), planar_start(3)[:2]
     _, y, z = tip_at(two, begin)
 
@@ -162,8 +162,8 @@ def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() 
         return [y + share, z - share]
 
     with pytest.raises(ProblemError, match=r"2 rows leave the 2 joints no freedom .* tip_level='acceleration'"):
-        standing_plan(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere())
-    plan = standing_plan(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere(), tip_level="acceleration")
+        standing_problem(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere())
+    plan = standing_problem(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere(), tip_level="acceleration")
     solution = solve(plan, Collocation(10, degree=3, scheme="legendre"))
     np.testing.assert_allclose(solution["velocities"][-1], 0, atol=1e-5)
 
@@ -178,4 +178,4 @@ def test_a_singular_start_is_named_where_the_cost_needs_a_slope() -> None:
         return [y - share, z + share]
 
     with pytest.raises(ProblemError, match=r"start_joints \[0.0, .* singular there"):
-        standing_plan(machine, path, (4, 5), straight, PLANAR_HORIZON)
+        standing_problem(machine, path, (4, 5), straight, PLANAR_HORIZON)

@@ -20,7 +20,7 @@ from models import Robot, Standing, Wrench, rectangle, simplified, with_load
 from models.machines.standing_motion import StandingMotion
 from models.papers import standing_example
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_plan
+from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_problem
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from scripts.robots import pushing
@@ -242,7 +242,7 @@ def test_a_start_in_a_singular_posture_may_be_left() -> None:
     machine, start = standing_example(), np.array([np.pi / 2, 0.0, 2 * np.pi, 2 * np.pi, 0.0])
     _, y, z = numeric(machine.tip_pose((), start).position).ravel()
     limits = Limits(joints=False, velocity=6.0, acceleration=60.0)
-    problem = standing_plan(
+    problem = standing_problem(
         machine, lambda t: [y, z - 0.1 * gallery.smooth(t / 2.0)], (4, 5), start, 2.0, limits=limits
     )
     solution = solve(problem, Collocation(16, degree=3, scheme="legendre", control="held"))

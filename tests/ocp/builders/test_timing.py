@@ -12,9 +12,9 @@ from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import Line, Path, SmoothPath, smooth
 from ocp import Collocation, ProblemError, solve
 from ocp.builders import timing_tables as path_reference
-from ocp.builders.timing import Fastest, minimum_time, timing_problem
+from ocp.builders.timing import Fastest, minimum_time_problem, plan_minimum_time
 from ocp.builders.timing_tables import largest_demand, table
-from ocp.schedule import JointLimits, Limits, Schedule, joint_motion, peak_acceleration, schedule
+from ocp.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
 
 INTERVALS = 100
@@ -24,7 +24,7 @@ ACCELERATION = peak_acceleration(5.0, 1.0, 200.0)
 
 class Case(NamedTuple):
     path: SmoothPath
-    limits: Limits
+    limits: LineLimits
     joints: ScaraPath | None
     plan: Schedule
     best: Fastest
@@ -34,12 +34,14 @@ def straight(length: float = 1.0) -> SmoothPath:
     return smooth(Path((Line((0.0, 0.0, 0.0), (length, 0.0, 0.0)),)), 0.1)
 
 
-def random_path(seed: int) -> tuple[SmoothPath, Limits]:
+def random_path(seed: int) -> tuple[SmoothPath, LineLimits]:
     rng = np.random.default_rng(seed)
     points = np.cumsum(rng.normal(size=(int(rng.integers(3, 8)), 3)) * 10.0 ** rng.uniform(-3, 0), axis=0)
     path = smooth(Path.through(points), 0.3 * float(np.linalg.norm(np.diff(points, axis=0), axis=1).min()))
     speed, acceleration = path.length * 10 ** rng.uniform(-0.5, 0.5), path.length * 10 ** rng.uniform(-0.5, 1)
-    return path, Limits(speed, acceleration, path.length * 10 ** rng.uniform(0, 3), acceleration * rng.uniform(0.3, 2))
+    return path, LineLimits(
+        speed, acceleration, path.length * 10 ** rng.uniform(0, 3), acceleration * rng.uniform(0.3, 2)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +52,9 @@ def arm() -> ScaraPath:
 @pytest.fixture(scope="module")
 def limited(arm: ScaraPath) -> Case:
     """The paper's example with a SCARA's limits."""
-    limits = Limits(1.0, ACCELERATION, 200.0, 5.0, JOINTS)
+    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0, JOINTS)
     plan = schedule(arm.path, limits, joints=arm)
-    return Case(arm.path, limits, arm, plan, minimum_time(arm.path, limits, arm, guess=plan, intervals=INTERVALS))
+    return Case(arm.path, limits, arm, plan, plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=INTERVALS))
 
 
 def worst(case: Case) -> float:
@@ -87,20 +89,20 @@ def worst(case: Case) -> float:
 def test_a_line_takes_the_closed_form_whatever_the_guess(
     speed: float, acceleration: float, jerk: float, duration: float
 ) -> None:
-    path, limits = straight(), Limits(speed, acceleration, jerk)
+    path, limits = straight(), LineLimits(speed, acceleration, jerk)
     assert schedule(path, limits).duration == pytest.approx(duration, rel=1e-9)
-    best = minimum_time(path, limits, intervals=INTERVALS)
+    best = plan_minimum_time(path, limits, intervals=INTERVALS)
     assert best.duration == pytest.approx(duration, rel=1e-6)
     # a guess that knows nothing of the optimum: its nodes are elsewhere, and the jerk held on them costs time
-    slow = schedule(path, Limits(0.3, 1.0, 10.0))
-    other = minimum_time(path, limits, guess=slow, intervals=2 * INTERVALS)
+    slow = schedule(path, LineLimits(0.3, 1.0, 10.0))
+    other = plan_minimum_time(path, limits, guess=slow, intervals=2 * INTERVALS)
     assert slow.duration > 2 * duration
     assert -1e-6 < other.duration / duration - 1 < 1e-4
     assert other.demand < 1.001
 
 
 def test_without_a_jerk_limit_to_speak_of_a_line_takes_bang_bang_acceleration() -> None:
-    best = minimum_time(straight(), Limits(10.0, 5.0, 1e6), intervals=INTERVALS)
+    best = plan_minimum_time(straight(), LineLimits(10.0, 5.0, 1e6), intervals=INTERVALS)
     assert best.duration == pytest.approx(2 * np.sqrt(1 / 5.0), rel=1e-4)
     assert best.demand < 1.001
 
@@ -109,8 +111,8 @@ def test_without_a_jerk_limit_to_speak_of_a_line_takes_bang_bang_acceleration() 
 def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     def best(unit: float) -> float:
         corner = Path.through(unit * np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.5, 0.0)]))
-        limits = Limits(unit, 5 * unit, 200 * unit, 5 * unit)
-        return minimum_time(smooth(corner, 0.1 * unit), limits, intervals=50).duration
+        limits = LineLimits(unit, 5 * unit, 200 * unit, 5 * unit)
+        return plan_minimum_time(smooth(corner, 0.1 * unit), limits, intervals=50).duration
 
     assert best(scale) == pytest.approx(best(1.0), rel=1e-6)
 
@@ -144,13 +146,13 @@ def test_the_schedule_is_never_faster_than_the_optimum(limited: Case) -> None:
 
 
 def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_with_joints(path: Any, limits: Limits, *, joints: Any = None) -> Schedule:
+    def none_with_joints(path: Any, limits: LineLimits, *, joints: Any = None) -> Schedule:
         if limits.joints is not None:
             raise ProblemError("no schedule found")
         return schedule(path, limits, joints=joints)
 
     monkeypatch.setattr(path_reference, "schedule", none_with_joints)
-    other = minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
+    other = plan_minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
     # held jerks lose time in proportion to the intervals' width
     assert other.duration == pytest.approx(limited.best.duration, rel=3e-3)
     assert other.demand < 1.001
@@ -159,18 +161,18 @@ def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, mon
 @pytest.mark.parametrize("kind", ["cubic", "quintic"])
 def test_centripetal_acceleration_is_kept_where_the_curvature_jumps_too(kind: str) -> None:
     path = example(kind)
-    limits = Limits(1.0, ACCELERATION, 200.0, 5.0)
+    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0)
     plan = schedule(path, limits)
-    case = Case(path, limits, None, plan, minimum_time(path, limits, guess=plan, intervals=INTERVALS))
+    case = Case(path, limits, None, plan, plan_minimum_time(path, limits, guess=plan, intervals=INTERVALS))
     assert worst(case) < 1.001
     assert case.best.duration < plan.duration
 
 
 def test_speeds_of_segments_are_kept() -> None:
     path = example("quintic")
-    limits = Limits(np.array([1.0, 0.4, 0.7]), 5.0, 200.0)
+    limits = LineLimits(np.array([1.0, 0.4, 0.7]), 5.0, 200.0)
     plan = schedule(path, limits)
-    best = minimum_time(path, limits, guess=plan, intervals=INTERVALS)
+    best = plan_minimum_time(path, limits, guess=plan, intervals=INTERVALS)
     motion = best.schedule.sample(1e-3)
     assert largest_demand(path, limits, None, motion).max() < 1.001
     assert best.duration < plan.duration * (1 + 1e-6)
@@ -181,17 +183,17 @@ def test_speeds_of_segments_are_kept() -> None:
 def test_random_paths_are_solved_and_bracketed(seed: int) -> None:
     path, limits = random_path(seed)
     plan = schedule(path, limits)
-    best = minimum_time(path, limits, guess=plan, intervals=60)
+    best = plan_minimum_time(path, limits, guess=plan, intervals=60)
     assert worst(Case(path, limits, None, plan, best)) < 1.001
     # no motion beats the line alone, without its curvature
-    alone = schedule(path, Limits(limits.speed, limits.acceleration, limits.jerk)).duration
+    alone = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).duration
     assert alone * (1 - 1e-6) < best.duration < plan.duration * (1 + 1e-6)
 
 
 def test_tight_joint_limits_far_below_the_asked_speed_are_solved(arm: ScaraPath) -> None:
-    limits = Limits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0))
+    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0))
     plan = schedule(arm.path, limits, joints=arm)
-    case = Case(arm.path, limits, arm, plan, minimum_time(arm.path, limits, arm, guess=plan, intervals=60))
+    case = Case(arm.path, limits, arm, plan, plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=60))
     assert worst(case) < 1.001
     assert case.best.duration < plan.duration
 
@@ -255,22 +257,22 @@ class Joints(NamedTuple):
 )
 def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
     with pytest.raises(ProblemError, match=words):
-        minimum_time(example("quintic"), Limits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
+        plan_minimum_time(example("quintic"), LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
 
 
 def test_a_joint_jerk_limit_on_a_path_whose_curvature_jumps_is_refused() -> None:
     path = example("cubic")
     along = scara_along(Scara(0.4, 0.4), path, "right")
-    limits = Limits(1.0, 5.0, 200.0, joints=JOINTS)
+    limits = LineLimits(1.0, 5.0, 200.0, joints=JOINTS)
     with pytest.raises(ProblemError, match="curvature jumps"):
-        minimum_time(path, limits, along)
+        plan_minimum_time(path, limits, along)
     with pytest.raises(ProblemError, match="curvature jumps"):
-        minimum_time(path, limits, along, guess=schedule(path, Limits(1.0, 5.0, 200.0)))
+        plan_minimum_time(path, limits, along, guess=schedule(path, LineLimits(1.0, 5.0, 200.0)))
 
 
 def test_a_guess_of_another_path_and_too_few_intervals_are_refused() -> None:
-    limits = Limits(1.0, 5.0, 200.0)
+    limits = LineLimits(1.0, 5.0, 200.0)
     with pytest.raises(ProblemError, match="guess is for a path"):
-        timing_problem(straight(), limits, guess=schedule(straight(2.0), limits))
+        minimum_time_problem(straight(), limits, guess=schedule(straight(2.0), limits))
     with pytest.raises(ProblemError, match="intervals"):
-        timing_problem(straight(), limits, intervals=5)
+        minimum_time_problem(straight(), limits, intervals=5)

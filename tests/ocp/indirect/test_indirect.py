@@ -13,7 +13,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Machine, paper_example
 from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, prepare, solve
-from ocp.builders.redundancy import minimum_velocity
+from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.problem.formulation import Formulation
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA
@@ -29,7 +29,7 @@ every_extremum = pytest.mark.parametrize("name", EXTREMA)
 
 def paper_problem(formulation: Any = "rates", machine: Machine | None = None, horizon: float = 5.0) -> Problem:
     by = machine or paper_example()
-    return minimum_velocity(by, [-1, -1], [3, 4], PAPER_START, horizon, formulation=formulation)
+    return minimum_velocity_problem(by, [-1, -1], [3, 4], PAPER_START, horizon, formulation=formulation)
 
 
 @cache
@@ -162,7 +162,7 @@ ARM_START = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
 )
 @pytest.mark.parametrize("shooting", SHOOTINGS)
 def test_spatial_arms_agree_with_collocation(machine: Machine, horizon: float, segments: int, shooting: str) -> None:
-    problem = minimum_velocity(machine, [0.1, 0.1, -0.05], [3, 4, 5], ARM_START, horizon, limits=False)
+    problem = minimum_velocity_problem(machine, [0.1, 0.1, -0.05], [3, 4, 5], ARM_START, horizon, limits=False)
     direct = solve(problem, Collocation(20, 3, "legendre"))
     solution = solve(problem, Indirect(segments=segments, shooting=shooting), guess=direct)
     assert solution.cost == pytest.approx(direct.cost, abs=1e-10)

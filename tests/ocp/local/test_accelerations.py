@@ -10,7 +10,8 @@ from hypothesis import given, settings
 
 from models import ModelError
 from models.machines.machine import jacobian_manipulability
-from models.machines.standing import PAPER_START, Standing
+from models.machines.standing import Standing
+from models.papers import STANDING_STARTS
 from models.robot.indices import joint_limit_index
 from models.robot.motion import momentum
 from ocp.errors import ProblemError
@@ -37,7 +38,7 @@ from tests.ocp.builders.standing_tasks import (
 def table(number: int, **settings: Any) -> AccelerationSolution:
     external = spring() if number == 2 else None
     return resolve_accelerations(
-        machine(), table_path(number), ROWS, PAPER_START[number], HORIZON, external=external, **settings
+        machine(), table_path(number), ROWS, STANDING_STARTS[number], HORIZON, external=external, **settings
     )
 
 
@@ -169,7 +170,7 @@ def test_layers_in_sequence_follow_the_corrected_printed_form_and_do_what_they_a
     asked = ca.Function("asked", [q, qd, qdd], second)
     rng = np.random.default_rng(3)
     for _ in range(5):
-        time, q0, qd0 = near(rng, PAPER_START[1])
+        time, q0, qd0 = near(rng, STANDING_STARTS[1])
         push = numeric(found(time, q0, qd0)).ravel()
         expected = printed_sequence(time, q0, qd0, (-0.3, 0.2)).ravel()
         np.testing.assert_allclose(push, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
@@ -231,7 +232,7 @@ def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tas
     q, rng = ca.SX.sym("q", 5), np.random.default_rng(4)
     slope = ca.Function("slope", [q], [index_and_slope(q, name)[1]])
     for _ in range(5):
-        at = near(rng, PAPER_START[1])
+        at = near(rng, STANDING_STARTS[1])
         added = numeric(driven(*at)) - numeric(plain(*at))
         assert sign * (numeric(slope(at[1])) @ added).item() > 0
         np.testing.assert_allclose(numeric(machine().tip_jacobian((), at[1]))[list(ROWS)] @ added, 0, atol=1e-9)
@@ -277,7 +278,7 @@ def test_the_stabilised_law_fails_on_table_2() -> None:
 def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_beyond_its_limits() -> None:
     """The pinned pendulum carried on past its lift-off, but stopped before it diverges; and tighter joint limits."""
     flies = resolve_accelerations(
-        machine(), table_path(1), ROWS, PAPER_START[1], 1.2, law="augmented", stop_at_lift_off=False
+        machine(), table_path(1), ROWS, STANDING_STARTS[1], 1.2, law="augmented", stop_at_lift_off=False
     )
     assert flies.stopped is None
     assert flies.motion.index.min() == pytest.approx(1.0, abs=1e-9)
@@ -288,9 +289,9 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
     standing = machine()
     joints = [replace(joint, upper=min(joint.upper, 3.0)) if i == 0 else joint for i, joint in
               enumerate(standing.robot.joints)]  # fmt: skip
-    joints[3] = replace(joints[3], lower=PAPER_START[1][3] - 0.01, upper=PAPER_START[1][3] + 0.01)
+    joints[3] = replace(joints[3], lower=STANDING_STARTS[1][3] - 0.01, upper=STANDING_STARTS[1][3] + 0.01)
     narrow = replace(standing, robot=replace(standing.robot, joints=tuple(joints)))
-    bent = resolve_accelerations(narrow, table_path(1), ROWS, PAPER_START[1], HORIZON, law="stabilised", step=5e-3)
+    bent = resolve_accelerations(narrow, table_path(1), ROWS, STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
     assert bent.stopped is None
     assert bent.motion.index.min() == pytest.approx(1.0, abs=1e-9)
     assert bent.motion.stands
@@ -300,9 +301,15 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
 
 def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
     """Held still by a path that swings faster than the steps see."""
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     found = resolve_accelerations(
-        machine(), lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2], ROWS, PAPER_START[1], 0.5, step=0.05, null_damping=2.0
+        machine(),
+        lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2],
+        ROWS,
+        STANDING_STARTS[1],
+        0.5,
+        step=0.05,
+        null_damping=2.0,
     )
     assert found.tip_error.max() > 1e-3
     assert "leaves_path" in found.failures
@@ -374,12 +381,12 @@ def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
 
 def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     """The tip of Table 1 moved on beyond the stretched arm."""
-    _, y, z = tip_at(machine(), PAPER_START[1])
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
 
     def path(t: Any) -> list[Any]:
         return [y + (1.8 - y) * t**2, z * (1 - t**2)]
 
-    found = resolve_accelerations(machine(), path, ROWS, PAPER_START[1], 1.0, stop_at_lift_off=False)
+    found = resolve_accelerations(machine(), path, ROWS, STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
     assert found.stopped is not None
     assert found.stopped.reason in ("divergence", "breakdown")
     assert np.isfinite(found.motion.joint_accelerations).all()
@@ -409,7 +416,7 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments = {"tip_path": table_path(1), "rows": ROWS, "start_joints": PAPER_START[1], "horizon": 1.0, **changes}
+    arguments = {"tip_path": table_path(1), "rows": ROWS, "start_joints": STANDING_STARTS[1], "horizon": 1.0, **changes}
     with pytest.raises(ProblemError, match=message):
         resolve_accelerations(machine(), **arguments)
 
@@ -440,14 +447,14 @@ def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> No
 )
 def test_what_gives_no_wrenches_is_refused(external: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], 1.0, external=external)
+        resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], 1.0, external=external)
 
 
 def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
     def push(time: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
 
-    found = resolve_accelerations(machine(), table_path(1), ROWS, PAPER_START[1], 0.3, external=push, step=0.01)
+    found = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], 0.3, external=push, step=0.01)
     assert found.stopped is not None
     assert found.stopped.reason == "breakdown"
     assert found.stopped.time == pytest.approx(0.11)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from models import ModelError
 from models.paths import Path, SmoothPath, smooth
 from ocp import ProblemError
-from ocp.schedule import JointLimits, Limits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
+from ocp.schedule import JointLimits, LineLimits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 
@@ -34,7 +34,7 @@ def ladder(count: int = 4) -> SmoothPath:
 
 def test_the_example_takes_the_time_checked_with_mean_acceleration() -> None:
     path = example("cubic")
-    limits = Limits(speed=1.0, acceleration=peak_acceleration(5.0, 1.0, 200.0), jerk=200.0)
+    limits = LineLimits(speed=1.0, acceleration=peak_acceleration(5.0, 1.0, 200.0), jerk=200.0)
     plan = schedule(path, limits)
     assert plan.duration == pytest.approx(1.868825, abs=1e-6)
     events = np.cumsum(np.asarray(path.piece_lengths))[:4]
@@ -44,7 +44,7 @@ def test_the_example_takes_the_time_checked_with_mean_acceleration() -> None:
 
 def test_the_example_takes_the_time_checked_with_peak_acceleration() -> None:
     path = example("cubic")
-    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
     assert plan.duration == pytest.approx(1.893825, abs=1e-6)
     assert plan.time_at(path.bounds[1:5]) == pytest.approx([0.3625, 0.6328, 0.9847, 1.2544], abs=5e-5)
     inside = (plan.time_at(path.bounds[1])[0], plan.time_at(path.bounds[4])[0])
@@ -54,7 +54,7 @@ def test_the_example_takes_the_time_checked_with_peak_acceleration() -> None:
 @pytest.mark.parametrize("length", [1e-6, 1e-3, 0.05, 0.2, 1.0, 1e3])
 def test_rest_to_rest_over_a_line_takes_the_seven_phase_time(length: float) -> None:
     speed, acceleration, jerk = 1.0, 5.0, 200.0
-    plan = schedule(line(length), Limits(speed, acceleration, jerk))
+    plan = schedule(line(length), LineLimits(speed, acceleration, jerk))
     # the top speed for which two ramps fill the line, by bisection on the closed form
     low, high = 0.0, speed
     for _ in range(200):
@@ -111,7 +111,7 @@ def test_random_paths_never_exceed_asked_speed_or_limits(seed: int, count: int, 
     path = smooth(random_path(rng, count), 10 ** rng.uniform(-3, -0.5), kind=kind)
     speed = 10 ** rng.uniform(-1.5, 0.5, count if each else ())
     centripetal = 10 ** rng.uniform(-1, 1.5) if rng.random() < 0.7 else np.inf
-    limits = Limits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), centripetal)
+    limits = LineLimits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), centripetal)
     plan = schedule(path, limits)
     check_profile(plan, path.by_piece(speed))
     # time and distance are inverse
@@ -128,13 +128,13 @@ def test_a_speed_that_bulges_between_two_points_of_the_grid_is_seen() -> None:
     rng = np.random.default_rng(12)
     path = smooth(random_path(rng, int(rng.integers(1, 9))), 10 ** rng.uniform(-3, -0.5))
     speed = 10 ** rng.uniform(-1.5, 0.5)
-    limits = Limits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), 10 ** rng.uniform(-1, 1.5))
+    limits = LineLimits(speed, 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(0.5, 3), 10 ** rng.uniform(-1, 1.5))
     check_profile(schedule(path, limits), path.by_piece(speed), 100001)
 
 
 def test_any_sequence_of_speeds_is_reached_between_its_ramps() -> None:
     path, speeds = ladder(5), [0.2, 1.0, 0.5, 0.05, 0.8]
-    plan = schedule(path, Limits(speeds, 5.0, 200.0))
+    plan = schedule(path, LineLimits(speeds, 5.0, 200.0))
     middles = (path.bounds[:-1] + path.bounds[1:])[path.piece_segment >= 0] / 2
     assert plan.profile.at_distance(middles).speed == pytest.approx(speeds, rel=1e-9)
     check_profile(plan, path.by_piece(speeds))
@@ -143,7 +143,7 @@ def test_any_sequence_of_speeds_is_reached_between_its_ramps() -> None:
 
 def test_centripetal_acceleration_slows_the_blends_only() -> None:
     path = example("quintic")
-    plan = schedule(path, Limits(speed=1.0, acceleration=5.0, jerk=200.0, centripetal=5.0))
+    plan = schedule(path, LineLimits(speed=1.0, acceleration=5.0, jerk=200.0, centripetal=5.0))
     motion = plan.sample(1e-3)
     assert np.max(motion.speed**2 * path.curvature(motion.distance)) < 5.0 * 1.001
     assert np.max(motion.speed) == pytest.approx(1.0, abs=1e-6)
@@ -165,17 +165,17 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
 def test_a_slower_asked_speed_needs_no_dip() -> None:
     path = example("quintic")
     peak = path.curvature(path.dense(200)).max()
-    plan = schedule(path, Limits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
+    plan = schedule(path, LineLimits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
     assert not plan.dips
 
 
 def test_strict_refuses_and_says_where() -> None:
     with pytest.raises(ProblemError, match=r"2 place\(s\).*\n.* m: centripetal acceleration permits"):
-        schedule(example("quintic"), Limits(1.0, 5.0, 200.0, centripetal=5.0), strict=True)
+        schedule(example("quintic"), LineLimits(1.0, 5.0, 200.0, centripetal=5.0), strict=True)
 
 
 def test_the_last_sample_is_the_end() -> None:
-    plan = schedule(line(1.0), Limits(1.0, 5.0, 200.0))
+    plan = schedule(line(1.0), LineLimits(1.0, 5.0, 200.0))
     t = plan.sample(2e-3).t
     assert t[-1] == plan.duration
     assert np.diff(t)[:-1] == pytest.approx(2e-3, rel=1e-9)
@@ -186,13 +186,13 @@ def test_the_last_sample_is_the_end() -> None:
 def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> None:
     for name in ("speed", "acceleration", "jerk", "centripetal"):
         with pytest.raises(ProblemError, match=f"{name} limit"):
-            replace(Limits(1.0, 5.0, 200.0), **{name: bad})  # type: ignore[arg-type]
+            replace(LineLimits(1.0, 5.0, 200.0), **{name: bad})  # type: ignore[arg-type]
     for values in ((bad, 1.0, 200.0), (5.0, bad, 200.0), (5.0, 1.0, bad)):
         with pytest.raises(ProblemError, match="positive"):
             peak_acceleration(*values)
     for name in ("velocity", "acceleration", "jerk"):
         with pytest.raises(ProblemError, match=f"joint {name} limit"):
-            Limits(1.0, 5.0, 200.0, joints=JointLimits(**{name: [1.0, bad]}))
+            LineLimits(1.0, 5.0, 200.0, joints=JointLimits(**{name: [1.0, bad]}))
 
 
 @pytest.mark.parametrize(
@@ -209,11 +209,11 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
 )
 def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ProblemError, match=message):
-        Limits(**{"speed": 1.0, "acceleration": 5.0, "jerk": 200.0, **given})
+        LineLimits(**{"speed": 1.0, "acceleration": 5.0, "jerk": 200.0, **given})
 
 
 def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
-    plan = schedule(line(1.0), Limits(1.0, 5.0, 200.0))
+    plan = schedule(line(1.0), LineLimits(1.0, 5.0, 200.0))
     for wrong in (-0.1, 9.0, NAN):
         with pytest.raises(ProblemError, match="outside the schedule"):
             plan.at(wrong)
@@ -223,17 +223,17 @@ def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
         with pytest.raises(ProblemError, match="sample period"):
             plan.sample(period)
     with pytest.raises(ValueError, match="2 segments"):
-        schedule(smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1), Limits([1, 2, 3], 5.0, 200.0))
+        schedule(smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1), LineLimits([1, 2, 3], 5.0, 200.0))
 
 
 @pytest.mark.parametrize("wrong", ["x", None, {}, 1j, [[0.1]]])
 def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
     path = smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1)
-    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
     calls: tuple[Callable[[Any], Any], ...] = (
         plan.sample,
         lambda value: schedule(path, value),
-        lambda value: schedule(value, Limits(1.0, 5.0, 200.0)),
+        lambda value: schedule(value, LineLimits(1.0, 5.0, 200.0)),
         lambda value: peak_acceleration(value, 1.0, 200.0),
     )
     for call in calls:

@@ -24,7 +24,7 @@ from ocp import ProblemError
 from ocp.schedule import (
     JointLimits,
     JointTrajectory,
-    Limits,
+    LineLimits,
     Schedule,
     SpeedProfile,
     joint_motion,
@@ -69,7 +69,7 @@ def test_random_arms_keep_all_limits_between_samples(seed: int, jerks: bool, cen
     bend = 10 ** rng.uniform(-1, 1.5) if centripetal else np.inf
     speed = 10 ** rng.uniform(-1, 0.5)
     plan = schedule(
-        arm.path, Limits(speed, 10 ** rng.uniform(0, 1.3), 10 ** rng.uniform(1, 3), bend, joints), joints=arm
+        arm.path, LineLimits(speed, 10 ** rng.uniform(0, 1.3), 10 ** rng.uniform(1, 3), bend, joints), joints=arm
     )
     assert (largest(plan, arm) <= 1.001).all()
     motion = plan.at(np.linspace(0, plan.duration, 20001))
@@ -88,7 +88,7 @@ def test_random_arms_keep_all_limits_between_samples(seed: int, jerks: bool, cen
 
 def test_joint_motion_has_the_derivatives_of_the_joints_by_time() -> None:
     arm = example_arm()
-    plan = schedule(arm.path, Limits(1.0, 5.0, 200.0, joints=SLOW), joints=arm)
+    plan = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=SLOW), joints=arm)
     steps = np.concatenate([plan.profile.t, plan.time_at(arm.path.bounds)])
     t = np.linspace(0.01, plan.duration - 0.01, 400)
     t = t[np.abs(t[:, None] - steps).min(axis=1) > 1e-4]
@@ -109,8 +109,8 @@ def test_joint_motion_has_the_derivatives_of_the_joints_by_time() -> None:
 )
 def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind: str) -> None:
     arm = example_arm()
-    free = schedule(arm.path, Limits(1.0, 5.0, 200.0))
-    asked = Limits(1.0, 5.0, 200.0, joints=limits)
+    free = schedule(arm.path, LineLimits(1.0, 5.0, 200.0))
+    asked = LineLimits(1.0, 5.0, 200.0, joints=limits)
     plan = schedule(arm.path, asked, joints=arm)
     assert plan.duration > free.duration
     used = largest(plan, arm).max()
@@ -123,28 +123,28 @@ def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind
 def test_the_curvature_of_the_joints_counts_at_a_steady_speed_too() -> None:
     """q'' v^2 alone, where the line acceleration is zero."""
     arm = example_arm()
-    plan = schedule(arm.path, Limits(1.0, 5.0, 200.0), joints=arm)
+    plan = schedule(arm.path, LineLimits(1.0, 5.0, 200.0), joints=arm)
     s = np.linspace(0.3, 1.3, 2001) * arm.path.length / 1.7
     steady = np.abs(arm.at(s).second).max(axis=0)
     limits = JointLimits(acceleration=0.5 * steady)
-    slowed = schedule(arm.path, Limits(1.0, 5.0, 200.0, joints=limits), joints=arm)
+    slowed = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=limits), joints=arm)
     assert slowed.duration > plan.duration
     assert largest(slowed, arm)[1] <= 1.001
 
 
 def test_limits_that_do_not_bind_change_nothing() -> None:
     arm = example_arm()
-    loose = schedule(arm.path, Limits(1.0, 5.0, 200.0, 1e3, JointLimits(1e3, 1e4, 1e6)), joints=arm, strict=True)
-    assert loose.duration == schedule(arm.path, Limits(1.0, 5.0, 200.0)).duration
+    loose = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, 1e3, JointLimits(1e3, 1e4, 1e6)), joints=arm, strict=True)
+    assert loose.duration == schedule(arm.path, LineLimits(1.0, 5.0, 200.0)).duration
 
 
 def test_what_cannot_be_scheduled_is_a_named_error() -> None:
     arm = example_arm()
-    limits = Limits(1.0, 5.0, 200.0, joints=SLOW)
+    limits = LineLimits(1.0, 5.0, 200.0, joints=SLOW)
     with pytest.raises(ProblemError, match="joint limits need the joints"):
         schedule(arm.path, limits)
     with pytest.raises(ProblemError, match="the arm has 4 joints"):
-        schedule(arm.path, Limits(1.0, 5.0, 200.0, joints=JointLimits([1.0, 2.0])), joints=arm)
+        schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=JointLimits([1.0, 2.0])), joints=arm)
     bent = Path((Line((0.3, 0, 0), (0.5, 0, 0)), Arc.through((0.5, 0, 0), (0.5, 0.2, 0), (0.3, 0.4, 0))))
     cubic = scara_along(ARM, smooth(bent, 0.05, kind="cubic"))
     with pytest.raises(ProblemError, match=r"curvature jumps.*quintic"):
@@ -180,9 +180,9 @@ class BrokenJoints:
 )
 def test_joints_that_are_no_numbers_are_a_named_error(kind: str, value: Any, message: str) -> None:
     path, joints = example("quintic"), BrokenJoints(kind, value)
-    plan = schedule(path, Limits(1.0, 5.0, 200.0))
+    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
     with pytest.raises(ProblemError, match=message):
-        schedule(path, Limits(1.0, 5.0, 200.0, joints=JointLimits(1.0)), joints=joints)
+        schedule(path, LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0)), joints=joints)
     with pytest.raises(ProblemError, match=message):
         joint_trajectory(plan, joints, 1e-3)
 
@@ -199,7 +199,7 @@ def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: 
     end = [np.cos(0.5), 0.0, 0.0, np.sin(0.5)]
     lines = (Line((0.5, -0.4, 0), (0.5, 0.4, 0)), Line((0.5, 0.4, 0), (0.1, 0.4, 0), None, end))
     arm = scara_along(ARM, smooth(Path(lines), 0.05))
-    limits = Limits(0.5, 5.0, 200.0)
+    limits = LineLimits(0.5, 5.0, 200.0)
     free, plan = schedule(arm.path, limits), schedule(arm.path, replace(limits, joints=joints), joints=arm)
     assert [dip.cause for dip in plan.dips] == [cause]
     assert plan.dips[0].start == 0
@@ -216,7 +216,7 @@ def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: 
 @pytest.fixture(scope="module")
 def sampled() -> JointTrajectory:
     arm = example_arm()
-    return joint_trajectory(schedule(arm.path, Limits(1.0, 5.0, 200.0, joints=SLOW), joints=arm), arm, 1e-3)
+    return joint_trajectory(schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=SLOW), joints=arm), arm, 1e-3)
 
 
 def equal(first: JointTrajectory, second: JointTrajectory) -> bool:
@@ -297,7 +297,7 @@ def test_a_trajectory_that_is_none_is_a_named_error(sampled: JointTrajectory, tm
 
 Curve = Callable[[int, Array], Array]
 """(n, distances) -> n-th derivative of a joint by the distance."""
-LENGTH, LINE = 2.0, Limits(1.0, 5.0, 200.0)
+LENGTH, LINE = 2.0, LineLimits(1.0, 5.0, 200.0)
 
 
 class Drawn:
@@ -334,7 +334,7 @@ def straight(length: float = LENGTH) -> SmoothPath:
     return smooth(Path.through([(0, 0, 0), (length, 0, 0)]), 0.1)
 
 
-def uneased(grid: Grid, limits: Limits, gentler: float = 1.0) -> Attempt:
+def uneased(grid: Grid, limits: LineLimits, gentler: float = 1.0) -> Attempt:
     """What is asked, with ramps that know nothing of the joints."""
     ones = np.ones(len(grid.asked))
     acceleration, jerk = limits.acceleration / gentler**2 * ones, limits.jerk / gentler**3 * ones
@@ -349,14 +349,14 @@ def again(state: Attempt) -> SpeedProfile:
     return state.profile
 
 
-def attempt(limits: Limits, joints: Drawn, gentler: float = 1.0, length: float = LENGTH) -> Attempt:
+def attempt(limits: LineLimits, joints: Drawn, gentler: float = 1.0, length: float = LENGTH) -> Attempt:
     """The plan along a straight line whose ramps know nothing of the joints."""
     state = uneased(make_grid(straight(length), limits, joints), limits, gentler)
     again(state)
     return state
 
 
-def demand(profile: SpeedProfile, limits: Limits, joints: Drawn, per_phase: int = 400) -> Array:
+def demand(profile: SpeedProfile, limits: LineLimits, joints: Drawn, per_phase: int = 400) -> Array:
     """Largest demand of joint acceleration and jerk over the limit in each phase. Shape (K,)."""
     inside = np.linspace(1e-9, 1 - 1e-9, per_phase)
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
@@ -368,11 +368,11 @@ def demand(profile: SpeedProfile, limits: Limits, joints: Drawn, per_phase: int 
     return np.asarray(np.maximum(second, third).max(axis=1).reshape(-1, per_phase).max(axis=1))
 
 
-def bounded(number: int = 1, line: Limits = LINE, /, **kinds: Any) -> Limits:
+def bounded(number: int = 1, line: LineLimits = LINE, /, **kinds: Any) -> LineLimits:
     return replace(line, joints=JointLimits(**{kind: np.broadcast_to(v, number) for kind, v in kinds.items()}))
 
 
-def hand_made(line: Limits, cuts: Array) -> Attempt:
+def hand_made(line: LineLimits, cuts: Array) -> Attempt:
     """The plan along a line whose grid is what is given: nothing is permitted or forbidden there."""
     at = np.zeros(len(cuts), dtype=np.intp)
     state = uneased(
@@ -396,7 +396,7 @@ def on_ramps(profile: SpeedProfile) -> Array:
 @given(seeds, st.sampled_from(["acceleration", "jerk"]))
 def test_a_demand_a_hair_over_its_limit_is_found_wherever_in_a_ramp_it_is(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
-    line = Limits(10 ** rng.uniform(-0.3, 0.3), 10 ** rng.uniform(0.3, 1), 10 ** rng.uniform(1.5, 2.5))
+    line = LineLimits(10 ** rng.uniform(-0.3, 0.3), 10 ** rng.uniform(0.3, 1), 10 ** rng.uniform(1.5, 2.5))
     joints = Drawn(**{name: wave(1.0, 10 ** rng.uniform(0, 1.3), rng.uniform(0, 6.28)) for name in "ab"})
     cuts = np.concatenate([[0.0], np.sort(rng.uniform(0.1, LENGTH - 0.1, 2)), [LENGTH]])
     state = hand_made(line, cuts)
@@ -429,7 +429,7 @@ def test_a_joint_limit_that_is_just_the_line_s_own_changes_nothing(kind: str) ->
     assert (state.acceleration == LINE.acceleration).all()
 
 
-def eased(limits: Limits, joints: Drawn, state: Attempt) -> Broken:
+def eased(limits: LineLimits, joints: Drawn, state: Attempt) -> Broken:
     """What the state is eased for, in one round."""
     broken = broken_ramps(state, limits, joints)
     assert broken is not None
@@ -546,7 +546,7 @@ def test_where_a_steady_speed_takes_most_of_a_limit_it_is_lowered_until_it_takes
     assert np.abs(lowered[:, None] - places).min(axis=1).max() <= 1
 
 
-def free_time(line: Limits, length: float = LENGTH) -> float:
+def free_time(line: LineLimits, length: float = LENGTH) -> float:
     """From rest to rest where the top speed is reached."""
     v, a, j = float(np.asarray(line.speed)), line.acceleration, line.jerk
     return 2 * ramp_time(v, a, j) + (length - 2 * ramp_distance(0, v, a, j)) / v
@@ -634,7 +634,7 @@ def bump(size: float, place: float, width: float) -> Curve:
 RUNGS = (0.6, 1.0, 0.6, 1.0, 0.6)
 
 
-def ladder(limits: Limits, joints: Drawn, gentler: float) -> Attempt:
+def ladder(limits: LineLimits, joints: Drawn, gentler: float) -> Attempt:
     """A plan as of attempt, along lines of 1 m with speeds of their own: its ramps are at every whole metre."""
     path = smooth(Path.through([(float(i), 1e-4 * (i % 2), 0) for i in range(len(RUNGS) + 1)]), 0.05)
     grid = make_grid(path, replace(limits, speed=RUNGS), joints)

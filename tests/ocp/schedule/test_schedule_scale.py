@@ -7,10 +7,10 @@ import tracemalloc
 import numpy as np
 
 from models.paths import Arc, Line, Path, Segment, SmoothPath, smooth
-from ocp.schedule import Limits, Schedule, schedule
+from ocp.schedule import LineLimits, Schedule, schedule
 
 DEVIATION = 5e-4
-LIMITS = Limits(0.25, 5.0, 200.0, centripetal=5.0)
+LIMITS = LineLimits(0.25, 5.0, 200.0, centripetal=5.0)
 
 
 def segments(count: int) -> list[Segment]:

@@ -15,7 +15,7 @@ from PIL import Image
 from models.machines.scara import Scara
 from models.paths import Path as TaskPath
 from models.paths import smooth
-from ocp.schedule import JointTrajectory, Limits, joint_motion, schedule
+from ocp.schedule import JointTrajectory, LineLimits, joint_motion, schedule
 from scripts import blend
 from scripts.papers.blend import results as blend_results
 from scripts.papers.blend.example import (
@@ -326,4 +326,4 @@ def test_the_script_is_registered() -> None:
 def test_the_examples_time_depends_on_its_length_alone() -> None:
     straight = smooth(TaskPath.through([(0, 0, 0), (1.6688250069032047, 0, 0)]), REMAINING)
     acceleration = 5.857864376269049  # 200 (0.2 - sqrt(0.2^2 - 4/200)) / 2: ramp of 0.2 s at 200 m/s^3 to 1 m/s
-    assert schedule(straight, Limits(SPEED, acceleration, JERK)).duration == pytest.approx(1.868825, abs=1e-6)
+    assert schedule(straight, LineLimits(SPEED, acceleration, JERK)).duration == pytest.approx(1.868825, abs=1e-6)
