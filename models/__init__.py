@@ -1,12 +1,18 @@
 """What a machine is: symbolic kinematics, geometry and momentum. Knows nothing of problems or solvers."""
 
+from models.cts.best_roll import optimal_inverse
+from models.cts.rig import Rig, Tunnel
+from models.cts.table import solve_table
 from models.errors import ModelError
 from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
+from models.machines.scara import Scara
+from models.machines.scara_path import scara_along
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
-from models.papers import paper_example
+from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
+from models.paths import Arc, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.robot.kinematics import (
     center_of_mass,
@@ -35,20 +41,31 @@ from models.robot.rebuild import (
     with_load,
 )
 from models.robot.robot import Robot, planar_chain
+from models.shapes.capsules import Box, Capsule
 from models.spatial import Frame
 
 __all__ = [
+    "STANDING_STARTS",
+    "Arc",
+    "Box",
+    "Capsule",
     "FixedBase",
     "Footprint",
     "Frame",
     "FreeFloating",
     "Joint",
+    "Line",
     "Link",
     "Machine",
     "ModelError",
+    "Path",
+    "Rig",
     "Robot",
+    "Scara",
+    "SmoothPath",
     "Standing",
     "Support",
+    "Tunnel",
     "Wrench",
     "attached",
     "base_reaction",
@@ -67,15 +84,22 @@ __all__ = [
     "momentum",
     "momentum_matrix",
     "momentum_rate",
+    "optimal_inverse",
     "paper_example",
     "planar_chain",
     "pruned",
     "rectangle",
+    "reference_rig",
+    "reference_tunnel",
     "renamed",
     "rerooted",
     "retipped",
     "robot_inertia",
+    "scara_along",
     "simplified",
+    "smooth",
+    "solve_table",
+    "standing_example",
     "subtree",
     "tip_jacobian",
     "tip_pose",

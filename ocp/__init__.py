@@ -1,33 +1,66 @@
-"""Optimal control: declare a problem, transcribe it, solve it, audit it."""
+"""Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate, certificate
+from ocp.builders.cts import roll_problem, spline_targets
+from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
+from ocp.builders.standing.options import FreeTime, Limits, Weights
+from ocp.builders.standing.plan import standing_problem
+from ocp.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
 from ocp.indirect.method import Indirect
+from ocp.local.accelerations import resolve_accelerations
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.laws import Layer, Stabiliser
+from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Solution
+from ocp.tasks.tip_task import TipTask
+from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.tightening import tighten
 
 __all__ = [
+    "Anywhere",
     "Audit",
     "AuditError",
     "Certificate",
     "Collocation",
     "Finding",
+    "Following",
+    "FreeTime",
+    "InFoot",
+    "IndexAtLeast",
     "Indirect",
+    "Layer",
+    "Limits",
     "MultipleShooting",
+    "Pinned",
     "Problem",
     "ProblemError",
     "RefinementWarning",
     "Solution",
     "SolveError",
+    "Stabiliser",
+    "TipTask",
+    "Unreachable",
+    "Weights",
     "certificate",
+    "inverse_kinematics",
+    "minimum_time_problem",
+    "minimum_velocity_problem",
+    "plan_minimum_time",
+    "plan_minimum_velocity",
     "prepare",
     "refine",
+    "resolve",
+    "resolve_accelerations",
+    "roll_problem",
     "solve",
+    "spline_targets",
+    "standing_problem",
     "tighten",
 ]
