@@ -1,4 +1,4 @@
-"""The README's Python blocks run, in their order and in one namespace, as a reader would type them."""
+"""The README's Python blocks run, each alone and all in their order, as a reader would type them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,26 @@ def python_blocks(text: str) -> list[tuple[int, str]]:
     return [(text.count("\n", 0, match.start(1)) + 1, match.group(1)) for match in FENCE.finditer(text)]
 
 
-def test_every_python_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+BLOCKS = python_blocks(README.read_text(encoding="utf-8"))
+
+
+def run(line: int, source: str, namespace: dict[str, object]) -> None:
+    # The padding makes a traceback point at the line in README.md.
+    exec(compile("\n" * (line - 1) + source, str(README), "exec"), namespace)
+
+
+@pytest.mark.parametrize(("line", "source"), BLOCKS, ids=[f"line {line}" for line, _ in BLOCKS])
+def test_a_python_block_runs_alone(line: int, source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # what a block writes must not land in the repository
-    blocks = python_blocks(README.read_text(encoding="utf-8"))
-    assert blocks, "README.md has no Python block: the pattern or the fences are wrong"
+    run(line, source, {"__name__": "__main__"})
+
+
+def test_the_python_blocks_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert BLOCKS, "README.md has no Python block: the pattern or the fences are wrong"
     namespace: dict[str, object] = {"__name__": "__main__"}
-    for line, source in blocks:
-        # The padding makes a traceback point at the line in README.md.
-        exec(compile("\n" * (line - 1) + source, str(README), "exec"), namespace)
+    for line, source in BLOCKS:
+        run(line, source, namespace)
 
 
 def test_every_make_target_named_in_the_readme_exists() -> None:
