@@ -1,13 +1,27 @@
-"""Piecewise polynomials kept as values at nodes: the form in which a solution stores its interpolants."""
+"""Curves over time: piecewise polynomials kept as values at nodes, and the integration of differential equations.
+
+Piecewise polynomials are the form in which a solution stores its interpolants.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
-__all__ = ["PiecewisePolynomial", "barycentric_weights", "differentiation_matrix", "lagrange", "quadrature_weights"]
-
+__all__ = [
+    "PiecewisePolynomial",
+    "barycentric_weights",
+    "differentiation_matrix",
+    "integrator",
+    "lagrange",
+    "lagrange_expressions",
+    "quadrature_weights",
+    "rk4_step",
+]
 
 TOUCHING = 1e-100  # a place nearer to a node than this is the node: its barycentric weight would overflow
 
@@ -72,3 +86,51 @@ def quadrature_weights(points: np.ndarray) -> np.ndarray:
     """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
     at, weight = np.polynomial.legendre.leggauss(len(points))
     return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))
+
+
+def lagrange_expressions(nodes: np.ndarray, place: Any) -> Any:
+    """Lagrange basis polynomials of ``nodes`` (d,) as expressions of the scalar ``place``. Shape (d, 1)."""
+    polynomials = []
+    for i, node in enumerate(nodes):
+        product: Any = 1.0
+        for j, other in enumerate(nodes):
+            if j != i:
+                product = product * (place - other) / (node - other)
+        polynomials.append(product)
+    return ca.vertcat(*polynomials)
+
+
+def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
+    """One step of width ``h`` of the classical Runge-Kutta method from ``x``, an array or an expression.
+
+    ``slope(place, x)`` is dx/dt at the place 0, 1/2 or 1 of the step.
+    """
+    k1 = slope(0.0, x)
+    k2 = slope(0.5, x + h / 2 * k1)
+    k3 = slope(0.5, x + h / 2 * k2)
+    k4 = slope(1.0, x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def integrator(
+    name: str,
+    dae: dict[str, Any],
+    places: Sequence[float] = (1.0,),
+    *,
+    tolerance: float = 1e-12,
+    max_steps: int = 20_000,
+    smooth: bool = True,
+    start: float = 0.0,
+) -> Any:
+    """A casadi integrator (cvodes: variable step and order) of ``dae`` from ``start`` to each of ``places``.
+
+    Args:
+        dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.
+        tolerance: Relative and absolute, of the local error. max_steps: Most steps between two places.
+        smooth: Adams' formulas, for smooth dynamics that are not stiff, and no word about a trial step that fails,
+            which may go anywhere; else backward differentiation formulas.
+    """
+    options = {"reltol": tolerance, "abstol": tolerance, "max_num_steps": max_steps, "quad_err_con": True}
+    if smooth:
+        options |= {"linear_multistep_method": "adams", "show_eval_warnings": False, "disable_internal_warnings": True}
+    return ca.integrator(name, "cvodes", dae, start, list(places), options)

@@ -1,40 +1,84 @@
-"""Exceptions of the package: each message names the offending thing, its value and what to do."""
+"""Exceptions of the package, and the checks of arguments that raise them.
+
+Each message names the offending thing, its value and what to do; the exception carries the same as fields.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+import numpy as np
 
-    from ocp.solution import Solution
+__all__ = [
+    "AuditError",
+    "Detailed",
+    "ProblemError",
+    "RefinementWarning",
+    "SolveError",
+    "about",
+    "checked_choice",
+    "checked_count",
+    "checked_positive",
+    "unknown_name",
+]
 
-__all__ = ["AuditError", "ProblemError", "RefinementWarning", "SolveError", "unknown_name"]
+
+class Detailed(Exception):
+    """An exception that carries what its message says; it is pickled with all of it.
+
+    Attributes:
+        name: Of the offending state, control, constraint, parameter, option or argument, where it is one.
+        value: What was found. limit: What it may be. time: When, s. Each None where the message says none.
+    """
+
+    def __init__(
+        self, message: str = "", *, name: str | None = None, value: Any = None, limit: Any = None, time: Any = None
+    ) -> None:
+        super().__init__(message)
+        self.name, self.value, self.limit, self.time = name, value, limit, time
 
 
-class ProblemError(ValueError):
+class ProblemError(Detailed, ValueError):
     """A problem, a method or an argument that cannot be right, found before anything is solved."""
 
 
-class SolveError(RuntimeError):
+class SolveError(Detailed, RuntimeError):
     """A solve that ended without an optimum.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution, or None where there is none.
+        conflicts: The constraints that have to give way (:class:`ocp.direct.diagnosis.Conflict`), the worst first.
     """
 
-    def __init__(self, message: str, solution: Solution | None = None) -> None:
-        super().__init__(message)
-        self.solution = solution
+    def __init__(self, message: str = "", solution: Any = None, conflicts: Sequence[Any] = (), **details: Any) -> None:
+        super().__init__(message, **details)
+        self.solution, self.conflicts = solution, tuple(conflicts)
+
+    def __reduce__(self) -> Any:
+        """Pickled without the problem of the solution: expressions cannot be pickled, as they cannot be saved."""
+        loose = None if self.solution is None else self.solution.with_problem(None)
+        return type(self), self.args, {**self.__dict__, "solution": loose}
 
 
-class AuditError(RuntimeError):
+class AuditError(Detailed, RuntimeError):
     """An audit that cannot be made, for example of a loaded solution without its problem."""
 
 
-class RefinementWarning(UserWarning):
+class RefinementWarning(Detailed, UserWarning):
     """A refinement that stopped at its cap before its tolerance was reached."""
+
+
+@contextmanager
+def about(name: str) -> Iterator[None]:
+    """What is raised inside, and names nothing itself, is about ``name``."""
+    try:
+        yield
+    except Detailed as error:
+        error.name = name if error.name is None else error.name
+        raise
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
@@ -42,4 +86,39 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
     names = [str(item) for item in known]
     near = get_close_matches(str(name), names, n=3)
     hint = f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(names) or 'none'}"
-    return ProblemError(f"unknown {kind} {name!r}; {hint}")
+    return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name), limit=tuple(names))
+
+
+def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
+    """``value``, or ProblemError where it is none of the words ``choices``; ``what`` ends with the argument's name."""
+    if not isinstance(value, str) or value not in choices:
+        words = " or ".join(repr(choice) for choice in choices)
+        raise ProblemError(
+            f"{what} must be {words}, not {value!r}", name=_last(what), value=value, limit=tuple(choices)
+        )
+    return value
+
+
+def checked_count(what: str, value: Any, least: int = 1) -> int:
+    """``value`` as a plain integer, or ProblemError unless it is a whole number and at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        kind = "a positive integer" if least == 1 else f"a whole number, at least {least}"
+        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=least)
+    return int(value)
+
+
+def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
+    """``value``, or ProblemError unless it is a number between 0 and ``below``, both excluded."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float | np.integer | np.floating)
+        or not 0 < value < below
+    ):
+        kind = "positive and finite" if below == np.inf else f"between 0 and {below:g}"
+        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
+    return value  # type: ignore[return-value]
+
+
+def _last(what: str) -> str:
+    """The name of an argument at the end of ``Collocation: scheme``."""
+    return what.rpartition(" ")[2].strip("'")

@@ -11,11 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.problem import Constraint, Problem, Variable
-from ocp.problem.values import check_horizon, check_inside, check_order, constant, numeric
+from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
-__all__ = ["BoundTable", "Formulation", "Rows"]
+__all__ = ["BoundTable", "Formulation", "Rows", "at_samples"]
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Formulation:
     """Vectors and functions of a checked problem. Later changes of the problem do not reach it.
 
     Attributes:
-        x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon.
+        x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Makes more.
         x0, u0: Symbols of states and controls at the start, for what ties both ends.
         f: State derivative. Shape (nx, 1).
         running, terminal: Cost densities, scalars.
@@ -108,7 +108,7 @@ class Formulation:
     def __init__(self, problem: Problem) -> None:
         problem.check()
         declared = problem.declared
-        sym = problem.symbols.sym
+        self.sym = sym = problem.symbols.sym
         horizon = declared.horizon
         assert horizon is not None
         self.problem = problem
@@ -145,6 +145,23 @@ class Formulation:
         """A casadi Function of (x, u, t, T, p)."""
         return ca.Function(name, [self.x, self.u, self.t, self.T, self.p], outputs, ["x", "u", "t", "T", "p"], names)
 
+    def sampled(
+        self, outputs: list[Any], x: Any, u: Any, t: Any, horizon: Any, p: Any, *more: tuple[Any, Any]
+    ) -> list[np.ndarray]:
+        """Expressions of (x, u, t, T, p) and of ``more`` symbols at M samples; each output (M, its number of entries).
+
+        An output that is a matrix is read column by column.
+
+        Args:
+            outputs: Expressions of the symbols of the formulation and of those in ``more``.
+            x, u: States (M, nx), controls (M, nu). t: Times, s. Shape (M,).
+            horizon: s. p: Parameters. Shape (np,).
+            more: Pairs of another symbol and its values, (M, n), or (n,) where they are the same at all samples.
+        """
+        symbols = [self.x, self.u, self.t, self.T, self.p, *(symbol for symbol, _ in more)]
+        function = ca.Function("sampled", symbols, [ca.densify(ca.vec(output)) for output in outputs], {"cse": True})
+        return at_samples(function, x, u, np.reshape(t, (-1, 1)), horizon, p, *(values for _, values in more))
+
     def horizon_at(self, p: Any) -> Any:
         """The fixed horizon at parameters, numbers or symbols."""
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
@@ -154,7 +171,7 @@ class Formulation:
 
         ``cost`` and ``g`` are expressions of x, u, t, T, p and of the data ``d``, whose first entry is the fraction s.
         """
-        v = self.problem.symbols.sym("v", self.nx + self.nu + self.horizon_is_free)
+        v = self.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
         horizon = v[self.nx + self.nu] if self.horizon_is_free else self.horizon_value
         new = [v[: self.nx, :], v[inside, :], d[0] * horizon, horizon]
@@ -174,14 +191,16 @@ class Formulation:
                 raise unknown_name("parameter", name, self.parameters)
         vector = np.zeros(self.np)
         for name, place in self.parameters.items():
-            if name not in given:
-                raise ProblemError(f"parameter {name!r} has no value; give parameters={{{name!r}: ...}}")
-            value = numeric(f"parameter {name!r}", given[name])
-            size = place.stop - place.start
-            if value.size not in (1, size):
-                raise ProblemError(f"parameter {name!r} has {value.size} entries, {size} expected")
-            if not np.all(np.isfinite(value)):
-                raise ProblemError(f"parameter {name!r} is not finite: {value.tolist()}")
+            what, size = f"parameter {name!r}", place.stop - place.start
+            with about(name):
+                if name not in given:
+                    raise ProblemError(f"{what} has no value; give parameters={{{name!r}: ...}}")
+                value = numeric(what, given[name])
+                if value.size not in (1, size):
+                    raise ProblemError(
+                        f"{what} has {value.size} entries, {size} expected", value=value.size, limit=size
+                    )
+                check_finite(what, value)
             vector[place] = value
         return vector
 
@@ -193,17 +212,20 @@ class Formulation:
         for kind, pool in (("state", self.states), ("control", self.controls)):
             for name, part in pool.items():
                 index = places[kind][part]
-                check_order(f"{where}: {kind} {name!r}", lower[index], upper[index])
-                for end in ("initial", "terminal") if kind == "state" else ():
-                    fixed = places[end][part]
-                    values = np.where(lower[fixed] == upper[fixed], lower[fixed], np.nan)
-                    check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
+                with about(name):
+                    check_order(f"{where}: {kind} {name!r}", lower[index], upper[index])
+                    for end in ("initial", "terminal") if kind == "state" else ():
+                        fixed = places[end][part]
+                        values = np.where(lower[fixed] == upper[fixed], lower[fixed], np.nan)
+                        check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
         for rows in (self.path, self.start, self.end):
-            for label, index in zip(rows.labels, rows.bounds, strict=True):
-                check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
+            for owner, label, index in zip(rows.owners, rows.labels, rows.bounds, strict=True):
+                with about(owner):
+                    check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
         index = places["horizon"]
-        check_horizon(f"{where}: horizon", lower[index])
-        check_order(f"{where}: horizon", lower[index], upper[index])
+        with about("horizon"):
+            check_horizon(f"{where}: horizon", lower[index])
+            check_order(f"{where}: horizon", lower[index], upper[index])
         if np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
             raise ProblemError(f"{where}: a bound is not a number")
         return lower, upper
@@ -228,8 +250,7 @@ class Formulation:
         if d.horizon is not None:
             old.append(d.horizon.symbol)
             new.append(self.T)
-        column = self.problem.symbols(expression)
-        return ca.densify(ca.substitute([column], old, new)[0])
+        return ca.densify(ca.substitute([self.problem.symbols(expression)], old, new)[0])
 
     def _rows(self, kind: str, pool: dict[str, Constraint]) -> Rows:
         symbols = self.problem.symbols
@@ -283,6 +304,22 @@ class Formulation:
             offset += lower.numel()
         table = [self._flat(ca.vertcat(*[part[i] for part in parts.values()])) for i in (0, 1)]
         return BoundTable(ca.Function("bounds", [self.p], table), places)
+
+
+def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
+    """A casadi function of columns at M samples; each output (M, n).
+
+    Args:
+        function: Its outputs are columns. columns: Its arguments: an array (M, n) of what differs from sample to
+            sample, or (n,) or a number of what does not.
+    """
+    values = [np.asarray(column, dtype=float) for column in columns]
+    shared = [i for i, value in enumerate(values) if value.ndim < 2]
+    m = next(len(value) for value in values if value.ndim == 2)
+    if m == 0:
+        return [np.zeros((0, function.numel_out(i))) for i in range(function.n_out())]
+    found = function.map("samples", "serial", m, shared, []).call([ca.DM(value.T) for value in values])
+    return [np.asarray(out.full()).T for out in found]
 
 
 def slices(pool: dict[str, Variable]) -> dict[str, slice]:

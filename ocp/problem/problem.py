@@ -1,19 +1,21 @@
 """What is asked: states, controls, parameters, dynamics, constraints, cost. Inert: declaring solves nothing.
 
-A declared problem as text.
+``str(problem)`` shows all that was declared, one thing a line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, about, checked_count, unknown_name
 from ocp.problem.values import (
+    check_finite,
     check_horizon,
     check_inside,
     check_order,
@@ -24,11 +26,25 @@ from ocp.problem.values import (
     stacked,
 )
 
-__all__ = ["Constraint", "Problem", "Variable", "describe"]
+__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Variable"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
 Guess = Any  # a value, or a function of time that returns one
+ENDS = ("initial", "terminal")
 RESERVED = ("t", "time", "horizon")
+WIDTH = 100  # of an expression shown as text
+Declare = TypeVar("Declare", bound=Callable[..., Any])
+
+
+def _about_its_name(method: Declare) -> Declare:
+    """What a declaration raises is about the name it is given."""
+
+    @wraps(method)
+    def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
+        with about(name):
+            return method(self, name, *args, **values)
+
+    return cast(Declare, declare)
 
 
 @dataclass(frozen=True)
@@ -55,6 +71,10 @@ class Variable:
     def size(self) -> int:
         return int(self.symbol.numel())
 
+    def __str__(self) -> str:
+        low, high = _column_text(self.lower), _column_text(self.upper)
+        return f"{self.name} ({self.size})" + ("" if (low, high) == ("-inf", "inf") else f" in [{low}, {high}]")
+
 
 @dataclass(frozen=True)
 class Constraint:
@@ -74,6 +94,10 @@ class Constraint:
     @property
     def size(self) -> int:
         return int(self.expression.numel())
+
+    def __str__(self) -> str:
+        low, high = _column_text(self.lower), _column_text(self.upper)
+        return f"{self.name} ({self.size}): {low} <= {_short(self.expression)} <= {high}"
 
 
 @dataclass
@@ -126,6 +150,7 @@ class Problem:
 
     # ---- variables -------------------------------------------------------------------------------------------
 
+    @_about_its_name
     def state(
         self,
         name: str,
@@ -147,42 +172,29 @@ class Problem:
             lower, upper: Bounds at every time; may be expressions of parameters.
             guess: A value, or a function ``time -> value``.
         """
-        given = {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
-        size = self._size(f"state {name!r}", size, {**given, "guess": guess})
-        symbol = self._symbol("state", name, size)
-        what = f"state {name!r}"
-        low, high = self._bounds(what, size, lower, upper)
-        first = self._column(f"{what}: initial", initial, size, np.nan)
-        last = self._column(f"{what}: terminal", terminal, size, np.nan)
-        for label, value in (("initial", first), ("terminal", last)):
-            check_inside(f"{what}: {label}", constant(value), constant(low), constant(high))
-        self._check_guess(what, guess, size)
-        self.declared.states[name] = Variable(name, symbol, low, high, first, last, guess)
-        return symbol
+        what, given = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
+        variable = self._variable("state", name, size, given, guess)
+        low, high = constant(variable.lower), constant(variable.upper)
+        ends = {label: self._column(f"{what}: {label}", given[label], variable.size, np.nan) for label in ENDS}
+        for label, value in ends.items():
+            check_inside(f"{what}: {label}", constant(value), low, high)
+        self.declared.states[name] = replace(variable, **ends)
+        return variable.symbol
 
+    @_about_its_name
     def control(
-        self,
-        name: str,
-        size: int | None = None,
-        *,
-        lower: Value = None,
-        upper: Value = None,
-        guess: Guess = None,
+        self, name: str, size: int | None = None, *, lower: Value = None, upper: Value = None, guess: Guess = None
     ) -> Any:
         """Declare a control and return its symbol, shape (n, 1). Arguments as for :meth:`state`."""
-        size = self._size(f"control {name!r}", size, {"lower": lower, "upper": upper, "guess": guess})
-        symbol = self._symbol("control", name, size)
-        low, high = self._bounds(f"control {name!r}", size, lower, upper)
-        self._check_guess(f"control {name!r}", guess, size)
-        self.declared.controls[name] = Variable(name, symbol, low, high, guess=guess)
-        return symbol
+        self.declared.controls[name] = self._variable("control", name, size, {"lower": lower, "upper": upper}, guess)
+        return self.declared.controls[name].symbol
 
+    @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
         """Declare a parameter, whose value is given at solve time, and return its symbol, shape (n, 1)."""
         size = self._size(f"parameter {name!r}", size, {})
-        symbol = self._symbol("parameter", name, size)
-        self.declared.parameters[name] = Variable(name, symbol)
-        return symbol
+        self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
+        return self.declared.parameters[name].symbol
 
     def horizon(
         self, value: Value = None, *, lower: Value = None, upper: Value = None, guess: float | None = None
@@ -191,32 +203,9 @@ class Problem:
 
         A free horizon starts at 0 excluded: ``lower`` must be positive (default 1e-6 s).
         """
-        what = f"problem {self.name!r}: horizon"
-        if self.declared.horizon is not None:
-            raise ProblemError(f"{what} is declared twice")
-        symbol = self.symbols.sym("horizon")
-        for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
-            if bound is not None and not is_symbolic(bound) and np.any(np.isnan(numeric(what, bound))):
-                raise ProblemError(f"{what}: {label} is not a number: {bound!r}")
-        if value is not None:
-            if not (lower is None and upper is None and guess is None):
-                raise ProblemError(f"{what}: give a fixed value or lower, upper and guess, not both")
-            low = high = self._column(what, value, 1, np.nan)
-            check_horizon(what, constant(low))
-        else:
-            low = self._column(f"{what}: lower", lower, 1, 1e-6)
-            high = self._column(f"{what}: upper", upper, 1, np.inf)
-            check_horizon(f"{what}: lower", constant(low))
-            check_order(what, constant(low), constant(high))
-            if guess is not None:
-                number = numeric(f"{what}: guess", guess)
-                if number.size != 1 or np.isnan(number[0]):
-                    raise ProblemError(f"{what}: guess must be one number, not {guess!r}")
-                check_horizon(f"{what}: guess", number)
-                check_inside(f"{what}: guess", number, constant(low), constant(high))
-                guess = float(number[0])
-        self.declared.horizon = Horizon(symbol, low, high, guess, value is not None)
-        return symbol
+        with about("horizon"):
+            self.declared.horizon = self._horizon(f"problem {self.name!r}: horizon", value, lower, upper, guess)
+        return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
         """Symbol of a state or control at the start, for conditions that tie both ends. Shape (n, 1)."""
@@ -231,25 +220,28 @@ class Problem:
         """Declare ``d state / dt = derivative``, shape (n, 1), of states, controls, parameters, time, horizon."""
         found = self._find(self.declared.states, state, "dynamics")
         if found.name in self.declared.dynamics:
-            raise ProblemError(f"state {found.name!r}: dynamics declared twice")
+            raise ProblemError(f"state {found.name!r}: dynamics declared twice", name=found.name)
         what = f"dynamics of {found.name!r}"
-        expression = self._expression(what, derivative, self._inner())
-        if expression.numel() != found.size:
-            raise ProblemError(f"{what} has {expression.numel()} entries, the state has {found.size}")
+        with about(found.name):
+            expression = self._expression(what, derivative, self._inner())
+            if expression.numel() != found.size:
+                raise ProblemError(f"{what} has {expression.numel()} entries, the state has {found.size}")
         self.declared.dynamics[found.name] = expression
 
+    @_about_its_name
     def path(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
         """Declare ``lower <= expression <= upper`` at every time; equal bounds make an equality."""
-        self._constrain(self.declared.path, "path", name, expression, lower, upper, self._inner())
+        self._constrain("path", name, expression, lower, upper)
 
+    @_about_its_name
     def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
         """Declare ``lower <= expression <= upper`` at the start."""
-        self._constrain(self.declared.start, "start", name, expression, lower, upper, self._inner())
+        self._constrain("start", name, expression, lower, upper)
 
+    @_about_its_name
     def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
         """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
-        known = self._inner() + list(self.declared.at_start.values())
-        self._constrain(self.declared.end, "end", name, expression, lower, upper, known)
+        self._constrain("end", name, expression, lower, upper, list(self.declared.at_start.values()))
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
@@ -272,18 +264,79 @@ class Problem:
             raise ProblemError(f"problem {self.name!r} has no state; declare one with problem.state(...)")
         for name in self.declared.states:
             if name not in self.declared.dynamics:
-                raise ProblemError(f"state {name!r} has no dynamics; declare problem.dynamics({name}, ...)")
+                raise ProblemError(f"state {name!r} has no dynamics; declare problem.dynamics({name}, ...)", name=name)
         if self.declared.horizon is None:
-            raise ProblemError(f"problem {self.name!r} has no horizon; declare problem.horizon(...)")
+            raise ProblemError(f"problem {self.name!r} has no horizon; declare problem.horizon(...)", name="horizon")
 
     def __str__(self) -> str:
-        return describe(self.name, self.declared)
+        """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
+        d, lines = self.declared, [f"Problem {self.name!r}"]
+        if d.horizon is None:
+            lines.append("  horizon      not declared")
+        elif d.horizon.fixed:
+            lines.append(f"  horizon      {_column_text(d.horizon.lower)} s")
+        else:
+            lines.append(f"  horizon      free in [{_column_text(d.horizon.lower)}, {_column_text(d.horizon.upper)}] s")
+        for state in d.states.values():
+            ends = [f"; {end} {text}" for end in ENDS if (text := _column_text(getattr(state, end))) != "nan"]
+            lines.append(f"  state        {state}{''.join(ends)}")
+        lines += [f"  control      {control}" for control in d.controls.values()]
+        lines += [f"  parameter    {p.name} ({p.size})" for p in d.parameters.values()]
+        lines += [f"  d{state}/dt = {_short(rate)}" for state, rate in d.dynamics.items()]
+        for kind in ("path", "start", "end"):
+            lines += [f"  {kind:<12} {constraint}" for constraint in getattr(d, kind).values()]
+        if d.running is not None:
+            lines.append(f"  minimize     integral of {_short(d.running)} dt + {_short(d.terminal)}")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         d = self.declared
         return f"<Problem {self.name!r}: {len(d.states)} states, {len(d.controls)} controls>"
 
     # ---- checks ----------------------------------------------------------------------------------------------
+
+    def _variable(self, kind: str, name: str, size: int | None, given: dict[str, Value], guess: Guess) -> Variable:
+        what = f"{kind} {name!r}"
+        size = self._size(what, size, {**given, "guess": guess})
+        symbol = self._symbol(kind, name, size)
+        low, high = self._bounds(what, size, given["lower"], given["upper"])
+        if guess is not None and not callable(guess):
+            array = numeric(f"{what}: guess", guess)
+            check_finite(f"{what}: guess", array)
+            if array.size not in (1, size):
+                raise ProblemError(f"{what}: guess has {array.size} entries, {size} expected")
+        return Variable(name, symbol, low, high, guess=guess)
+
+    def _horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
+        if self.declared.horizon is not None:
+            raise ProblemError(f"{what} is declared twice")
+        for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
+            self._check_number(what, label, bound)
+        symbol = self.symbols.sym("horizon")
+        if value is not None:
+            if not (lower is None and upper is None and guess is None):
+                raise ProblemError(f"{what}: give a fixed value or lower, upper and guess, not both")
+            fixed = self._column(what, value, 1, np.nan)
+            check_horizon(what, constant(fixed))
+            return Horizon(symbol, fixed, fixed, None, fixed=True)
+        low = self._column(f"{what}: lower", lower, 1, 1e-6)
+        high = self._column(f"{what}: upper", upper, 1, np.inf)
+        check_horizon(f"{what}: lower", constant(low))
+        check_order(what, constant(low), constant(high))
+        if guess is not None:
+            number = numeric(f"{what}: guess", guess)
+            if number.size != 1 or np.isnan(number[0]):
+                raise ProblemError(f"{what}: guess must be one number, not {guess!r}", value=guess)
+            check_horizon(f"{what}: guess", number)
+            check_inside(f"{what}: guess", number, constant(low), constant(high))
+            guess = float(number[0])
+        return Horizon(symbol, low, high, guess, fixed=False)
+
+    @staticmethod
+    def _check_number(what: str, label: str, bound: Value) -> None:
+        """Raise where a bound that is given as numbers holds one that is nan."""
+        if bound is not None and not is_symbolic(bound) and np.any(np.isnan(numeric(what, bound))):
+            raise ProblemError(f"{what}: {label} is not a number: {bound!r}", value=bound)
 
     def _horizon_symbol(self) -> list[Any]:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
@@ -306,9 +359,7 @@ class Problem:
 
     def _size(self, what: str, size: int | None, given: dict[str, Value]) -> int:
         if size is not None:
-            if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
-                raise ProblemError(f"{what}: size must be a positive integer, not {size!r}")
-            return int(size)
+            return checked_count(f"{what}: size", size)
         plain = {f"{what}: {k}": v for k, v in given.items() if v is not None and not callable(v)}
         lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in plain.items()}
         for label, n in lengths.items():
@@ -340,19 +391,9 @@ class Problem:
         low = self._column(f"{what}: lower", lower, size, -np.inf)
         high = self._column(f"{what}: upper", upper, size, np.inf)
         for label, value in (("lower", lower), ("upper", upper)):
-            if value is not None and not is_symbolic(value) and np.any(np.isnan(numeric(what, value))):
-                raise ProblemError(f"{what}: {label} is not a number: {value!r}")
+            self._check_number(what, label, value)
         check_order(what, constant(low), constant(high))
         return low, high
-
-    def _check_guess(self, what: str, guess: Guess, size: int) -> None:
-        if guess is None or callable(guess):
-            return
-        array = numeric(f"{what}: guess", guess)
-        if not np.all(np.isfinite(array)):
-            raise ProblemError(f"{what}: guess is not finite: {array.tolist()}")
-        if array.size not in (1, size):
-            raise ProblemError(f"{what}: guess has {array.size} entries, {size} expected")
 
     def _expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
         if value is None or isinstance(value, str):
@@ -367,8 +408,7 @@ class Problem:
                 raise ProblemError(f"{what} is not finite: {expression}")
         else:
             array = numeric(what, value)
-            if not np.all(np.isfinite(array)):
-                raise ProblemError(f"{what} is not finite: {array.tolist()}")
+            check_finite(what, array)
             expression = self.symbols(ca.DM(array))
         identities = {identity(s) for symbol in known for s in ca.symvar(symbol)}
         for symbol in ca.symvar(expression):
@@ -395,84 +435,35 @@ class Problem:
         )
 
     def _constrain(
-        self,
-        pool: dict[str, Constraint],
-        kind: str,
-        name: str,
-        expression: Value,
-        lower: Value,
-        upper: Value,
-        known: Sequence[Any],
+        self, kind: str, name: str, expression: Value, lower: Value, upper: Value, known: Sequence[Any] = ()
     ) -> None:
+        """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""
         what = f"{kind} constraint {name!r}"
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} constraint: its name must be a non-empty string, not {name!r}")
         for other in (self.declared.path, self.declared.start, self.declared.end):
             if name in other:
                 raise ProblemError(f"{what}: a constraint of this name exists already")
-        vector = self._expression(what, expression, known)
+        vector = self._expression(what, expression, [*self._inner(), *known])
         if vector.numel() == 0:
             raise ProblemError(f"{what} is empty")
         if lower is None and upper is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
-        pool[name] = Constraint(name, vector, low, high)
+        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high)
 
 
-WIDTH = 100
-
-
-def describe(name: str, declared: Declarations) -> str:
-    """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
-    lines = [f"Problem {name!r}"]
-    horizon = declared.horizon
-    if horizon is None:
-        lines.append("  horizon      not declared")
-    elif horizon.fixed:
-        lines.append(f"  horizon      {column(horizon.lower)} s")
-    else:
-        lines.append(f"  horizon      free in [{column(horizon.lower)}, {column(horizon.upper)}] s")
-    for state in declared.states.values():
-        ends = [f"{k} {column(v)}" for k, v in (("initial", state.initial), ("terminal", state.terminal)) if set_(v)]
-        lines.append(f"  state        {variable(state)}{''.join('; ' + end for end in ends)}")
-    lines += [f"  control      {variable(control)}" for control in declared.controls.values()]
-    lines += [f"  parameter    {p.name} ({p.size})" for p in declared.parameters.values()]
-    lines += [f"  d{state}/dt = {short(rate)}" for state, rate in declared.dynamics.items()]
-    for kind in ("path", "start", "end"):
-        lines += [f"  {kind:<12} {constraint(c)}" for c in getattr(declared, kind).values()]
-    if declared.running is not None:
-        lines.append(f"  minimize     integral of {short(declared.running)} dt + {short(declared.terminal)}")
-    return "\n".join(lines)
-
-
-def variable(item: Variable) -> str:
-    bounds = "" if unbounded(item) else f" in [{column(item.lower)}, {column(item.upper)}]"
-    return f"{item.name} ({item.size}){bounds}"
-
-
-def constraint(item: Constraint) -> str:
-    return f"{item.name} ({item.size}): {column(item.lower)} <= {short(item.expression)} <= {column(item.upper)}"
-
-
-def unbounded(item: Variable) -> bool:
-    return column(item.lower) == "-inf" and column(item.upper) == "inf"
-
-
-def set_(value: Any) -> bool:
-    return column(value) != "nan"
-
-
-def column(value: Any) -> str:
+def _column_text(value: Any) -> str:
     """A column of numbers or expressions; one number where all entries are the same."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
-            return short(str(value))
+            return _short(str(value))
         value = ca.evalf(value)
     entries = [str(entry) for entry in ca.vertsplit(value)]
-    return entries[0] if len(set(entries)) == 1 else short("[" + ", ".join(entries) + "]")
+    return entries[0] if len(set(entries)) == 1 else _short("[" + ", ".join(entries) + "]")
 
 
-def short(expression: Any) -> str:
+def _short(expression: Any) -> str:
     """An expression on one line of bounded length. SX prints its shared parts first; only bounded text is kept."""
     if not isinstance(expression, str) and ca.Function("size", ca.symvar(expression), [expression]).n_nodes() > 60:
         return f"expression of {', '.join(s.name() for s in ca.symvar(expression)[:8])}, ..."

@@ -10,6 +10,7 @@ import numpy as np
 from ocp.errors import ProblemError
 
 __all__ = [
+    "check_finite",
     "check_horizon",
     "check_inside",
     "check_order",
@@ -18,6 +19,7 @@ __all__ = [
     "is_symbolic",
     "numeric",
     "stacked",
+    "symbols_of",
     "table",
 ]
 
@@ -34,7 +36,13 @@ def stacked(what: str, value: Any) -> Any:
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
     except NotImplementedError as error:
-        raise ProblemError(f"{what}: a flat list of numbers and expressions is expected, not {value!r}") from error
+        words = f"{what}: a flat list of numbers and expressions is expected, not {value!r}"
+        raise ProblemError(words, value=value) from error
+
+
+def symbols_of(*functions: Any) -> Any:
+    """The symbols to call functions with: ``casadi.SX`` where all are made of SX, which inlines them, else MX."""
+    return ca.SX if all(function.is_a("SXFunction") for function in functions) else ca.MX
 
 
 def identity(symbol: Any) -> int:
@@ -55,7 +63,8 @@ def table(what: str, value: Any) -> np.ndarray:
             raise TypeError("a string")
         return np.asarray(plain, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ProblemError(f"{what}: numbers or expressions are expected, not {value!r}") from error
+        words = f"{what}: numbers or expressions are expected, not {value!r}"
+        raise ProblemError(words, value=value) from error
 
 
 def constant(expression: Any) -> np.ndarray:
@@ -68,25 +77,35 @@ def constant(expression: Any) -> np.ndarray:
     return np.array([float(entry) if entry.is_constant() else np.nan for entry in entries])
 
 
+def check_finite(what: str, value: np.ndarray) -> None:
+    """Raise where an entry is infinite or not a number."""
+    if not np.all(np.isfinite(value)):
+        raise ProblemError(f"{what} is not finite: {value.tolist()}", value=value.tolist())
+
+
 def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
     """Raise where a lower bound lies above its upper bound, or bounds cannot be met at all."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        given: dict[str, Any] = {"value": float(low), "limit": float(high)}
         if low > high:
-            raise ProblemError(f"{what}: lower bound {low:g} is above upper bound {high:g} (entry {i})")
+            raise ProblemError(f"{what}: lower bound {low:g} is above upper bound {high:g} (entry {i})", **given)
         if low == np.inf or high == -np.inf:
-            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})")
+            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})", **given)
 
 
 def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
     """Raise where a value (nan: free) is infinite or lies outside its bounds (nan: not known yet)."""
     for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
+        given: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
         if np.isinf(number):
-            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free")
+            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free", **given)
         if number < low or number > high:
-            raise ProblemError(f"{what} value {number:g} is outside the bounds [{low:g}, {high:g}] (entry {i})")
+            words = f"{what} value {number:g} is outside the bounds [{low:g}, {high:g}] (entry {i})"
+            raise ProblemError(words, **given)
 
 
 def check_horizon(what: str, value: np.ndarray) -> None:
     """Raise unless a horizon is a positive finite number (nan: an expression of parameters)."""
     if np.isinf(value[0]) or value[0] <= 0:
-        raise ProblemError(f"{what} must be positive and finite, not {value[0]:g} s")
+        words = f"{what} must be positive and finite, not {value[0]:g} s"
+        raise ProblemError(words, value=float(value[0]))
