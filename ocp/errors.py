@@ -5,7 +5,7 @@ Each message names the offending thing, its value and what to do; the exception 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
@@ -21,6 +21,7 @@ __all__ = [
     "about",
     "checked_choice",
     "checked_count",
+    "checked_mapping",
     "checked_positive",
     "unknown_name",
 ]
@@ -99,11 +100,13 @@ def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
     return value
 
 
-def checked_count(what: str, value: Any, least: int = 1) -> int:
-    """``value`` as a plain integer, or ProblemError unless it is a whole number and at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+def checked_count(what: str, value: Any, least: int = 1, most: int | None = None) -> int:
+    """``value`` as a plain integer, or ProblemError unless it is a whole number from ``least`` to ``most``."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
         kind = "a positive integer" if least == 1 else f"a whole number, at least {least}"
-        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=least)
+        kind = kind if most is None else f"{least} to {most}"
+        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=(least, most))
     return int(value)
 
 
@@ -117,6 +120,13 @@ def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
         kind = "positive and finite" if below == np.inf else f"between 0 and {below:g}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
     return value  # type: ignore[return-value]
+
+
+def checked_mapping(what: str, values: Any) -> dict[str, Any]:
+    """A dictionary by name, or nothing, as a dictionary of its own; ProblemError for anything else."""
+    if not isinstance(values, Mapping | None):
+        raise ProblemError(f"{what} must be a dictionary by name, not {values!r}", name=_last(what), value=values)
+    return dict(values or {})
 
 
 def _last(what: str) -> str:

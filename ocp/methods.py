@@ -1,29 +1,53 @@
-"""One way in: ``solve(problem, method)``, and ``prepare`` for problems that are solved many times."""
+"""``solve(problem, method)``, and ``prepare`` for problems that are solved many times."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
-from ocp.direct.nlp import SOLVERS
-from ocp.direct.prepared import Method, Prepared, by_name
 from ocp.errors import ProblemError
-from ocp.indirect.method import Indirect, PreparedIndirect
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import Solution
 
-__all__ = ["prepare", "solve"]
+__all__ = ["Method", "PreparedProblem", "prepare", "solve"]
+
+
+class PreparedProblem(Protocol):
+    """A problem that a method has made ready to be solved many times."""
+
+    def solve(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        guess: Solution | Mapping[str, Any] | None = None,
+        check: bool = True,
+    ) -> Solution:
+        """Solve with these parameters from this guess; see :func:`solve`."""
+        ...
+
+
+class Method(Protocol):
+    """What solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
+
+    def prepare(
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: Mapping[str, Any] | None = None,
+        compiled: bool = False,
+    ) -> PreparedProblem:
+        """Build a problem once, to be solved many times; see :func:`prepare`."""
+        ...
 
 
 def prepare(
     problem: Problem,
-    method: Method | Indirect,
+    method: Method,
     *,
     solver: str = "ipopt",
     options: Mapping[str, Any] | None = None,
     compiled: bool = False,
-) -> Prepared | PreparedIndirect:
+) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
     Args:
@@ -36,21 +60,17 @@ def prepare(
     Raises:
         ProblemError: The problem is not complete, or the method or solver cannot take it.
     """
-    if isinstance(method, Indirect):
-        if solver not in SOLVERS:
-            raise ProblemError(f"unknown solver {solver!r}; known: {', '.join(SOLVERS)}")
-        seeder = partial(_seed, solver=solver, options=by_name("options", options), compiled=compiled)
-        return PreparedIndirect(problem, method, seeder)
-    return Prepared(problem, method, solver, options or {}, compiled)
-
-
-def _seed(problem: Problem, method: Method, parameters: Any, guess: Any, **how: Any) -> Solution:
-    return prepare(problem, method, **how).solve(parameters, guess)
+    checked_problem(problem)
+    if not callable(getattr(type(method), "prepare", None)):
+        raise ProblemError(
+            f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
+        )
+    return method.prepare(problem, solver=solver, options=options, compiled=compiled)
 
 
 def solve(
     problem: Problem,
-    method: Method | Indirect,
+    method: Method,
     *,
     parameters: Mapping[str, Any] | None = None,
     solver: str = "ipopt",

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ocp.direct.collocation import Collocation
-from ocp.direct.shooting import MultipleShooting
-from ocp.direct.transcription import fractions
-from ocp.errors import ProblemError, RefinementWarning
+from ocp.direct.prepared import DirectMethod, check_meshed
+from ocp.errors import ProblemError, RefinementWarning, checked_count
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Refinement, Solution
@@ -26,7 +24,7 @@ ROUNDS = 20
 
 def refine(
     problem: Problem,
-    method: Collocation | MultipleShooting,
+    method: DirectMethod,
     *,
     tolerance: float = 1e-6,
     max_intervals: int = 400,
@@ -57,15 +55,15 @@ def refine(
     Warns:
         RefinementWarning: The cap (or the least width) stopped it before the tolerance was reached.
     """
-    if not isinstance(method, Collocation | MultipleShooting):
-        raise ProblemError(f"refine: Collocation(...) or MultipleShooting(...) is expected, not {method!r}")
-    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
-        raise ProblemError(f"refine: tolerance must be positive and finite, not {tolerance!r}")
-    if not isinstance(max_intervals, int | np.integer):
-        raise ProblemError(f"refine: max_intervals must be a whole number, not {max_intervals!r}")
+    check_meshed("refine", method, tolerance)
+    max_intervals = checked_count("refine: max_intervals", max_intervals)
     if max_intervals < method.intervals:
-        raise ProblemError(f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given")
-    order = method.degree + 1 if isinstance(method, Collocation) else 4
+        raise ProblemError(
+            f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given",
+            name="max_intervals",
+            value=max_intervals,
+            limit=method.intervals,
+        )
     intervals: list[int] = []
     errors: list[float] = []
     while True:
@@ -74,19 +72,18 @@ def refine(
         intervals.append(method.intervals)
         errors.append(audit.integration_error)
         reached = audit.integration_error <= tolerance
-        mesh = fractions(method.intervals, method.mesh)
-        finer = split(mesh, audit.local_errors, SAFETY * tolerance, order, max_intervals)
-        if reached or len(finer) == len(mesh) or len(errors) == ROUNDS:
+        finer = split(method.fractions, audit.local_errors, SAFETY * tolerance, method.order, max_intervals)
+        if reached or len(finer) == method.intervals + 1 or len(errors) == ROUNDS:
             break
-        method = dataclasses.replace(method, intervals=len(finer) - 1, mesh=tuple(finer.tolist()))
+        method = method.with_mesh(finer)
         guess = solution
     if not reached:
-        warnings.warn(
+        words = (
             f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals with an "
-            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals",
-            RefinementWarning,
-            stacklevel=2,
+            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals"
         )
+        told = RefinementWarning(words, name="integration error", value=errors[-1], limit=tolerance)
+        warnings.warn(told, stacklevel=2)
     return dataclasses.replace(solution, refinement=Refinement(tuple(intervals), tuple(errors), tolerance, reached))
 
 

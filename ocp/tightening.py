@@ -9,14 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from ocp.direct.collocation import Collocation
 from ocp.direct.fragment import Fragment
-from ocp.direct.prepared import Prepared
-from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, SolveError
+from ocp.direct.prepared import DirectMethod, check_meshed
+from ocp.errors import SolveError
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
@@ -29,7 +26,7 @@ FURTHER = 1.2  # share of the excess that a bound is drawn in by: the plan follo
 
 def tighten(
     problem: Any,
-    method: Collocation | MultipleShooting,
+    method: DirectMethod,
     *,
     tolerance: float = 1e-6,
     parameters: Mapping[str, Any] | None = None,
@@ -51,11 +48,8 @@ def tighten(
         ProblemError: tolerance not positive, another method.
         SolveError: A solve failed, or the excess does not fall under the tolerance; says what remains and where.
     """
-    if not isinstance(method, Collocation | MultipleShooting):
-        raise ProblemError(f"tighten: Collocation(...) or MultipleShooting(...) is expected, not {method!r}")
-    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
-        raise ProblemError(f"tighten: tolerance must be positive and finite, not {tolerance!r}")
-    prepared = Prepared(problem, method, solver, options or {}, False)
+    check_meshed("tighten", method, tolerance)
+    prepared = method.prepare(problem, solver=solver, options=options)
     form, fragment = prepared.formulation, prepared.fragment
     p = form.parameter_vector(dict(parameters or {}))
     bounds = form.bound_values(p)
@@ -78,6 +72,10 @@ def tighten(
         f"problem {form.name!r}: after {ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
         f"between {times[k]:.4g} and {times[k + 1]:.4g} s; take more intervals",
         solution,
+        name=labels[i],
+        value=float(either[k, i]),
+        limit=tolerance,
+        time=float(times[k]),
     )
 
 
@@ -112,11 +110,8 @@ def _excess(
     s = breaks[owner] + np.diff(breaks)[owner] * np.tile(place, n)
     x = solution.state_interpolant(s)
     u = solution.control_interpolant.within(owner, np.tile(place, n))
-    rows = ca.Function("rows", [form.x, form.u, form.t, form.T, form.p], [form.path.expression])
-    m, horizon = len(s), solution.horizon
-    ones = np.ones((1, m))
-    inputs = (x.T, u.T, horizon * s[None, :], horizon * ones, p[:, None] * ones)
-    g = np.asarray(rows.map(m, "serial").call([ca.DM(value) for value in inputs])[0].full()).T
+    horizon = solution.horizon
+    g = form.sampled([form.path.expression], x, u, horizon * s, horizon, p)[0]
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
     low, high = bounds[0][index], bounds[1][index]
     given = np.where(low < high, 1.0, np.nan)  # equalities are not looked at

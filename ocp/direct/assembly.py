@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.direct.fragment import Block, Fragment
+from ocp.problem.values import symbols_of
 
 __all__ = ["Program", "assemble"]
 
@@ -103,7 +104,7 @@ def parametric(fragment: Fragment, x: Any, p: Any, lam: Any) -> Any:
         return total
     for block in fragment.blocks:
         function = block.function
-        symbol = (ca.SX if function.is_a("SXFunction") else ca.MX).sym
+        symbol = symbols_of(function).sym
         v, d, q = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
         cost, g = function(v, d, q)
         mu = symbol("mu", g.numel())
@@ -115,7 +116,7 @@ def parametric(fragment: Fragment, x: Any, p: Any, lam: Any) -> Any:
 def derive(block: Block, options: dict[str, Any]) -> Derived:
     """Derivatives of one block, exact and symbolic."""
     function = block.function
-    symbol = (ca.SX if function.is_a("SXFunction") else ca.MX).sym
+    symbol = symbols_of(function).sym
     v, d, p = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
     cost, g = function(v, d, p)
     sigma, lam = symbol("sigma"), symbol("lam", g.numel())

@@ -14,15 +14,16 @@ import numpy as np
 
 from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange, quadrature_weights
 from ocp.direct.fragment import Block, Fragment
-from ocp.direct.transcription import FragmentBuilder, check_intervals, fractions, settled
-from ocp.errors import ProblemError
+from ocp.direct.prepared import DirectMethod
+from ocp.direct.transcription import FragmentBuilder
+from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
 
 __all__ = ["Collocation"]
 
 
 @dataclass(frozen=True)
-class Collocation:
+class Collocation(DirectMethod):
     """Direct collocation on a mesh of intervals.
 
     Attributes:
@@ -44,25 +45,22 @@ class Collocation:
     mesh: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        check_intervals("Collocation", self.intervals, self.mesh)
-        integer = isinstance(self.degree, int | np.integer) and not isinstance(self.degree, bool)
-        if not (integer and 1 <= self.degree <= 9):
-            raise ProblemError(f"Collocation: degree must be 1 to 9, not {self.degree!r}")
-        if self.scheme not in ("radau", "legendre"):
-            raise ProblemError(f"Collocation: scheme must be 'radau' or 'legendre', not {self.scheme!r}")
-        if self.control not in ("points", "held"):
-            raise ProblemError(f"Collocation: control must be 'points' or 'held', not {self.control!r}")
-        settled(self, intervals=self.intervals, degree=self.degree)
+        self._settle("degree", most=9)
+        checked_choice("Collocation: scheme", self.scheme, ("radau", "legendre"))
+        checked_choice("Collocation: control", self.control, ("points", "held"))
+
+    @property
+    def order(self) -> int:
+        return self.degree + 1
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
-        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
         return transcribe(self, form, staged)
 
 
 def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment:
     d, nx, nu = method.degree, form.nx, form.nu
     radau, held = method.scheme == "radau", method.control == "held"
-    mesh = fractions(method.intervals, method.mesh)
+    mesh = method.fractions
     n, width = len(mesh) - 1, np.diff(mesh)
     stages = np.arange(n)
     points = np.array(ca.collocation_points(d, method.scheme))
@@ -102,7 +100,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
         (np.repeat(controls[:, 0], d, axis=0) if held else controls.reshape(n * d, nu)).T,
         stage_of,
     )
-    data = form.problem.symbols.sym("d", 3)  # fraction, width, weight
+    data = form.sym("d", 3)  # fraction, width, weight
     function = form.point_function(
         "point",
         data,

@@ -1,10 +1,9 @@
-"""Words for what went wrong where a solver failed.
+"""What went wrong where a solver failed: what cannot hold together, where, and by how much.
 
-Which constraints cannot hold together, where, and by how much: the least that would have to give way.
-
-A solver that fails leaves its last iterate, whose residuals are spread over constraints and dynamics alike. Here the
-dynamics and the given ends hold, and every constraint and bound may be missed by an amount of its own, the same at all
-times: the plan with the least sum of these amounts, each relative to the size of its constraint, is the answer.
+A solver that fails leaves its last iterate, whose residuals are spread over constraints and dynamics alike. So an
+elastic program is solved: the dynamics and the given ends hold, and every constraint and bound may be missed by an
+amount of its own, the same at all times. The plan with the least sum of these amounts, each relative to the size of its
+constraint, names the least that would have to give way.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import numpy as np
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
+from ocp.errors import SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 
@@ -25,6 +25,10 @@ __all__ = ["Conflict", "conflicts", "diagnosis"]
 
 WORST = 6  # lines of one kind
 MISSED = 1e-6  # residual from which a plan counts as not feasible
+ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
+COST_SHARE = 1e-3  # of the problem's own cost, which makes the elastic plan unique
+EQUALITY_PRICE = 10.0  # how much dearer it is to miss an equality, which is what is asked for, than a limit
+HELD = 1e-5  # amount below which a constraint holds, relative to its size
 
 
 class Built(Protocol):
@@ -37,15 +41,31 @@ class Built(Protocol):
     program: Program
 
 
-def diagnosis(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> str:
-    """What went wrong: what cannot hold together, and the worst residuals by constraint, state and time."""
+def diagnosis(
+    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float, solution: Any = None
+) -> SolveError:
+    """The error that says what cannot hold together, and the worst residuals by constraint, state and time."""
     labels, at, value, miss = residuals(built, outcome.variables, arguments)
     lines = [f"problem {built.problem.name!r}: {built.solver_name} ended with {outcome.status}"]
-    lines += conflict_lines(built, outcome, arguments, horizon)
+    found: list[Conflict] | None = None
+    if "User_Requested_Stop" not in outcome.status and np.all(np.isfinite(value)) and np.any(miss > MISSED):
+        found = conflicts(built.formulation, built.fragment, built.program, arguments, horizon)
+    if found:
+        lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
+        lines += [f"  {conflict}" for conflict in found[:WORST]]
+    elif found is not None:
+        lines.append(
+            "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
+            "another guess or grid, or raise max_iter"
+        )
     lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
+    worst: list[dict[str, Any]] = [
+        {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in (found or ())[:1]
+    ]
     broken = np.flatnonzero(~np.isfinite(value))
     for i in broken[:WORST]:
         lines.append(f"  {labels[i]} is not finite at {at[i] * horizon:.4g} s")
+        worst.append({"name": labels[i], "value": float(value[i]), "time": float(at[i] * horizon)})
     seen: set[str] = set()
     for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
         if len(seen) == WORST or not miss[i] > 1e-8:
@@ -53,10 +73,11 @@ def diagnosis(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], 
         if labels[i] not in seen:
             seen.add(labels[i])
             lines.append(f"  {labels[i]} is missed by {miss[i]:.3g} at {at[i] * horizon:.4g} s")
+            worst.append({"name": labels[i], "value": float(miss[i]), "limit": 0.0, "time": float(at[i] * horizon)})
     lines += at_bounds(built, outcome.variables, arguments, horizon)
     if not seen and not broken.size:
         lines.append("  all constraints are met; the plan is feasible but not optimal")
-    return "\n".join(lines)
+    return SolveError("\n".join(lines), solution, found or (), **(worst[0] if worst else {}))
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
@@ -90,40 +111,31 @@ def residuals(
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
     except RuntimeError:  # an integrator breaks down
         g = np.full(fragment.n_rows, np.nan)
-    names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
+    names = variable_labels(form, fragment)
     bounds = [
-        f"{'' if role == 'horizon' else role + ' '}{names[role][entry]}" if role else "a stage variable"
-        for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+        f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
+        for role, name in zip(fragment.variable_role, names, strict=True)
     ]
     value = np.concatenate([g, v])
-    lower, upper = (np.concatenate([arguments[s + "g"], arguments[s + "x"]]) for s in ("lb", "ub"))
+    lower, upper = both_bounds(arguments)
     at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
     labels = [*fragment.row_labels, *(f"bound of {name}" for name in bounds)]
     return labels, at, value, np.maximum(lower - value, value - upper)
 
 
-def conflict_lines(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """What would have to give way for a plan to exist, where the solver came to no feasible one."""
-    value, miss = residuals(built, outcome.variables, arguments)[2:]
-    if "User_Requested_Stop" in outcome.status or not np.all(np.isfinite(value)) or not np.any(miss > MISSED):
-        return []
-    found = conflicts(built.formulation, built.fragment, built.program, arguments, horizon)
-    if found is None:
-        return []
-    if not found:
-        return [
-            "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
-            "another guess or grid, or raise max_iter"
-        ]
-    return ["not all constraints can hold together near the guess; with the dynamics and the given ends held,"] + [
-        f"  {conflict}" for conflict in found[:WORST]
+def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of the rows, then of the variables."""
+    low, high = (np.concatenate([arguments[f"{side}g"], arguments[f"{side}x"]]) for side in ("lb", "ub"))
+    return low, high
+
+
+def variable_labels(form: Formulation, fragment: Fragment) -> list[str]:
+    """Name of the state, control or horizon that each variable is; "" of a copy that a stage carries."""
+    names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
+    return [
+        names[role][entry] if role else ""
+        for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
     ]
-
-
-IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
-COST = 1e-3  # share of the problem's own cost, which makes the plan unique
-TASK = 10.0  # how much dearer it is to miss an equality, which is what is asked for, than a limit
-LEAST = 1e-5  # amount below which a constraint holds, relative to its size
 
 
 @dataclass(frozen=True)
@@ -144,8 +156,13 @@ class Conflict:
     fraction: float
     horizon: float
 
+    @property
+    def time(self) -> float | None:
+        """When it is missed most, s; None of the horizon itself."""
+        return None if self.label == "horizon" else self.fraction * self.horizon
+
     def __str__(self) -> str:
-        time = f" at {self.fraction * self.horizon:.4g} s" if self.label != "horizon" else ""
+        time = "" if self.time is None else f" at {self.time:.4g} s"
         return f"{self.label} would have to go {self.amount:.3g} beyond its {self.side} bound {self.bound:.4g}{time}"
 
 
@@ -165,7 +182,7 @@ def conflicts(
     rows, columns = soft.picks(n, m, k)
     with np.errstate(all="ignore"):
         size = float(program.values(arguments["x0"], arguments["p"])[0])
-    share = COST / max(1.0, abs(size)) if np.isfinite(size) else 0.0
+    share = COST_SHARE / max(1.0, abs(size)) if np.isfinite(size) else 0.0
     lam, sigma = ca.MX.sym("lam", rows.shape[0]), ca.MX.sym("sigma")
     cost, slope = program.gradient(v, p)
     values, jacobian = program.jacobian(v, p)
@@ -180,7 +197,7 @@ def conflicts(
         "print_time": False,
         "error_on_fail": False,
         "show_eval_warnings": False,
-        "ipopt": IPOPT,
+        "ipopt": ELASTIC_IPOPT,
     }
     lower, upper = soft.limits(arguments)
     try:
@@ -211,14 +228,8 @@ class _Soft:
 
     def __init__(self, form: Formulation, fragment: Fragment, arguments: dict[str, np.ndarray]) -> None:
         places = form.bounds.places
-        names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
-        variables = [
-            names[role][entry] if role else ""
-            for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
-        ]
-        owner = np.array([*fragment.row_labels, *variables])
-        low = np.concatenate([arguments["lbg"], arguments["lbx"]])
-        high = np.concatenate([arguments["ubg"], arguments["ubx"]])
+        owner = np.array([*fragment.row_labels, *variable_labels(form, fragment)])
+        low, high = both_bounds(arguments)
         declared = np.concatenate([places[kind] for kind in ("path", "start", "end")])
         is_soft = np.concatenate([np.isin(fragment.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
         self.lower = np.flatnonzero(is_soft & np.isfinite(low) & (owner != "horizon"))
@@ -233,7 +244,7 @@ class _Soft:
         self.sizes = np.full(len(self.labels), np.inf)
         np.minimum.at(self.sizes, index, size[np.concatenate([self.lower, self.upper])])
         self.prices = 1 / self.sizes
-        self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= TASK
+        self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= EQUALITY_PRICE
         relaxed = is_soft[fragment.n_rows :]
         horizon = fragment.variable_role == "horizon"
         self.low = np.where(relaxed & ~horizon, -np.inf, arguments["lbx"])
@@ -254,25 +265,23 @@ class _Soft:
 
     def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the elastic rows."""
-        low = np.concatenate([arguments["lbg"], arguments["lbx"]])
-        high = np.concatenate([arguments["ubg"], arguments["ubx"]])
+        low, high = both_bounds(arguments)
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
     def read(self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[Conflict]:
-        low = np.concatenate([arguments["lbg"], arguments["lbx"]])
-        high = np.concatenate([arguments["ubg"], arguments["ubx"]])
+        low, high = both_bounds(arguments)
         found: dict[int, Conflict] = {}
         for side, index, slack in (
             ("lower", self.lower, self.slack_of_lower),
             ("upper", self.upper, self.slack_of_upper),
         ):
-            miss = low[index] - values[index] if side == "lower" else values[index] - high[index]
             bound = (low if side == "lower" else high)[index]
+            miss = bound - values[index] if side == "lower" else values[index] - bound
             for i in np.argsort(-miss):
                 j = int(slack[i])
-                if miss[i] <= LEAST * self.sizes[j]:
+                if miss[i] <= HELD * self.sizes[j]:
                     break
                 if j not in found or miss[i] > found[j].amount:
                     at = float(self.fractions[index[i]])

@@ -12,7 +12,7 @@ import numpy as np
 from ocp.console import Interrupt, Progress, interruptible
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_choice
 
 __all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
 
@@ -74,8 +74,7 @@ def build_solver(
     Raises:
         ProblemError: An unknown solver, or an option that it does not take.
     """
-    if solver not in SOLVERS:
-        raise ProblemError(f"unknown solver {solver!r}; known: {', '.join(SOLVERS)}")
+    checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     defaults = IPOPT if solver == "ipopt" else FATROP
@@ -102,7 +101,8 @@ def build_solver(
     try:
         return ca.nlpsol("solver", solver, nlp, {**settings, solver: own}), progress
     except RuntimeError as error:
-        raise ProblemError(f"{solver} does not take these options {options!r}: {last_line(error)}") from error
+        words = f"{solver} does not take these options {options!r}: {last_line(error)}"
+        raise ProblemError(words, name="options", value=options) from error
 
 
 def fatrop_functions(program: Program) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def call_solver(
     except RuntimeError as error:
         words = str(error).lower()
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
-            raise ProblemError(f"fatrop does not take this option: {last_line(error)}") from error
+            raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
         raise
     finally:
         if progress is not None:

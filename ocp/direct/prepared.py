@@ -1,4 +1,4 @@
-"""A problem built once for a method and a solver, to be solved many times."""
+"""Direct methods, and a problem built once for such a method and a solver, to be solved many times."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,16 +17,87 @@ from ocp.direct.diagnosis import diagnosis
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point
 from ocp.direct.nlp import Outcome, build_solver, call_solver
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, checked_count, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
+__all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
-class Method(Protocol):
-    """A transcription: turns a formulation into a nonlinear program."""
 
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment: ...
+class DirectMethod:
+    """A direct method: turns a problem into a nonlinear program on a mesh of intervals.
+
+    Attributes:
+        intervals: Number of intervals.
+        control: How the controls move inside an interval.
+        mesh: Fractions 0..1 where intervals begin and end, N + 1 of them; None for equal intervals.
+    """
+
+    intervals: int
+    control: str
+    mesh: tuple[float, ...] | None
+
+    @property
+    def order(self) -> int:
+        """Power of the width with which the integration error of one interval falls."""
+        raise NotImplementedError
+
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
+        raise NotImplementedError
+
+    def prepare(
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: Mapping[str, Any] | None = None,
+        compiled: bool = False,
+    ) -> Prepared:
+        """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
+        return Prepared(problem, self, solver, options, compiled)
+
+    @property
+    def fractions(self) -> np.ndarray:
+        """Where intervals begin and end, as fractions of the horizon. Shape (N + 1,)."""
+        return np.linspace(0.0, 1.0, self.intervals + 1) if self.mesh is None else np.asarray(self.mesh, dtype=float)
+
+    def with_mesh(self, mesh: np.ndarray) -> Self:
+        """The same method on another mesh (N + 1,)."""
+        return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
+
+    def _settle(self, count: str, most: int | None = None) -> None:
+        """Check the mesh and the whole number by the name ``count``; turn them into plain Python, as is saved.
+
+        Raises:
+            ProblemError: No positive integers, or a mesh that does not increase from 0 to 1 in so many intervals.
+        """
+        kind = type(self).__name__
+        for name, limit in (("intervals", None), (count, most)):
+            object.__setattr__(self, name, checked_count(f"{kind}: {name}", getattr(self, name), most=limit))
+        if self.mesh is None:
+            return
+        told = {"name": "mesh", "value": self.mesh}
+        try:
+            at = np.asarray(self.mesh, dtype=float)
+        except (TypeError, ValueError) as error:
+            words = f"{kind}: mesh must be fractions from 0 to 1, not {self.mesh!r}"
+            raise ProblemError(words, **told) from error
+        if at.shape != (self.intervals + 1,):
+            words = f"{kind}: mesh has {at.size} entries, {self.intervals + 1} expected (fractions 0 to 1)"
+            raise ProblemError(words, **told)
+        if not (at[0] == 0.0 and at[-1] == 1.0 and np.all(np.diff(at) > 0)):
+            raise ProblemError(f"{kind}: mesh must increase from 0 to 1, not {at.tolist()}", **told)
+        object.__setattr__(self, "mesh", tuple(at.tolist()))
+
+
+def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
+    """Raise ProblemError unless a method has a mesh of intervals, and a tolerance is positive and finite."""
+    if not isinstance(method, DirectMethod):
+        words = f"{caller}: Collocation(...) or MultipleShooting(...) is expected, not {method!r}"
+        raise ProblemError(words, name="method", value=method)
+    checked_positive(f"{caller}: tolerance", tolerance)
 
 
 class Prepared:
@@ -37,20 +108,15 @@ class Prepared:
     """
 
     def __init__(
-        self, problem: Problem, method: Method, solver: str, options: Mapping[str, Any], compiled: bool
+        self, problem: Problem, method: DirectMethod, solver: str, options: Mapping[str, Any] | None, compiled: bool
     ) -> None:
         began = time.monotonic()
-        if not isinstance(problem, Problem):
-            raise ProblemError(f"a Problem is expected, not {type(problem).__name__}")
-        if isinstance(method, type) or not callable(getattr(method, "transcribe", None)):
-            raise ProblemError(f"a method such as Collocation(...) is expected, not {method!r}")
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
-        self._solver, self._progress = build_solver(
-            self.program, solver, by_name("options", options), self.fragment.stages, problem.name
-        )
+        own = checked_mapping("options", options)
+        self._solver, self._progress = build_solver(self.program, solver, own, self.fragment.stages, problem.name)
         self.seconds = time.monotonic() - began
 
     def solve(
@@ -65,7 +131,7 @@ class Prepared:
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
         form, fragment = self.formulation, self.fragment
-        p = form.parameter_vector(by_name("parameters", parameters))
+        p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
         lower, upper = bounds
         arguments = {
@@ -83,9 +149,9 @@ class Prepared:
         try:
             solution = self._solution(outcome, p)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
-            raise SolveError(diagnosis(self, outcome, arguments, self._horizon(outcome, p))) from error
+            raise diagnosis(self, outcome, arguments, self._horizon(outcome, p)) from error
         if check and not outcome.success:
-            raise SolveError(diagnosis(self, outcome, arguments, solution.horizon), solution)
+            raise diagnosis(self, outcome, arguments, solution.horizon, solution)
         return solution
 
     def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
@@ -103,10 +169,7 @@ class Prepared:
         at[-1] = 1.0
         costates = self._costates(outcome, p)
         by_parameter = self._cost_gradient(outcome, p) if form.np else np.zeros(0)
-        stacked = {
-            "states": v[fragment.report_states],
-            "controls": controls_at(controls, fragment, piece, place),
-        }
+        x, u = v[fragment.report_states], controls_at(controls, fragment, piece, place)
         settings = {k: v for k, v in dataclasses.asdict(self.method).items() if v is not None}  # type: ignore[call-overload]
         return Solution(
             name=form.name,
@@ -118,8 +181,8 @@ class Prepared:
             iterations=outcome.iterations,
             horizon=horizon,
             t=at * horizon,
-            states={name: stacked["states"][:, s] for name, s in form.states.items()},
-            controls={name: stacked["controls"][:, s] for name, s in form.controls.items()},
+            states={name: x[:, s] for name, s in form.states.items()},
+            controls={name: u[:, s] for name, s in form.controls.items()},
             costates={name: costates[:, s] for name, s in form.states.items()},
             parameters={name: p[s] for name, s in form.parameters.items()},
             cost_gradients={name: by_parameter[s] for name, s in form.parameters.items()},
@@ -180,13 +243,6 @@ def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> N
             middle = np.where(room & np.isfinite(high - low), (low + high) / 2, np.nan)
         arguments[f"lb{kind}"] = np.where(room, np.fmin(low + by[f"lb{kind}"], middle), low)
         arguments[f"ub{kind}"] = np.where(room, np.fmax(high - by[f"ub{kind}"], middle), high)
-
-
-def by_name(what: str, values: Any) -> dict[str, Any]:
-    """A dictionary or nothing as a dictionary of its own; ProblemError for anything else."""
-    if not isinstance(values, Mapping | None):
-        raise ProblemError(f"{what} must be a dictionary by name, not {values!r}")
-    return dict(values or {})
 
 
 def compiler_options() -> dict[str, Any]:

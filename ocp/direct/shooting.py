@@ -11,21 +11,22 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.curves import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial, integrator, rk4_step
 from ocp.direct.fragment import Block, Fragment
-from ocp.direct.transcription import FragmentBuilder, check_intervals, fractions, settled
-from ocp.errors import ProblemError
+from ocp.direct.prepared import DirectMethod
+from ocp.direct.transcription import FragmentBuilder
+from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
 
 __all__ = ["MultipleShooting"]
 
 THIRDS = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
 INLINE = 3000  # instructions of a stage up to which it is one flat SX function
-CVODES = {"reltol": 1e-12, "abstol": 1e-12, "max_num_steps": 100_000, "quad_err_con": True}
+MOST_STEPS = 100_000  # of cvodes in an interval, for stiff dynamics
 
 
 @dataclass(frozen=True)
-class MultipleShooting:
+class MultipleShooting(DirectMethod):
     """Multiple shooting on a mesh of intervals.
 
     Attributes:
@@ -47,23 +48,21 @@ class MultipleShooting:
     mesh: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        check_intervals("MultipleShooting", self.intervals, self.mesh)
-        if self.integrator not in ("rk4", "cvodes"):
-            raise ProblemError(f"MultipleShooting: integrator must be 'rk4' or 'cvodes', not {self.integrator!r}")
-        if isinstance(self.steps, bool) or not isinstance(self.steps, int | np.integer) or self.steps < 1:
-            raise ProblemError(f"MultipleShooting: steps must be a positive integer, not {self.steps!r}")
-        if self.control not in ("held", "linear"):
-            raise ProblemError(f"MultipleShooting: control must be 'held' or 'linear', not {self.control!r}")
-        settled(self, intervals=self.intervals, steps=self.steps)
+        self._settle("steps")
+        checked_choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
+        checked_choice("MultipleShooting: control", self.control, ("held", "linear"))
+
+    @property
+    def order(self) -> int:
+        return 4
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
-        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
         return transcribe(self, form, staged)
 
 
 def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fragment:
     nx, nu = form.nx, form.nu
-    mesh = fractions(method.intervals, method.mesh)
+    mesh = method.fractions
     n, width = len(mesh) - 1, np.diff(mesh)
     stages = np.arange(n)
     linear = method.control == "linear"
@@ -167,9 +166,9 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
     """One integration step (x, w, d, number of the step, T, p) -> (x, cost), and whether to inline all into SX."""
     if method.integrator == "cvodes":
-        return cvodes(form, method, [1.0])[0], False
+        return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
-    sym = form.problem.symbols.sym
+    sym = form.sym
     x, w, d, i = sym("x", form.nx), sym("w", controls_of(form, method)), sym("d", 2), sym("i")
     horizon, p = sym("T"), sym("p", form.np)
     h = d[1] * horizon / method.steps
@@ -177,34 +176,29 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
     def slope(place: float, state: Any) -> Any:
         within = (i + place) / method.steps
         time = (d[0] + d[1] * within) * horizon
-        return ca.vertcat(*function(state, control_at(form, method, w, within), time, horizon, p))
+        return ca.vertcat(*function(state[: form.nx], control_at(form, method, w, within), time, horizon, p))
 
-    k1 = slope(0.0, x)
-    k2 = slope(0.5, x + h / 2 * k1[: form.nx])
-    k3 = slope(0.5, x + h / 2 * k2[: form.nx])
-    k4 = slope(1.0, x + h * k3[: form.nx])
-    change = h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    outputs = [x + change[: form.nx], change[form.nx]]
+    after = rk4_step(slope, ca.vertcat(x, 0), h)
+    outputs = [after[: form.nx], after[form.nx]]
     step = ca.Function("step", [x, w, d, i, horizon, p], outputs)
     flat = step.is_a("SXFunction") and step.n_instructions() * method.steps < INLINE
     return step, flat
 
 
-def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> tuple[Any, Any]:
-    """(x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost), and the integrator itself."""
-    sym = form.problem.symbols.sym
+def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> Any:
+    """(x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost)."""
+    sym = form.sym
     nw = controls_of(form, method)
     x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
     w, s, h, horizon, p = (q[:nw], q[nw], q[nw + 1], q[nw + 2], q[nw + 3 :])
     function = form.function("f", [form.f, form.running], ["f", "running"])
     rate, cost = function(x, control_at(form, method, w, place), (s + h * place) * horizon, horizon, p)
     dae = {"x": x, "t": place, "p": q, "ode": h * horizon * rate, "quad": h * horizon * cost}
-    integrator = ca.integrator("cvodes", "cvodes", dae, 0.0, places, CVODES)
+    whole = integrator("cvodes", dae, places, max_steps=MOST_STEPS, smooth=False)
     x, w, d, i = ca.MX.sym("x", form.nx), ca.MX.sym("w", nw), ca.MX.sym("d", 2), ca.MX.sym("i")
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
-    result = integrator(x0=x, p=ca.vertcat(w, d, horizon, p))
-    outputs = [result["xf"], result["qf"]]
-    return ca.Function("step", [x, w, d, i, horizon, p], outputs), integrator
+    result = whole(x0=x, p=ca.vertcat(w, d, horizon, p))
+    return ca.Function("step", [x, w, d, i, horizon, p], [result["xf"], result["qf"]])
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
@@ -213,7 +207,7 @@ def dense_function(form: Formulation, method: MultipleShooting) -> Any:
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
     if method.integrator == "cvodes":
         places = (np.arange(1, method.steps + 1) / method.steps).tolist()
-        knots = [x, *ca.horzsplit(cvodes(form, method, places)[0](x, w, d, 0, horizon, p)[0])]
+        knots = [x, *ca.horzsplit(cvodes(form, method, places)(x, w, d, 0, horizon, p)[0])]
     else:
         step, knots = step_function(form, method)[0], [x]
         for i in range(method.steps):

@@ -1,6 +1,7 @@
-"""What every transcription shares: collecting variables, rows and blocks of one phase, and the ends of the horizon.
+"""What every transcription shares: the nonlinear program of one phase, collected piece by piece.
 
-Where the variables of one phase stand in the vector of a nonlinear program.
+:class:`Layout` says where the variables of a phase stand in the vector of the program; :class:`FragmentBuilder`
+collects variables, rows and blocks, imposes what is asked at nodes and at both ends, and numbers the rows.
 """
 
 from __future__ import annotations
@@ -15,36 +16,68 @@ from ocp.direct.fragment import Block, Fragment, InterpolantMaker, Stages
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 
-__all__ = ["FragmentBuilder", "Layout", "check_intervals", "fractions", "plain_layout", "settled", "staged_layout"]
+__all__ = ["FragmentBuilder", "Layout"]
 
 
-def check_intervals(method: str, intervals: Any, mesh: tuple[float, ...] | None) -> None:
-    """Raise ProblemError unless ``intervals`` is a positive integer that fits ``mesh`` (N + 1 fractions 0..1)."""
-    if isinstance(intervals, bool) or not isinstance(intervals, int | np.integer) or intervals < 1:
-        raise ProblemError(f"{method}: intervals must be a positive integer, not {intervals!r}")
-    if mesh is None:
-        return
-    try:
-        at = np.asarray(mesh, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ProblemError(f"{method}: mesh must be fractions from 0 to 1, not {mesh!r}") from error
-    if at.shape != (intervals + 1,):
-        raise ProblemError(f"{method}: mesh has {at.size} entries, {intervals + 1} expected (fractions 0 to 1)")
-    if not (at[0] == 0.0 and at[-1] == 1.0 and np.all(np.diff(at) > 0)):
-        raise ProblemError(f"{method}: mesh must increase from 0 to 1, not {at.tolist()}")
+@dataclass(frozen=True)
+class Layout:
+    """Indices of the variables of one phase with N intervals.
+
+    Nodes stand between intervals. In the plain layout the end of interval k *is* node k + 1 and the horizon is one
+    variable. In the staged layout (for structure-exploiting solvers) each stage owns its copies of the end of its
+    interval, of the horizon and of the start, and linear rows tie them to the next node.
+
+    Attributes:
+        size: Number of variables.
+        node: Variables of each node. Shape (n, N + 1).
+        node_end: Variables at the end of each interval. Shape (n, N).
+        interval: Variables inside each interval. Shape (m, N).
+        horizon: The horizon as each node sees it, or None where it is fixed. Shape (N + 1,).
+        initial: Node variables at the start as the first and the last node see them. Shape (n, 2).
+        joins: (next node, its source in the stage before), each of shape (carried, N); None in the plain layout.
+        stage_controls: Number of variables of a stage that are not its node. 0 in the plain layout.
+    """
+
+    size: int
+    node: np.ndarray
+    node_end: np.ndarray
+    interval: np.ndarray
+    horizon: np.ndarray | None
+    initial: np.ndarray
+    joins: tuple[np.ndarray, np.ndarray] | None = None
+    stage_controls: int = 0
 
 
-def settled(method: Any, **whole: Any) -> None:
-    """Turn whole numbers and the mesh of a method into plain Python, so that it compares, hashes and is saved."""
-    for name, value in whole.items():
-        object.__setattr__(method, name, int(value))
-    if method.mesh is not None:
-        object.__setattr__(method, "mesh", tuple(float(s) for s in method.mesh))
+def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
+    """Node 0, interval 0, node 1, ..., node N, horizon."""
+    stride = node_size + interval_size
+    grid = np.arange(intervals * stride).reshape(intervals, stride).T
+    node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
+    size = intervals * stride + node_size
+    horizon = np.full(intervals + 1, size) if free_horizon else None
+    initial = np.column_stack([node[:, 0], node[:, 0]])
+    return Layout(size + free_horizon, node, node[:, 1:], grid[node_size:], horizon, initial)
 
 
-def fractions(intervals: int, mesh: tuple[float, ...] | None) -> np.ndarray:
-    """Where intervals begin and end, as fractions of the horizon. Shape (N + 1,)."""
-    return np.linspace(0.0, 1.0, intervals + 1) if mesh is None else np.asarray(mesh, dtype=float)
+def staged_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool) -> Layout:
+    """Stage k: node k with its copies of horizon and start, then interval k with the copy of its end."""
+    carried = node_size + free_horizon + node_size * keep_initial
+    inputs = interval_size + node_size
+    stride = carried + inputs
+    grid = np.arange(intervals * stride).reshape(intervals, stride).T
+    full = np.column_stack([grid[:carried], intervals * stride + np.arange(carried)])
+    node_end = grid[carried + interval_size :]
+    own = full[node_size + free_horizon :] if keep_initial else full[:node_size]
+    return Layout(
+        intervals * stride + carried,
+        full[:node_size],
+        node_end,
+        grid[carried : carried + interval_size],
+        full[node_size] if free_horizon else None,
+        own[:, [0, -1]],
+        (full[:, 1:], np.vstack([node_end, full[node_size:, :-1]])),
+        inputs,
+    )
 
 
 @dataclass
@@ -164,7 +197,7 @@ class FragmentBuilder:
         """Impose path rows at K points of fractions ``at``: states (nx, K), controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
-        d = self.formulation.problem.symbols.sym("d", 1)
+        d = self.formulation.sym("d", 1)
         function = self.formulation.point_function("path", d, 0, rows.expression)
         index = self.rows(rows.labels, rows.bounds, stages, at)
         self.blocks.append(Block(function, self.point(states, controls, stages), at[None, :], index))
@@ -211,7 +244,7 @@ class FragmentBuilder:
     ) -> None:
         """One block at the start (place 0) or the end (place 1) of v = [x, controls, T, x0, controls at the start]."""
         form, lay = self.formulation, self.layout
-        sym, nx, nu = form.problem.symbols.sym, form.nx, form.nu
+        sym, nx, nu = form.sym, form.nx, form.nu
         stage = self.intervals if place else 0
         used = ca.vertcat(rows.expression, cost)
         # symbol of the problem, the variables that make it, and their weights
@@ -291,64 +324,3 @@ class FragmentBuilder:
             interpolants=interpolants,
             stages=stages,
         )
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Indices of the variables of one phase with N intervals.
-
-    Nodes stand between intervals. In the plain layout the end of interval k *is* node k + 1 and the horizon is one
-    variable. In the staged layout (for structure-exploiting solvers) each stage owns its copies of the end of its
-    interval, of the horizon and of the start, and linear rows tie them to the next node.
-
-    Attributes:
-        size: Number of variables.
-        node: Variables of each node. Shape (n, N + 1).
-        node_end: Variables at the end of each interval. Shape (n, N).
-        interval: Variables inside each interval. Shape (m, N).
-        horizon: The horizon as each node sees it, or None where it is fixed. Shape (N + 1,).
-        initial: Node variables at the start as the first and the last node see them. Shape (n, 2).
-        joins: (next node, its source in the stage before), each of shape (carried, N); None in the plain layout.
-        stage_controls: Number of variables of a stage that are not its node. 0 in the plain layout.
-    """
-
-    size: int
-    node: np.ndarray
-    node_end: np.ndarray
-    interval: np.ndarray
-    horizon: np.ndarray | None
-    initial: np.ndarray
-    joins: tuple[np.ndarray, np.ndarray] | None = None
-    stage_controls: int = 0
-
-
-def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Node 0, interval 0, node 1, ..., node N, horizon."""
-    stride = node_size + interval_size
-    grid = np.arange(intervals * stride).reshape(intervals, stride).T
-    node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
-    size = intervals * stride + node_size
-    horizon = np.full(intervals + 1, size) if free_horizon else None
-    initial = np.column_stack([node[:, 0], node[:, 0]])
-    return Layout(size + free_horizon, node, node[:, 1:], grid[node_size:], horizon, initial)
-
-
-def staged_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool) -> Layout:
-    """Stage k: node k with its copies of horizon and start, then interval k with the copy of its end."""
-    carried = node_size + free_horizon + node_size * keep_initial
-    inputs = interval_size + node_size
-    stride = carried + inputs
-    grid = np.arange(intervals * stride).reshape(intervals, stride).T
-    full = np.column_stack([grid[:carried], intervals * stride + np.arange(carried)])
-    node_end = grid[carried + interval_size :]
-    own = full[node_size + free_horizon :] if keep_initial else full[:node_size]
-    return Layout(
-        intervals * stride + carried,
-        full[:node_size],
-        node_end,
-        grid[carried : carried + interval_size],
-        full[node_size] if free_horizon else None,
-        own[:, [0, -1]],
-        (full[:, 1:], np.vstack([node_end, full[node_size:, :-1]])),
-        inputs,
-    )

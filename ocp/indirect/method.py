@@ -18,7 +18,8 @@ import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, SolveError
+from ocp.direct.nlp import SOLVERS
+from ocp.errors import ProblemError, SolveError, checked_choice, checked_count, checked_mapping, checked_positive
 from ocp.indirect.boundary import NODES, BoundaryProblem
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.minimality import not_least
@@ -54,20 +55,33 @@ class Indirect:
     seed: Collocation = dataclasses.field(default_factory=lambda: Collocation(40))
 
     def __post_init__(self) -> None:
-        if isinstance(self.segments, bool) or not isinstance(self.segments, int | np.integer) or self.segments < 1:
-            raise ProblemError(f"Indirect: segments must be a positive integer, not {self.segments!r}")
-        if self.shooting not in ("multiple", "backward"):
-            raise ProblemError(f"Indirect: shooting must be 'multiple' or 'backward', not {self.shooting!r}")
+        checked_count("Indirect: segments", self.segments)
+        checked_choice("Indirect: shooting", self.shooting, ("multiple", "backward"))
         for name in ("tolerance", "residual"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float | np.number) and 0 < value < 1):
-                raise ProblemError(f"Indirect: {name} must be between 0 and 1, not {value!r}")
+            checked_positive(f"Indirect: {name}", getattr(self, name), below=1.0)
         if not isinstance(self.seed, Collocation):
-            raise ProblemError(f"Indirect: seed must be a Collocation(...), not {self.seed!r}")
+            raise ProblemError(
+                f"Indirect: seed must be a Collocation(...), not {self.seed!r}", name="seed", value=self.seed
+            )
+
+    def prepare(
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: Mapping[str, Any] | None = None,
+        compiled: bool = False,
+    ) -> PreparedIndirect:
+        """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
+
+        ``solver``, ``options`` and ``compiled`` are for the direct solution that seeds it.
+        """
+        checked_choice("solver", solver, SOLVERS)
+        how = {"solver": solver, "options": checked_mapping("options", options), "compiled": compiled}
+        return PreparedIndirect(problem, self, how)
 
 
 SLACK = 1e-9  # relative, of what rounding may do to times
-Seeder = Callable[[Problem, Any, Any, Any], Solution]  # problem, method, parameters, guess
 
 
 class PreparedIndirect:
@@ -77,11 +91,9 @@ class PreparedIndirect:
         formulation, hamiltonian, boundary: What was derived. seconds: Wall time of it.
     """
 
-    def __init__(self, problem: Problem, method: Indirect, seeder: Seeder) -> None:
+    def __init__(self, problem: Problem, method: Indirect, seeding: dict[str, Any]) -> None:
         began = time.monotonic()
-        if not isinstance(problem, Problem):
-            raise ProblemError(f"a Problem is expected, not {type(problem).__name__}")
-        self.problem, self.method, self._seeder = problem, method, seeder
+        self.problem, self.method, self._seeding = problem, method, seeding
         self.formulation = Formulation(problem)
         self.hamiltonian = Hamiltonian.of(self.formulation)
         backward = method.shooting == "backward"
@@ -116,7 +128,7 @@ class PreparedIndirect:
             if self.hamiltonian.linear:  # bang-bang controls ring between free collocation points
                 direct = dataclasses.replace(direct, control="held")
             try:
-                seed = self._seeder(self.problem, direct, parameters, guess)
+                seed = direct.prepare(self.problem, **self._seeding).solve(parameters, guess)
             except SolveError as error:
                 return self._no_seed(f"the direct solution that was to seed it failed: {error}", error.solution, check)
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"

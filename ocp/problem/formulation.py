@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, unknown_name
-from ocp.problem.problem import Constraint, Problem, Variable
+from ocp.problem.problem import Constraint, Problem, Variable, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Formulation", "Rows", "at_samples"]
@@ -106,7 +106,7 @@ class Formulation:
     """
 
     def __init__(self, problem: Problem) -> None:
-        problem.check()
+        checked_problem(problem).check()
         declared = problem.declared
         self.sym = sym = problem.symbols.sym
         horizon = declared.horizon

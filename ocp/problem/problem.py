@@ -26,7 +26,7 @@ from ocp.problem.values import (
     stacked,
 )
 
-__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Variable"]
+__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Variable", "checked_problem"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
 Guess = Any  # a value, or a function of time that returns one
@@ -45,6 +45,13 @@ def _about_its_name(method: Declare) -> Declare:
             return method(self, name, *args, **values)
 
     return cast(Declare, declare)
+
+
+def checked_problem(problem: Any) -> Problem:
+    """``problem``, or ProblemError where it is none."""
+    if not isinstance(problem, Problem):
+        raise ProblemError(f"a Problem is expected, not {type(problem).__name__}", name="problem", value=problem)
+    return problem
 
 
 @dataclass(frozen=True)

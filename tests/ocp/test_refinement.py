@@ -140,7 +140,7 @@ def test_a_round_that_fails_raises_what_solving_raises() -> None:
         ({"max_intervals": np.nan}, "max_intervals"),
         ({"method": None}, "refine: .* expected, not None"),
         ({"method": Collocation}, "refine: .* expected"),
-        ({"solver": "snopt"}, "unknown solver"),
+        ({"solver": "snopt"}, "solver must be"),
         ({"parameters": {"p": 1.0}}, "unknown parameter"),
     ],
 )
