@@ -8,23 +8,19 @@ import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
-from ocp.problem.formulation import Formulation
-from ocp.problem.problem import Problem
 
-if TYPE_CHECKING:
-    from ocp.audit.audit import Audit
-    from ocp.problem.problem import Problem
-
-__all__ = ["Refinement", "Sample", "Solution", "check_belongs"]
+__all__ = ["Refinement", "Sample", "Solution", "check_belongs", "stack", "unstack"]
 
 VERSION = 1
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
+PLAIN = ("t", "variables", "multipliers")
+PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
 
 
@@ -110,7 +106,7 @@ class Solution:
     variables: np.ndarray
     multipliers: np.ndarray
     seconds: dict[str, float]
-    problem: Problem | None = field(default=None, compare=False, repr=False)
+    problem: Any = field(default=None, compare=False, repr=False)
     refinement: Refinement | None = None
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -141,10 +137,13 @@ class Solution:
         try:
             times = np.asarray(time, dtype=float)
         except (TypeError, ValueError) as error:
-            raise ProblemError(f"a time or an array of times is expected, not {time!r}") from error
+            raise ProblemError(
+                f"a time or an array of times is expected, not {time!r}", name="time", value=time
+            ) from error
         slack = 1e-12 * self.horizon
         if not np.all((times >= -slack) & (times <= self.horizon + slack)):
-            raise ProblemError(f"time {time!r} is outside the plan, 0 to {self.horizon:g} s")
+            words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
+            raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon), time=time)
         return self.at_fraction(times / self.horizon)
 
     def at_fraction(self, fraction: Any) -> Sample:
@@ -152,14 +151,11 @@ class Solution:
         at = np.asarray(fraction, dtype=float)
         flat = np.clip(at.reshape(-1), 0.0, 1.0)
         values: dict[str, np.ndarray] = {}
-        for pool, interpolant in (
-            (self.states, self.state_interpolant),
-            (self.controls, self.control_interpolant),
-        ):
+        for pool, interpolant in ((self.states, self.state_interpolant), (self.controls, self.control_interpolant)):
             values |= unstack(pool, interpolant(flat))
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
 
-    def audit(self, problem: Problem | None = None, **settings: Any) -> Audit:
+    def audit(self, problem: Any = None, **settings: Any) -> Any:
         """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit.audit`.
 
         Raises:
@@ -169,11 +165,12 @@ class Solution:
 
         known = problem if problem is not None else self.problem
         if known is None:
-            raise AuditError(f"plan {self.name!r} was loaded without its problem; call audit(problem)")
+            words = f"plan {self.name!r} was loaded without its problem; call audit(problem)"
+            raise AuditError(words, name=self.name)
         return audit(known, self, **settings)
 
-    def with_problem(self, problem: Problem) -> Solution:
-        """The same solution tied to a problem, after :meth:`load`."""
+    def with_problem(self, problem: Any) -> Solution:
+        """The same solution tied to a problem, after :meth:`load`, or to None."""
         return replace(self, problem=problem)
 
     # ---- files -----------------------------------------------------------------------------------------------
@@ -181,16 +178,11 @@ class Solution:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write arrays and JSON (no pickle) to one ``.npz`` file, whole or not at all."""
         target = Path(path)
-        arrays: dict[str, np.ndarray] = {
-            "t": self.t,
-            "variables": self.variables,
-            "multipliers": self.multipliers,
-        }
+        arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in PLAIN}
         for kind in POOLS:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
-            part = getattr(self, kind)
-            arrays |= {f"{kind}/{what}": getattr(part, what) for what in ("breaks", "nodes", "values")}
+            arrays |= {f"{kind}/{part}": getattr(getattr(self, kind), part) for part in PARTS}
         simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
         head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
@@ -220,26 +212,21 @@ class Solution:
             head = json.loads(arrays.pop("head").tobytes().decode())
             version = head.pop("version")
             if version != VERSION:
-                raise ProblemError(f"{path}: written by another version of the format ({version}, not {VERSION})")
+                words = f"{path}: written by another version of the format ({version}, not {VERSION})"
+                raise ProblemError(words, name="version", value=version, limit=VERSION)
             order = head.pop("order")
             fields: dict[str, Any] = {
                 kind: {name: arrays[f"{kind}/{name}"] for name in names} for kind, names in order.items()
             }
             fields |= {
-                kind: PiecewisePolynomial(*(arrays[f"{kind}/{what}"] for what in ("breaks", "nodes", "values")))
-                for kind in INTERPOLANTS
+                kind: PiecewisePolynomial(*(arrays[f"{kind}/{part}"] for part in PARTS)) for kind in INTERPOLANTS
             }
             past = head.pop("refinement", None)
-            refinement = None
             if past is not None:
-                refinement = Refinement(
-                    tuple(past["intervals"]), tuple(past["errors"]), past["tolerance"], past["reached"]
-                )
-            fields |= {key: arrays[key] for key in ("t", "variables", "multipliers")}
-            return cls(**head, **fields, refinement=refinement)
-        except FileNotFoundError:
-            raise
-        except ProblemError:
+                rounds = tuple(past["intervals"]), tuple(past["errors"])
+                fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
+            return cls(**head, **fields, **{name: arrays[name] for name in PLAIN})
+        except (FileNotFoundError, ProblemError):
             raise
         except Exception as error:  # what zip, zlib, numpy and JSON say of broken bytes is of many kinds
             raise ProblemError(f"{path} is not a saved solution: {error}") from error
@@ -252,6 +239,11 @@ def plain(value: Any) -> Any:
     raise TypeError(f"{value!r} cannot be saved")
 
 
+def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
+    """The arrays (M, n) of a pool side by side; without any, (``like``, 0)."""
+    return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
+
+
 def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of stacked values (M, n) by name, in the order and sizes of ``pool``."""
     values, offset = {}, 0
@@ -261,13 +253,19 @@ def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.nd
     return values
 
 
-def check_belongs(form: Formulation, solution: Solution) -> None:
+class Places(Protocol):
+    """Where the states and controls of a problem stand in its vectors, by name."""
+
+    name: str
+    states: dict[str, slice]
+    controls: dict[str, slice]
+
+
+def check_belongs(form: Places, solution: Solution) -> None:
     """Raise ProblemError unless the states and controls of a plan are those of a problem."""
-    for what, places, pool in (
-        ("states", form.states, solution.states),
-        ("controls", form.controls, solution.controls),
-    ):
-        have = {name: values.shape[1] for name, values in pool.items()}
-        want = {name: place.stop - place.start for name, place in places.items()}
+    for what in ("states", "controls"):
+        have = {name: values.shape[1] for name, values in getattr(solution, what).items()}
+        want = {name: place.stop - place.start for name, place in getattr(form, what).items()}
         if have != want:
-            raise ProblemError(f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}")
+            words = f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}"
+            raise ProblemError(words, name=what, value=have, limit=want)

@@ -9,22 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from ocp.audit.costates import Adjoint, adjoint
 from ocp.audit.principle import Optimality, minimum_principle
-from ocp.audit.reintegration import Reintegration, reintegrate
-from ocp.audit.violations import violations
+from ocp.audit.reintegration import Reintegration, reintegrate, violations
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_belongs, unstack
+from ocp.solution import Solution, check_belongs, stack, unstack
 
 __all__ = ["Audit", "Finding", "audit"]
 
-FINER = 10
+FINER = 10  # times as fine as the plan's own points is the grid on which constraints are looked at
 
 
 @dataclass(frozen=True)
@@ -134,13 +132,12 @@ def audit(
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
             unknown.
     """
-    if not isinstance(tolerances, Mapping | None):
-        raise ProblemError(f"audit: tolerances must be a dictionary by name, not {tolerances!r}")
-    limits = dict(tolerances or {})
+    limits = checked_mapping("audit: tolerances", tolerances)
     named = {"integration": integration, "constraints": constraints, "stationarity": stationarity}
     for name, limit in {**named, "drift": drift, "costates": costates, **limits}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
-            raise ProblemError(f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}")
+            words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
+            raise ProblemError(words, name=name, value=limit)
     form = Formulation(problem)
     check_belongs(form, solution)
     p = form.parameter_vector(solution.parameters)
@@ -162,11 +159,7 @@ def audit(
     findings.append(cost_finding(form, solution, again, p, integration))
     findings.append(reported_finding(solution, integration))
 
-    names = [
-        *form.states,
-        *form.controls,
-        *[c for kind in (form.path, form.start, form.end) for c in kind.names],
-    ]
+    names = [*form.states, *form.controls, *[c for kind in (form.path, form.start, form.end) for c in kind.names]]
     for name in limits:
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
@@ -178,11 +171,8 @@ def audit(
         findings.append(finding)
         total[name] = max(total.get(name, 0.0), finding.value)
 
-    for what, interpolant, limit_of in (
-        ("state jump, relative", solution.state_interpolant, integration),
-        ("control jump, relative", solution.control_interpolant, None),
-    ):
-        findings.append(jump(what, interpolant, solution.horizon, limit_of))
+    findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, integration))
+    findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, None))
     findings += optimality_findings(form, optimality, stationarity, drift)
     costate = adjoint(form, solution, p, bounds)
     findings += costate_findings(costate, optimality, costates)
@@ -253,18 +243,13 @@ def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None,
 
 def cost_finding(form: Formulation, solution: Solution, again: Reintegration, p: np.ndarray, limit: float) -> Finding:
     """The cost of the re-integrated plan against the one the solver reports."""
-    symbols = [form.x, form.x0, form.u0, form.t, form.T, form.p]
-    terminal = ca.Function("terminal", symbols, [form.terminal])
-    end = terminal(again.states[-1], again.states[0], again.controls[0], solution.horizon, solution.horizon, p)
-    cost = again.cost + float(end)
+    end = form.terminal_cost(again.states[-1], again.states[0], again.controls[0], solution.horizon, p)
+    cost = again.cost + end
     # parts of the running cost may cancel: judge by their size
-    m = len(again.t)
-    running = ca.Function("running", [form.x, form.u, form.t, form.T, form.p], [form.running]).map(m, "serial")
-    ones = np.ones((1, m))
-    inputs = (again.plan.T, again.controls.T, again.t[None, :], solution.horizon * ones, p[:, None] * ones)
-    parts = np.abs(np.asarray(running.call([ca.DM(v) for v in inputs])[0].full()).ravel())
+    running = form.sampled([form.running], again.plan, again.controls, again.t, solution.horizon, p)[0]
+    parts = np.abs(running).ravel()
     spent = float(np.sum(np.diff(again.t) * (parts[:-1] + parts[1:]) / 2))
-    size = max(abs(cost), abs(again.cost), abs(float(end)), abs(solution.cost), spent)
+    size = max(abs(cost), abs(again.cost), abs(end), abs(solution.cost), spent)
     off = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
     return Finding("cost, relative", off, limit, None, f"reported {solution.cost:.8g}, integrated {cost:.8g}")
 
@@ -277,7 +262,7 @@ def reported_finding(solution: Solution, limit: float) -> Finding:
         (solution.controls, solution.control_interpolant),
         (solution.costates, solution.costate_interpolant),
     ):
-        values = np.hstack([np.zeros((len(off), 0)), *pool.values()])
+        values = stack(pool, len(off))
         sides = [curve(solution.t / solution.horizon + shift) - values for shift in (-1e-12, 1e-12)]
         size = np.max(np.abs(curve.values), initial=0.0) or 1.0
         off = np.maximum(off, np.min([np.abs(side).max(axis=1, initial=0.0) for side in sides], axis=0) / size)

@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.audit import Audit, audit
-from ocp.audit.principle import numbers
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -17,7 +16,7 @@ from ocp.solution import Solution, check_belongs
 
 __all__ = ["Certificate", "Comparison", "certificate"]
 
-SAMPLES = 400
+SPREAD = 400  # places at which states and controls are compared
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,9 @@ def certificate(
     """
     named = dict(solutions) if isinstance(solutions, Mapping) else name_by_method(solutions)
     if len(named) < 2:
-        raise ProblemError(f"a certificate compares at least two solutions, not {len(named)}")
+        raise ProblemError(
+            f"a certificate compares at least two solutions, not {len(named)}", value=len(named), limit=2
+        )
     form = Formulation(problem)
     for solution in named.values():
         check_belongs(form, solution)
@@ -125,10 +126,10 @@ def certificate(
     p = form.parameter_vector(named[reference].parameters)
     for name, solution in named.items():
         if not np.array_equal(form.parameter_vector(solution.parameters), p):
-            raise ProblemError(f"plans {reference!r} and {name!r} were solved at different parameters")
+            raise ProblemError(f"plans {reference!r} and {name!r} were solved at different parameters", name=name)
     audits = {name: audit(problem, named[name]) for name in order}
     first = named[reference]
-    spread = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    spread = (np.arange(SPREAD) + 0.5) / SPREAD
     comparisons = []
     for name in order:
         solution = named[name]
@@ -182,15 +183,13 @@ def sample(
     free, and the mean size of the running cost, for the cost may vanish as well.
     """
     lam = solution.costate_interpolant(own)
-    symbol = form.problem.symbols.sym("lam", form.nx)
-    parts = ca.vertcat(form.running, symbol * form.f)
-    function = ca.Function("hamiltonian", [form.x, form.u, form.t, form.T, form.p, symbol], [parts])
+    symbol = form.sym("lam", form.nx)
     x, u = solution.state_interpolant(own), solution.control_interpolant(own)
-    found = numbers(function, x, u, own * solution.horizon, solution.horizon, p, lam)[0]
+    parts = [ca.vertcat(form.running, symbol * form.f)]
+    found = form.sampled(parts, x, u, own * solution.horizon, solution.horizon, p, (symbol, lam))[0]
     hamiltonian, size = found.sum(axis=1), float(np.max(np.abs(found).sum(axis=1), initial=0.0))
     x, u = solution.state_interpolant(spread), solution.control_interpolant(spread)
-    lam_spread = solution.costate_interpolant(spread)
-    running = numbers(function, x, u, spread * solution.horizon, solution.horizon, p, lam_spread)[0][:, 0]
+    running = form.sampled([form.running], x, u, spread * solution.horizon, solution.horizon, p)[0]
     return [x, u, lam, hamiltonian], size, float(np.mean(np.abs(running)))
 
 

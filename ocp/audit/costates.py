@@ -1,15 +1,13 @@
-"""The costates of a plan against their own equations: lambda' = -dH/dx, and the conditions at the ends.
+"""The costates of a plan against their own equation, lambda' = -dH/dx, and against the conditions at the ends.
 
-The costates come from the multipliers of whatever method made the plan; here they are integrated backwards from the end
-along the plan, by an integrator that has never seen these multipliers. Bryson, Ho 1975, chapters 2 and 3.
-
-Costates beside the bounds of states, where those of a discrete plan jump.
+The costates come from the multipliers of whatever method made the plan; here they are integrated backwards along the
+plan, by an integrator that has never seen these multipliers. Bryson, Ho 1975, chapters 2 and 3.
 
 A bound of a state pushes on the costate with a density along an arc. A transcription that holds the bound at nodes only
 has an atom there instead: its costate follows the costate equation inside an interval and jumps at the nodes (at a free
 end that is at a bound, away from the gradient of the final cost). The reported value at a node is that before the jump.
-Here the value behind it is found from the costate equation, and a jump is accepted only where a bound is active and
-with the sign that its multiplier must have (Hartl, Sethi, Vickson 1995).
+The value behind it is found from the costate equation, and a jump is accepted only where a bound is active and with the
+sign that its multiplier must have (Hartl, Sethi, Vickson 1995).
 """
 
 from __future__ import annotations
@@ -21,15 +19,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.reintegration import OPTIONS, basis
 from ocp.console import quiet
+from ocp.curves import integrator, lagrange_expressions
 from ocp.problem.formulation import Formulation
-from ocp.solution import Solution
+from ocp.solution import Solution, stack
 
-__all__ = ["Adjoint", "adjoint", "costates_at_samples"]
+__all__ = ["Adjoint", "active_sides", "adjoint", "costates_at_samples"]
 
 IMMATERIAL = 1e-7  # share of the cost
-ACTIVE = 1e-5  # a bound nearer than this, relative to its scale, is active
+ACTIVE_WITHIN = 1e-5  # a bound nearer than this, relative to its scale, is active
 
 
 @dataclass(frozen=True)
@@ -75,16 +73,14 @@ def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[
     reason = obstacle(form, solution, bounds)
     integrated = None
     if not reason:
-        integrator, data = costate_pieces(form, solution, p)
+        pieces = CostatePieces(form, solution, p)
         everywhere = np.full((n + 1, form.nx), np.inf)
-        everywhere[-1] = lam = plan[-1]
+        everywhere[-1] = plan[-1]
         for k in reversed(range(n)):
-            try:
-                with quiet():
-                    lam = np.asarray(integrator(x0=lam, p=data[:, k])["xf"].full()).reshape(-1)
-            except RuntimeError:
+            everywhere[k] = pieces.backwards(everywhere[k + 1], range(k, k + 1))
+            if not np.all(np.isfinite(everywhere[k])):
+                everywhere[: k + 1] = np.inf
                 break
-            everywhere[k] = lam
         integrated = everywhere[np.searchsorted(breaks, costates.breaks - 1e-12)]
     return Adjoint(costates.breaks * solution.horizon, integrated, plan, reason, *ends, scale)
 
@@ -95,51 +91,41 @@ def immaterial(solution: Solution) -> float:
     return IMMATERIAL * abs(solution.cost) / way if way > 0 else 0.0
 
 
-def costate_pieces(form: Formulation, solution: Solution, p: np.ndarray) -> tuple[Any, np.ndarray]:
-    """The integrator over one piece of the states' interpolant, and its parameters for every piece, (size, n)."""
-    breaks, nodes = solution.state_interpolant.breaks, solution.state_interpolant.nodes
-    n, samples = len(breaks) - 1, solution.control_interpolant.nodes
-    places = breaks[:-1, None] + np.diff(breaks)[:, None] * samples
-    owner = np.searchsorted(solution.control_interpolant.breaks, breaks[:-1] + 0.5 * np.diff(breaks)) - 1
-    begin, width = solution.control_interpolant.breaks[owner], np.diff(solution.control_interpolant.breaks)[owner]
-    within = (places - begin[:, None]) / width[:, None]
-    controls = solution.control_interpolant.within(np.repeat(owner, len(samples)), within.ravel())
-    data = np.vstack(
-        [
-            solution.state_interpolant.values.reshape(n, -1).T,
-            controls.reshape(n, -1).T,
-            breaks[:-1],
-            np.diff(breaks),
-            np.full(n, solution.horizon),
-            np.tile(p[:, None], (1, n)),
-        ]
-    )
-    return costate_integrator(form, nodes, samples), data
+class CostatePieces:
+    """The costate equation along a plan, to be integrated over the pieces of the states' interpolant one by one.
 
-
-def over_intervals(form: Formulation, solution: Solution, p: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Costates at the start of every control interval, integrated from their own at its end. Shape (N, nx).
-
-    Args:
-        ends: Costates at the ends of the intervals. Shape (N, nx).
+    Attributes:
+        count: Number of pieces.
     """
-    integrator, data = costate_pieces(form, solution, p)
-    pieces = data.shape[1] // len(ends)
-    starts = np.full(ends.shape, np.nan)
-    for k, lam in enumerate(ends):
+
+    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray) -> None:
+        states, controls = solution.state_interpolant, solution.control_interpolant
+        self.count = n = len(states.breaks) - 1
+        width = np.diff(states.breaks)
+        places = states.breaks[:-1, None] + width[:, None] * controls.nodes
+        owner = np.searchsorted(controls.breaks, states.breaks[:-1] + 0.5 * width) - 1
+        within = (places - controls.breaks[owner][:, None]) / np.diff(controls.breaks)[owner][:, None]
+        u = controls.within(np.repeat(owner, len(controls.nodes)), within.ravel())
+        shared = np.tile(np.append(solution.horizon, p), (n, 1))
+        columns = (states.values.reshape(n, -1), u.reshape(n, -1), states.breaks[:-1, None], width[:, None], shared)
+        self._data = np.hstack(columns).T
+        self._integrator = costate_integrator(form, states.nodes, controls.nodes)
+
+    def backwards(self, end: np.ndarray, pieces: range) -> np.ndarray:
+        """The costate at the start of some pieces, from that at their end; nan where the integration breaks down."""
+        lam = end
         try:
             with quiet():
-                for i in reversed(range(k * pieces, (k + 1) * pieces)):
-                    lam = np.asarray(integrator(x0=lam, p=data[:, i])["xf"].full()).reshape(-1)
+                for k in reversed(pieces):
+                    lam = np.asarray(self._integrator(x0=lam, p=self._data[:, k])["xf"].full()).reshape(-1)
         except RuntimeError:
-            continue
-        starts[k] = lam
-    return starts
+            return np.full_like(end, np.nan)
+        return lam
 
 
 def obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
     """Why the costate equation alone does not say what the costates are, or ""."""
-    x = np.hstack(list(solution.states.values()))
+    x = stack(solution.states)
     index = form.bounds.places["state"]
     if np.any(near(x[1:-1], bounds[0][index], bounds[1][index])):
         return "a state is at its bound"
@@ -151,18 +137,24 @@ def path_obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarra
     if len(form.path) and not np.all(form.path.equality & form.path.uses_control):
         return "there are path constraints beyond equalities with a control"
     if len(form.path):
-        u = np.hstack(list(solution.controls.values()))
+        u = stack(solution.controls)
         index = form.bounds.places["control"]
         if np.any(near(u, bounds[0][index], bounds[1][index])):
             return "a control is at its bound where path equalities hold"
     return ""
 
 
-def near(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Where values (M, n) are at a bound."""
+def active_sides(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where values (M, n) are at their lower, and at their upper bound. Each (M, n), bool."""
     with np.errstate(invalid="ignore"):
         size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
-    return np.asarray((values <= lower + ACTIVE * size) | (values >= upper - ACTIVE * size))
+    return np.asarray(values <= lower + ACTIVE_WITHIN * size), np.asarray(values >= upper - ACTIVE_WITHIN * size)
+
+
+def near(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Where values (M, n) are at a bound."""
+    at_lower, at_upper = active_sides(values, lower, upper)
+    return np.asarray(at_lower | at_upper)
 
 
 def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray) -> Any:
@@ -170,15 +162,15 @@ def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray
 
     Multipliers of path equalities are those that make H stationary: mu = -(A A')^-1 A (L_u + f_u' lambda), A = h_u.
     """
-    sym = form.problem.symbols.sym
+    sym = form.sym
     nx, nu = form.nx, form.nu
     lam, back = sym("lam", nx), sym("back")
     cuts = np.cumsum([0, nx * len(nodes), nu * len(samples), 1, 1, 1, form.np])
     q = sym("q", int(cuts[-1]))
     xs, us, s, h, horizon, p = (q[int(a) : int(b)] for a, b in pairwise(cuts))
     place = 1 - back
-    x = ca.mtimes(ca.reshape(xs, nx, len(nodes)), ca.vertcat(*basis(nodes, place)))
-    u = ca.mtimes(ca.reshape(us, nu, len(samples)), ca.vertcat(*basis(samples, place)))
+    x = ca.mtimes(ca.reshape(xs, nx, len(nodes)), lagrange_expressions(nodes, place))
+    u = ca.mtimes(ca.reshape(us, nu, len(samples)), lagrange_expressions(samples, place))
     value = form.running + ca.dot(lam, form.f)
     if len(form.path):
         gradient = ca.gradient(value, form.u)
@@ -192,7 +184,7 @@ def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray
     function = ca.Function("rate", [form.x, form.u, form.t, form.T, form.p, lam], [ca.densify(rate)], {"cse": True})
     ode = h * horizon * function(x, u, (s + h * place) * horizon, horizon, p, lam)
     dae = {"x": lam, "t": back, "p": q, "ode": ode}
-    return ca.integrator("costates", "cvodes", dae, 0.0, 1.0, OPTIONS)
+    return integrator("costates", dae)
 
 
 def end_residuals(
@@ -201,21 +193,17 @@ def end_residuals(
     """What of the transversality conditions no multiplier explains: (of the states, of the horizon)."""
     low, high = bounds
     nx = form.nx
-    x0, x1, lam0, lam1 = (
-        np.hstack([pool[name][k] for name in form.states])
-        for pool in (solution.states, solution.costates)
-        for k in (0, -1)
-    )
-    controls = [np.hstack([v[k] for v in solution.controls.values()]) if form.nu else np.zeros(0) for k in (0, -1)]
+    x0, x1, lam0, lam1 = (stack(pool)[k] for pool in (solution.states, solution.costates) for k in (0, -1))
+    controls = stack(solution.controls, 2)[[0, -1]]
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
-    last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+    end = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
     symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
     # a path constraint of the states alone that is active at an end holds them there as an end condition does
     path = form.path.select(~form.path.uses_control)
     first = ca.substitute([path.expression], [form.x, form.t], [form.x0, 0])[0]
-    rows = ca.vertcat(begin, last[0], ca.substitute([path.expression], [form.t], [form.T])[0], first)
+    rows = ca.vertcat(begin, end[0], ca.substitute([path.expression], [form.t], [form.T])[0], first)
     both = ca.vertcat(form.x, form.x0, form.T)
-    function = ca.Function("ends", symbols, [rows, ca.densify(ca.jacobian(rows, both)), ca.gradient(last[1], both)])
+    function = ca.Function("ends", symbols, [rows, ca.densify(ca.jacobian(rows, both)), ca.gradient(end[1], both)])
     found = function(x1, x0, controls[1], controls[0], solution.horizon, p)
     values, slopes, gradient = (np.asarray(v.full()) for v in found)
     index = np.concatenate([form.start.bounds, form.end.bounds, path.bounds, path.bounds])
@@ -234,17 +222,16 @@ def end_residuals(
     explicit = ca.depends_on(ca.vertcat(form.f, form.running, form.path.expression), form.T)
     target, matrix = left[free], columns[: 2 * nx][free]
     if horizon_free and not explicit:
-        hamiltonian = ca.Function("h", [form.x, form.u, form.t, form.T, form.p], [form.running, form.f])
-        running, rate = hamiltonian(x1, controls[1], solution.horizon, solution.horizon, p)
-        final = float(running) + float(np.dot(np.asarray(rate.full()).reshape(-1), lam1))
+        last = x1[None], controls[1][None], solution.horizon, solution.horizon, p
+        running, rate = form.sampled([form.running, form.f], *last)
+        final = float(running[0, 0]) + float(np.dot(rate[0], lam1))
         target = np.append(target, -final - gradient[2 * nx, 0])
         matrix = np.vstack([matrix, columns[2 * nx]])
     multipliers = np.linalg.lstsq(matrix, target, rcond=None)[0] if matrix.size else np.zeros(matrix.shape[1])
     residual = target - matrix @ multipliers
     # a bound that holds an end free otherwise pushes one way only
     x, index = np.concatenate([x1, x0]), np.concatenate([places["terminal"], places["initial"]])
-    no_limit = np.full(2 * nx, np.inf)
-    above, below = near(x[None], -no_limit, high[index])[0], near(x[None], low[index], no_limit)[0]
+    below, above = (side[0] for side in _pushing(x[None], low[index], high[index]))
     push = left - columns[: 2 * nx] @ multipliers
     wrong = np.where(above & ~below, np.maximum(-push, 0), 0) + np.where(below & ~above, np.maximum(push, 0), 0)
     residual = np.concatenate([wrong, residual])
@@ -260,13 +247,13 @@ def costates_at_samples(
     interpolant = solution.control_interpolant
     mesh, places = interpolant.breaks, interpolant.nodes
     n = len(mesh) - 1
-    reported = np.hstack(list(solution.costates.values()))
+    reported = stack(solution.costates)
     at = (mesh[:-1, None] + np.diff(mesh)[:, None] * places) * solution.horizon
     costates = np.stack([np.interp(at, solution.t, column) for column in reported.T], axis=-1)
     jumps = np.zeros(n, dtype=bool)
     index = form.bounds.places["state"]
     low, high = bounds[0][index], bounds[1][index]
-    if not near(np.hstack(list(solution.states.values())), low, high).any():
+    if not near(stack(solution.states), low, high).any():
         return costates, jumps
     if len(solution.t) == n + 1:
         if not path_obstacle(form, solution, bounds):
@@ -276,19 +263,20 @@ def costates_at_samples(
     return costates, jumps
 
 
-def _signs(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a state may be pushed up by its lower bound, and down by its upper one."""
+def _pushing(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a state may be pushed up by its lower bound, and down by its upper one; each judged by itself."""
     nothing = np.full_like(low, np.inf)
-    return near(x, low, nothing), near(x, -nothing, high)
+    return active_sides(x, low, nothing)[0], active_sides(x, -nothing, high)[1]
 
 
 def _between_nodes(
     form: Formulation, solution: Solution, p: np.ndarray, sides: tuple[np.ndarray, np.ndarray], costates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    before = np.hstack(list(solution.costates.values()))
-    behind = over_intervals(form, solution, p, before[1:])
-    x = np.hstack(list(solution.states.values()))
-    at_low, at_high = (side[:-1] for side in _signs(x, *sides))
+    """Costates that jump at the nodes only, and which intervals are beside a jump."""
+    before, pieces = stack(solution.costates), CostatePieces(form, solution, p)
+    each = pieces.count // (len(before) - 1)
+    behind = [pieces.backwards(lam, range(k * each, (k + 1) * each)) for k, lam in enumerate(before[1:])]
+    at_low, at_high = (side[:-1] for side in _pushing(stack(solution.states), *sides))
     jump = behind - before[:-1]
     # an upper bound takes from the costate, a lower one adds to it
     allowed = np.isfinite(jump) & ((at_high & (jump < 0)) | (at_low & (jump > 0)))
@@ -312,17 +300,16 @@ def _end(
 
     They stay between the reported value and the gradient of the final cost, for the rest is the atom of the bound.
     """
-    x = np.hstack([solution.states[name] for name in form.states])
+    x = stack(solution.states)
     free = form.bounds.places["terminal"]
     open_end = bounds[0][free] < bounds[1][free]
-    at_low, at_high = (side[0] & open_end for side in _signs(x[-1:], *sides))
+    at_low, at_high = (side[0] & open_end for side in _pushing(x[-1:], *sides))
     last = reported[-1]
     if not (at_low | at_high).any():
         return np.asarray(last)
     final = ca.substitute([form.terminal], [form.t], [form.T])[0]
     slope = ca.Function("slope", [form.x, form.x0, form.u0, form.T, form.p], [ca.densify(ca.gradient(final, form.x))])
-    first = np.hstack([value[0] for value in solution.controls.values()])
-    own = np.asarray(slope(x[-1], x[0], first, solution.horizon, p).full()).ravel()
+    own = np.asarray(slope(x[-1], x[0], stack(solution.controls, 1)[0], solution.horizon, p).full()).ravel()
     t = solution.t[-3:]
     continued = reported[-2] + (reported[-2] - reported[-3]) * (t[2] - t[1]) / (t[1] - t[0])
     atom = last - own

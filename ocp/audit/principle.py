@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.audit.costates import costates_at_samples
+from ocp.audit.costates import active_sides, costates_at_samples
 from ocp.problem.formulation import Formulation
-from ocp.solution import Solution
+from ocp.solution import Solution, stack
 
 __all__ = ["Optimality", "minimum_principle"]
-
-ACTIVE = 1e-5  # a bound nearer than this, relative to its scale, is active
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,11 @@ def minimum_principle(
 ) -> Optimality:
     """Evaluate the minimum principle along a plan at its own control samples and reported points."""
     horizon = solution.horizon
-    x, u, costate = (np.hstack(list(pool.values())) if pool else np.zeros((len(solution.t), 0))
-                     for pool in (solution.states, solution.controls, solution.costates))  # fmt: skip
-    lam = form.problem.symbols.sym("lam", form.nx)
-    symbols = [form.x, form.u, form.t, form.T, form.p, lam]
-    values = ca.Function("hamiltonian", symbols, [form.running, lam * form.f])
-    running, products = numbers(values, x, u, solution.t, horizon, p, costate)
+    pools = (solution.states, solution.controls, solution.costates)
+    x, u, costate = (stack(pool, len(solution.t)) for pool in pools)
+    lam = form.sym("lam", form.nx)
+    parts = [form.running, lam * form.f]
+    running, products = form.sampled(parts, x, u, solution.t, horizon, p, (lam, costate))
     hamiltonian = running[:, 0] + products.sum(axis=1)
     least = 1.0 if form.indifferent else 0.0  # without a cost all parts are rounding, and nothing to judge by
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=least))
@@ -71,19 +68,14 @@ def minimum_principle(
     sampled, beside = costates_at_samples(form, solution, p, bounds)
     costates = sampled.reshape(len(s), form.nx)
     rows = form.path.select(form.path.uses_control)
-    outputs = [
-        ca.jacobian(form.running, form.u).T,
-        ca.jacobian(form.f, form.u),
-        rows.expression,
-        ca.jacobian(rows.expression, form.u),
-    ]
-    function = ca.Function("gradient", symbols, [ca.densify(ca.vec(out)) for out in outputs])
-    direct, f_u, *here = numbers(function, states, controls, t, horizon, p, costates)
+    held_by = [rows.expression, ca.jacobian(rows.expression, form.u)]
+    slopes = [ca.jacobian(form.running, form.u), ca.jacobian(form.f, form.u)]
+    direct, f_u, *here = form.sampled([*slopes, *held_by], states, controls, t, horizon, p)
     around = [here]
     if len(interpolant.nodes) == 1:  # a held control answers for its whole interval: constraints at both ends hold it
         for end in (interpolant.breaks[:-1], interpolant.breaks[1:]):
-            x_end, t_end = solution.state_interpolant(end), end * horizon
-            around.append(numbers(function, x_end, controls, t_end, horizon, p, costates)[2:])
+            x_end = solution.state_interpolant(end)
+            around.append(form.sampled(held_by, x_end, controls, end * horizon, horizon, p))
     g, g_u = (np.hstack([place[i] for place in around]) for i in (0, 1))
     products = f_u.reshape(len(t), form.nu, form.nx) * costates[:, None, :]
     gradient = direct + products.sum(axis=2)
@@ -94,17 +86,15 @@ def minimum_principle(
     control, path = form.bounds.places["control"], np.tile(rows.bounds, len(around))
     level = np.hstack([controls, g])
     lower, upper = np.concatenate([low[control], low[path]]), np.concatenate([high[control], high[path]])
-    size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
     equal = lower == upper  # active everywhere, even where the plan misses it
-    at_lower = (level <= lower + ACTIVE * size) | equal
-    at_upper = (level >= upper - ACTIVE * size) | equal
+    at_lower, at_upper = (side | equal for side in active_sides(level, lower, upper))
     reduced = np.abs(gradient).max(axis=1)
     for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
-        slopes = g_u[k].reshape(len(around), form.nu, -1).transpose(0, 2, 1).reshape(-1, form.nu)
-        directions = np.vstack([np.eye(form.nu), slopes])
+        normals = g_u[k].reshape(len(around), form.nu, -1).transpose(0, 2, 1).reshape(-1, form.nu)
+        directions = np.vstack([np.eye(form.nu), normals])
         reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
-    parts = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
-    return Optimality(t, reduced, parts or 1.0, hamiltonian, scale or 1.0)
+    size = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
+    return Optimality(t, reduced, size or 1.0, hamiltonian, scale or 1.0)
 
 
 def over_hats(gradient: np.ndarray, widths: np.ndarray, beside: np.ndarray) -> np.ndarray:
@@ -145,21 +135,3 @@ def reduce_gradient(
             return np.asarray(gradient + columns @ multiplier)
         del active[worst]
     return gradient
-
-
-def numbers(
-    function: ca.Function,
-    x: np.ndarray,
-    u: np.ndarray,
-    t: np.ndarray,
-    horizon: float,
-    p: np.ndarray,
-    lam: np.ndarray,
-) -> list[np.ndarray]:
-    """A function of (x, u, t, T, p, lambda) at M samples; each output (M, size)."""
-    m = len(t)
-    if m == 0:
-        return [np.zeros((0, function.numel_out(i))) for i in range(function.n_out())]
-    inputs = (x.T, u.T, t[None, :], np.full((1, m), horizon), np.tile(p[:, None], (1, m)), lam.T)
-    outputs = function.map(m, "serial").call([ca.DM(value) for value in inputs])
-    return [np.asarray(out.full()).T for out in outputs]

@@ -9,14 +9,17 @@ import casadi as ca
 import numpy as np
 
 from ocp.console import quiet
+from ocp.curves import integrator
 from ocp.errors import ProblemError
 from ocp.indirect.hamiltonian import Hamiltonian, numeric_bounds
-from ocp.indirect.seed import Arcs
+from ocp.indirect.seed import ControlArcs
 from ocp.problem.formulation import Formulation
+from ocp.problem.values import symbols_of
 
-__all__ = ["NODES", "BoundaryProblem"]
+__all__ = ["LOBATTO", "BoundaryProblem"]
 
-NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # of the reported interpolant of a piece, Chebyshev-Lobatto
+LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported piece, 0..1
+MOST_STEPS = 50_000  # of the integrator in a segment
 
 
 class BoundaryProblem:
@@ -27,7 +30,7 @@ class BoundaryProblem:
     Attributes:
         form, ham: The problem and its Hamiltonian system. backward: Whether to shoot backwards from the end state.
         outputs: Function of the Hamiltonian system -> (u, mu, H, dH/du of the linear controls).
-        step, dense: Functions (y, q) -> (y at the end, or at NODES behind the first; integrals of L and dH/dT).
+        step, dense: Functions (y, q) -> (y at the end, or at LOBATTO behind the first; integrals of L and dH/dT).
     """
 
     def __init__(self, ham: Hamiltonian, *, backward: bool, tolerance: float) -> None:
@@ -36,26 +39,24 @@ class BoundaryProblem:
             check_backward(ham)
         self.outputs = ham.outputs()
         self.step = self._integrator(np.array([1.0]))
-        self.dense = self._integrator(NODES[1:])
+        self.dense = self._integrator(LOBATTO[1:])
         self._ends = end_conditions(ham.form)
-        self._systems: dict[tuple[int, ...], tuple[Any, Any]] = {}
+        self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
-    def system(self, arcs: Arcs) -> tuple[Any, Any]:
+    def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
         """Residual and its Jacobian as functions of (unknowns, data), for a number of segments in every arc."""
         key = tuple(arcs.segments)
         if key not in self._systems:
             build = self._backward if self.backward else self._multiple
             z, data, residual = build(arcs)
             jacobian = ca.jacobian(residual, z)
-            self._systems[key] = (
-                ca.Function("residual", [z, data], [residual]),
-                ca.Function("jacobian", [z, data], [jacobian]),
-            )
+            named = (("residual", residual), ("jacobian", jacobian))
+            self._systems[key] = tuple(ca.Function(name, [z, data], [value]) for name, value in named)
         return self._systems[key]
 
-    def _multiple(self, arcs: Arcs) -> tuple[Any, Any, Any]:
+    def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Forward multiple shooting: unknown y at every segment's start and at the end."""
-        form, _ham = self.form, self.ham
+        form = self.form
         at, of = self.layout(arcs), self._data(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
         total = sum(arcs.segments)
@@ -77,7 +78,7 @@ class BoundaryProblem:
             residuals.append(values[2] + by_horizon + ca.sum2(quads[1, :]))
         return z, data, ca.vertcat(*residuals)
 
-    def _backward(self, arcs: Arcs) -> tuple[Any, Any, Any]:
+    def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Backward shooting: unknown end state only; the start must be met."""
         form = self.form
         of = self._data(arcs)
@@ -86,7 +87,7 @@ class BoundaryProblem:
         _, y_start = self._chain(z, data, arcs, total)
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
-    def _chain(self, state: Any, data: Any, arcs: Arcs, total: int) -> tuple[list[Any], Any]:
+    def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
         """y at all nodes from the end to the start, integrated backwards from an end state."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
@@ -101,7 +102,7 @@ class BoundaryProblem:
             nodes.append(y)
         return nodes, y
 
-    def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: Arcs) -> Any:
+    def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
         """The q of every segment side by side."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
@@ -120,12 +121,13 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
+        """The arguments of a Hamiltonian system's functions, of y and q (columns, one a sample) at times ``at``."""
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
         return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
 
-    def layout(self, arcs: Arcs) -> dict[str, slice]:
+    def layout(self, arcs: ControlArcs) -> dict[str, slice]:
         """Where everything stands in the vector of unknowns."""
         form = self.form
         total = sum(arcs.segments)
@@ -136,55 +138,41 @@ class BoundaryProblem:
             "start": len(form.start),
             "end": len(form.end),
         }
-        cuts = np.cumsum([0, *sizes.values()])
-        return {name: slice(int(a), int(b)) for name, a, b in zip(sizes, cuts, cuts[1:], strict=False)}
+        return side_by_side(sizes)
 
-    def _data(self, arcs: Arcs) -> dict[str, slice]:
+    def _data(self, arcs: ControlArcs) -> dict[str, slice]:
         """Where everything stands in the vector of data: horizon if fixed, p, end values, bang values, guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
-        cuts = np.cumsum([0, *parts.values()])
-        return {name: slice(int(a), int(b)) for name, a, b in zip(parts, cuts, cuts[1:], strict=False)}
+        return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
         """Function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang, guess]."""
         ham = self.ham
         sizes = ham.sizes
         flow = ham.flow()
-        sym = (ca.SX if flow.is_a("SXFunction") else ca.MX).sym
+        sym = symbols_of(flow).sym
         y, place = sym("y", 2 * sizes[0]), sym("place")
         q = sym("q", 3 + sum(sizes[4:]))
-        cuts = np.cumsum([3, *sizes[4:]])
-        tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
-        x_rate, lam_rate, cost, by_horizon = flow(y[: sizes[0]], y[sizes[0] :], q[0] + place * q[1], q[2], *tail)
+        x_rate, lam_rate, cost, by_horizon = flow(*self.arguments(y, q[0] + place * q[1], q[2], q))
         ode, quad = q[1] * ca.vertcat(x_rate, lam_rate), q[1] * ca.vertcat(cost, by_horizon)
-        tolerance = self.tolerance
-        options = {
-            "reltol": tolerance,
-            "abstol": tolerance,
-            "max_num_steps": 50_000,
-            "quad_err_con": True,
-            "linear_multistep_method": "adams",
-            "show_eval_warnings": False,
-            "disable_internal_warnings": True,  # a trial step of Newton's method may go anywhere
-        }
         dae = {"x": y, "t": place, "p": q, "ode": ode, "quad": quad}
-        integrator = ca.integrator("flow", "cvodes", dae, 0.0, places.tolist(), options)
+        flown = integrator("flow", dae, places.tolist(), tolerance=self.tolerance, max_steps=MOST_STEPS)
         y, q = ca.MX.sym("y", 2 * sizes[0]), ca.MX.sym("q", q.numel())
-        result = integrator(x0=y, p=q)
+        result = flown(x0=y, p=q)
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
-    def integrate(self, integrator: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (2 nx, places) and integrals (2,); nan where the integration breaks down."""
         try:
             with quiet():
-                states, spent = integrator(y, q)
+                states, spent = segment(y, q)
             return np.asarray(states.full()), np.asarray(spent.full()).reshape(-1)
         except RuntimeError:
-            return np.full(integrator.size_out(0), np.nan), np.full(2, np.nan)
+            return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
 
-    def end_multipliers(self, z: np.ndarray, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
+    def end_multipliers(self, z: np.ndarray, arcs: ControlArcs) -> tuple[np.ndarray, np.ndarray]:
         """Multipliers of the start and of the end constraints."""
         if self.backward:
             return np.zeros(0), np.zeros(0)
@@ -197,7 +185,9 @@ class BoundaryProblem:
             return y
         return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
 
-    def unpack(self, z: np.ndarray, arcs: Arcs, data: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def unpack(
+        self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
@@ -220,6 +210,12 @@ class BoundaryProblem:
         return y, np.asarray(inputs(switches, horizon, data).full()), switches, horizon
 
 
+def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
+    """Where each part stands in a vector of all, in order."""
+    cuts = np.cumsum([0, *sizes.values()]).tolist()
+    return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
+
+
 def check_backward(ham: Hamiltonian) -> None:
     """Raise ProblemError where backward shooting cannot take the problem."""
     form = ham.form
@@ -238,7 +234,9 @@ def check_backward(ham: Hamiltonian) -> None:
     if found:
         raise ProblemError(
             f"backward shooting cannot take {', '.join(found)}: it needs a given start, a free end state and a fixed "
-            "horizon; use Indirect(shooting='multiple')"
+            "horizon; use Indirect(shooting='multiple')",
+            name="shooting",
+            value="backward",
         )
 
 
@@ -248,7 +246,7 @@ def end_conditions(form: Formulation) -> Any:
     ``ends`` are, for initial and then for terminal states, 1 where an entry is given and its value; elsewhere the
     costate there is the gradient of Phi = terminal cost + nu . constraints (with minus at the start).
     """
-    sym = form.problem.symbols.sym
+    sym = form.sym
     nx = form.nx
     y0, y1, ends = sym("y0", 2 * nx), sym("y1", 2 * nx), sym("ends", 4 * nx)
     nu0, nu1 = sym("nu0", len(form.start)), sym("nu1", len(form.end))

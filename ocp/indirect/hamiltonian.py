@@ -12,12 +12,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, about
 from ocp.problem.formulation import Formulation
+from ocp.problem.values import symbols_of
 
 __all__ = ["Hamiltonian"]
 
-SEED = 20110106
+SEED = 20110106  # of the random points at which matrices are looked at
 REGULAR = 1e-9  # least eigenvalue, relative to the largest, of a matrix that may be divided by
 
 
@@ -55,7 +56,7 @@ class Hamiltonian:
                 linear in a control that has no bounds, or does not determine a control; says which.
         """
         check_constraints(form)
-        sym = form.problem.symbols.sym
+        sym = form.sym
         levels = [form.bounds.function(form.p)[0][int(i)] for i in form.path.bounds]
         rows = form.path.expression - ca.vertcat(form.problem.symbols(0, 1), *levels)
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
@@ -88,19 +89,20 @@ class Hamiltonian:
         switching = slope[list(self.linear)] if self.linear else slope[:0, :]
         return self._eliminated("outputs", [self.form.u, self.mu, self.value, switching])
 
-    def multipliers(self, u: np.ndarray, free: np.ndarray, *point: Any) -> np.ndarray:
+    def multipliers(
+        self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, t: np.ndarray, horizon: float, p: Any
+    ) -> np.ndarray:
         """Multipliers of the path equalities that best make H stationary in the free controls. Shape (K, m).
 
         Args:
-            u: Controls at K samples. Shape (K, nu). free: Which are off their bounds. Shape (K, nu), bool.
-            point: x, lam, t, T, p at the samples, each (size, K).
+            free: Which controls are off their bounds. Shape (K, nu), bool.
+            x, u, lam: States, controls, costates at K samples. Shape (K, .). t: Times, s. Shape (K,).
+            horizon: s. p: Parameters. Shape (np,).
         """
         form, count = self.form, len(u)
         slope = ca.substitute([ca.gradient(self.value, form.u)], [self.mu], [ca.DM.zeros(len(form.path))])[0]
-        symbols = [form.x, self.lam, form.t, form.T, form.p, form.u]
-        outputs = [ca.densify(slope), ca.densify(ca.vec(ca.jacobian(self.rows, form.u)))]
-        found = ca.Function("slopes", symbols, outputs).map(count)(*point, u.T)
-        slopes, rows = (np.asarray(v.full()).T for v in found)
+        outputs = [slope, ca.jacobian(self.rows, form.u)]
+        slopes, rows = form.sampled(outputs, x, u, t, horizon, p, (self.lam, lam))
         mu = np.zeros((count, len(form.path)))
         for k in range(count):
             columns = rows[k].reshape(form.nu, -1)[free[k]]
@@ -110,14 +112,14 @@ class Hamiltonian:
 
     def _eliminated(self, name: str, outputs: list[Any]) -> Any:
         form = self.form
-        sym = form.problem.symbols.sym
+        sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
         control = assemble_control(form, self.smooth, self.linear, w, bang)
         outputs = [ca.densify(out) for out in outputs]
         outputs = ca.substitute(outputs, [form.u, self.mu], [control, w[len(self.smooth) :, :]])
         inner = ca.Function(name, [form.x, self.lam, form.t, form.T, form.p, bang, w], outputs, {"cse": True})
-        flat = self.unknowns.is_a("SXFunction") and inner.is_a("SXFunction")
-        arguments = [(ca.SX if flat else ca.MX).sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
+        sym = symbols_of(self.unknowns, inner).sym
+        arguments = [sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
         found = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
         return ca.Function(name, arguments, found, {"cse": True})
 
@@ -136,27 +138,31 @@ def check_constraints(form: Formulation) -> None:
         if np.any(np.isfinite(low) | np.isfinite(high)):
             raise ProblemError(
                 f"the indirect method cannot take the bounds of state {name!r}: it knows path constraints only as "
-                "bounds of controls and equalities that contain a control; drop them or use a direct method"
+                "bounds of controls and equalities that contain a control; drop them or use a direct method",
+                name=name,
             )
-    for label, equality, uses in zip(form.path.labels, form.path.equality, form.path.uses_control, strict=True):
-        if not equality:
-            raise ProblemError(
-                f"the indirect method cannot take the path inequality {label!r}; drop it or use a direct method"
-            )
-        if not uses:
-            raise ProblemError(
-                f"the indirect method cannot take the path equality {label!r}, which contains no control; "
-                "differentiate it until one appears or use a direct method"
-            )
+    path = form.path
+    for owner, label, equality, uses in zip(path.owners, path.labels, path.equality, path.uses_control, strict=True):
+        with about(owner):
+            if not equality:
+                raise ProblemError(
+                    f"the indirect method cannot take the path inequality {label!r}; drop it or use a direct method"
+                )
+            if not uses:
+                raise ProblemError(
+                    f"the indirect method cannot take the path equality {label!r}, which contains no control; "
+                    "differentiate it until one appears or use a direct method"
+                )
     if form.nu and ca.depends_on(form.terminal, form.u0):
         raise ProblemError("the indirect method cannot take a terminal cost on the control at the start")
     controls = ca.vertcat(form.u, form.u0)
     for kind, rows in (("start", form.start), ("end", form.end)):
-        for i, (label, equality) in enumerate(zip(rows.labels, rows.equality, strict=True)):
-            if not equality:
-                raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
-            if form.nu and ca.depends_on(rows.expression[i], controls):
-                raise ProblemError(f"the indirect method cannot take {kind} constraint {label!r} on the control")
+        for i, (owner, label, equality) in enumerate(zip(rows.owners, rows.labels, rows.equality, strict=True)):
+            with about(owner):
+                if not equality:
+                    raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
+                if form.nu and ca.depends_on(rows.expression[i], controls):
+                    raise ProblemError(f"the indirect method cannot take {kind} constraint {label!r} on the control")
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,7 @@ class Stationarity:
     def solve(self) -> tuple[Any, str]:
         """Function (x, lam, t, T, p, bang, guess) -> w, and how it works."""
         form, n, m = self.form, len(self.smooth), len(self.form.path)
-        sym = form.problem.symbols.sym
+        sym = form.sym
         self._check_linear()
         w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
         known = [form.x, self.lam, form.t, form.T, form.p, bang]
@@ -223,7 +229,8 @@ class Stationarity:
             if not (np.isfinite(low[at]) and np.isfinite(high[at])):
                 raise ProblemError(
                     f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
-                    "both sides: no control makes it least; bound it or add a quadratic term to the cost"
+                    "both sides: no control makes it least; bound it or add a quadratic term to the cost",
+                    name=self.form.control_labels[i],
                 )
 
     def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:

@@ -13,20 +13,19 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
 from ocp.errors import ProblemError, SolveError, checked_choice, checked_count, checked_mapping, checked_positive
-from ocp.indirect.boundary import NODES, BoundaryProblem
+from ocp.indirect.boundary import LOBATTO, BoundaryProblem
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.minimality import not_least
 from ocp.indirect.newton import Found, newton
-from ocp.indirect.seed import Arcs, read_arcs, read_unknowns
+from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Formulation, at_samples
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs
 
@@ -112,9 +111,7 @@ class PreparedIndirect:
             ProblemError: Wrong parameters or guess. SolveError: Newton failed, or a control has a singular arc.
         """
         form = self.formulation
-        if not isinstance(parameters, Mapping | None):
-            raise ProblemError(f"parameters must be a dictionary by name, not {parameters!r}")
-        p = form.parameter_vector(dict(parameters or {}))
+        p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
         note = ""
         if isinstance(guess, Solution):
@@ -122,7 +119,8 @@ class PreparedIndirect:
             check_belongs(form, seed)
             missing = [name for name in form.states if name not in seed.costates]
             if missing:
-                raise ProblemError(f"the guess, plan {seed.name!r}, has no costates of {', '.join(missing)}")
+                words = f"the guess, plan {seed.name!r}, has no costates of {', '.join(missing)}"
+                raise ProblemError(words, name=missing[0])
         else:
             direct = self.method.seed
             if self.hamiltonian.linear:  # bang-bang controls ring between free collocation points
@@ -130,31 +128,40 @@ class PreparedIndirect:
             try:
                 seed = direct.prepare(self.problem, **self._seeding).solve(parameters, guess)
             except SolveError as error:
-                return self._no_seed(f"the direct solution that was to seed it failed: {error}", error.solution, check)
+                return self._no_seed("the direct solution that was to seed it failed: ", error, error.solution, check)
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
         try:
             arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds, self.method.segments)
         except SolveError as error:
-            return self._no_seed(str(error), seed, check)
+            return self._no_seed("", error, seed, check)
         system = self.boundary.system(arcs)
         start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds, backward=self.boundary.backward)
-        found = newton(system, start, data, self._scale(start, arcs), self.method.residual)
+        found = newton(system, start, data, float(max(1.0, np.max(np.abs(start)))), self.method.residual)
         found = self._check_order(found, arcs, bounds)
         solution = self._solution(found, arcs, data, p, bounds, note, time.monotonic() - began)
         if check and not solution.success:
-            raise SolveError(self._diagnosis(found, solution), solution)
+            raise SolveError(
+                f"problem {self.problem.name!r}: the indirect method failed: {solution.status} after {found.steps} "
+                f"Newton steps, residual {found.residual:.2e}\n  try a finer direct solution as guess, more segments, "
+                "or a direct method",
+                solution,
+                value=found.residual,
+                limit=self.method.residual,
+            )
         return solution
 
-    def _no_seed(self, reason: str, seed: Solution | None, check: bool) -> Solution:
+    def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
         """Raise SolveError because of a seed that cannot be used, or return that seed as no success."""
         if check or seed is None:
-            raise SolveError(f"problem {self.problem.name!r}: the indirect method failed: {reason}", seed)
-        return dataclasses.replace(seed, success=False, status=reason)
+            words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
+            told = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
+            raise SolveError(words, seed, error.conflicts, **told) from error
+        return dataclasses.replace(seed, success=False, status=f"{why}{error}")
 
     # ---- before and after ------------------------------------------------------------------------------------
 
-    def _check_order(self, found: Found, arcs: Arcs, bounds: tuple[np.ndarray, np.ndarray]) -> Found:
+    def _check_order(self, found: Found, arcs: ControlArcs, bounds: tuple[np.ndarray, np.ndarray]) -> Found:
         """A root whose switches are out of order, or whose horizon is beyond its bounds, is no plan."""
         if self.method.shooting == "backward" or not found.success:
             return found
@@ -177,13 +184,10 @@ class PreparedIndirect:
         status = f"the switches are not in order within the horizon: {np.round(knots[1:], 6).tolist()} s"
         return dataclasses.replace(found, success=False, status=status)
 
-    def _scale(self, start: np.ndarray, arcs: Arcs) -> float:
-        return float(max(1.0, np.max(np.abs(start))))
-
     def _solution(
         self,
         found: Found,
-        arcs: Arcs,
+        arcs: ControlArcs,
         data: np.ndarray,
         p: np.ndarray,
         bounds: tuple[np.ndarray, np.ndarray],
@@ -193,36 +197,27 @@ class PreparedIndirect:
         form, ham = self.formulation, self.hamiltonian
         y, inputs, switches, horizon = self.boundary.unpack(found.unknowns, arcs, data)
         pieces = self._pieces(y, inputs, bounds)
-        count = len(pieces) * len(NODES)
-        dense = np.full((len(pieces), len(NODES), 2 * form.nx), np.nan)
+        count = len(pieces) * len(LOBATTO)
+        dense = np.full((len(pieces), len(LOBATTO), 2 * form.nx), np.nan)
         cost = 0.0
         for i, (first, piece) in enumerate(pieces):
             dense[i, 0] = first
             states, spent = self.boundary.integrate(self.boundary.dense, first, piece)
             dense[i, 1:], cost = states.T, cost + float(spent[0])
         q: np.ndarray = np.array([piece for _, piece in pieces]).T
-        times = q[0][:, None] + q[1][:, None] * NODES
+        times = q[0][:, None] + q[1][:, None] * LOBATTO
         flat = dense.reshape(count, -1)
-        repeated = np.repeat(q, len(NODES), axis=1)
-        arguments = self.boundary.arguments(flat.T, times.reshape(1, -1), repeated[2:3], repeated)
-        control, multiplier = (np.asarray(out.full()).T for out in self.boundary.outputs.map(count)(*arguments)[:2])
-        terminal = ca.Function("terminal", [form.x, form.x0, form.u0, form.t, form.T, form.p], [form.terminal])
-        cost += float(terminal(flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu), horizon, horizon, p))
+        arguments = self.boundary.arguments(flat.T, times.reshape(1, -1), horizon, np.repeat(q, len(LOBATTO), axis=1))
+        columns = [value.T if np.ndim(value) else value for value in arguments]
+        control, multiplier = at_samples(self.boundary.outputs, *columns)[:2]
+        ends = flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu)
+        cost += form.terminal_cost(*ends, horizon, p)
 
-        shape = (len(pieces), len(NODES))
+        shape = (len(pieces), len(LOBATTO))
         nu_start, nu_end = self.boundary.end_multipliers(found.unknowns, arcs)
-        extremal = Extremal(
-            NODES,
-            q[1],
-            times,
-            dense[..., : form.nx],
-            dense[..., form.nx :],
-            control.reshape(*shape, form.nu),
-            multiplier.reshape(*shape, len(form.path)),
-            horizon,
-            nu_start,
-            nu_end,
-        )
+        x, lam = dense[..., : form.nx], dense[..., form.nx :]
+        u, mu = control.reshape(*shape, form.nu), multiplier.reshape(*shape, len(form.path))
+        extremal = Extremal(LOBATTO, q[1], times, x, lam, u, mu, horizon, nu_start, nu_end)
         if found.success:
             reason = not_least(ham, extremal, p, bounds)
             if reason:
@@ -234,10 +229,7 @@ class PreparedIndirect:
         keep = own.ravel()
         reported = times.ravel()[keep]
         reported[-1] = horizon
-        interpolants = [
-            PiecewisePolynomial(breaks, NODES, values)
-            for values in (extremal.states, extremal.controls, extremal.costates)
-        ]
+        interpolants = [PiecewisePolynomial(breaks, LOBATTO, values) for values in (x, u, lam)]
         settings = dataclasses.asdict(self.method)
         return Solution(
             name=form.name,
@@ -280,8 +272,8 @@ class PreparedIndirect:
         for first, q in zip(y.T[:-1], inputs.T, strict=True):
             cuts = [0.0]
             if self.hamiltonian.how != "quadratic":
-                marks = [at_bound(first, q, place) for place in NODES]
-                for a, b, before, after in zip(NODES, NODES[1:], marks, marks[1:], strict=False):
+                marks = [at_bound(first, q, place) for place in LOBATTO]
+                for a, b, before, after in zip(LOBATTO, LOBATTO[1:], marks, marks[1:], strict=False):
                     if np.any(before != after):
                         cuts.append(bisect(partial(at_bound, first, q), a, b, before))
             cuts = [cut for cut in cuts if cut < 1.0 - 1e-9]
@@ -291,13 +283,6 @@ class PreparedIndirect:
                 piece = np.concatenate([[q[0] + a * q[1], (b - a) * q[1]], q[2:]])
                 pieces.append((self.boundary.advance(first, q, a), piece))
         return pieces
-
-    def _diagnosis(self, found: Found, solution: Solution) -> str:
-        return (
-            f"problem {self.problem.name!r}: the indirect method failed: {solution.status} after {found.steps} Newton "
-            f"steps, residual {found.residual:.2e}\n  try a finer direct solution as guess, more segments, or a direct "
-            "method"
-        )
 
 
 def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:

@@ -13,8 +13,8 @@ from ocp.errors import ProblemError
 
 __all__ = ["Found", "newton"]
 
-HALVINGS = 12
-STEPS = 40
+HALVINGS = 12  # of a step before it counts as none
+MOST_STEPS = 40
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Found:
     status: str
 
 
-def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: float, tolerance: float) -> Found:
+def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: float, tolerance: float) -> Found:
     """Damped Newton's method on a sparse system; the step is halved until the residual falls."""
     residual, jacobian = system
 
@@ -45,14 +45,14 @@ def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: 
     interrupt = Interrupt()
     polished = False
     with interruptible(interrupt):
-        for steps in range(STEPS + 1):
+        for steps in range(MOST_STEPS + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
                 return Found(z, size, steps, False, "the integration broke down at the seed")
             if size <= tolerance * scale and polished:
                 return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step: it costs little and gains digits
-            if interrupt.stop or steps == STEPS:
+            if interrupt.stop or steps == MOST_STEPS:
                 break
             try:
                 with quiet():
@@ -65,9 +65,8 @@ def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: 
                 step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
                 word = "Newton's matrix is singular: the plan is not determined"
-                return Found(
-                    z, size, steps, polished, f"Converged in {steps} Newton steps; {word}" if polished else word
-                )
+                status = f"Converged in {steps} Newton steps; {word}" if polished else word
+                return Found(z, size, steps, polished, status)
             length = 1.0
             for _ in range(HALVINGS):
                 trial = z + length * step
@@ -80,4 +79,6 @@ def newton(system: tuple[Any, Any], start: np.ndarray, data: np.ndarray, scale: 
             if polished and np.max(np.abs(new)) > size:
                 return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
             z, value = trial, new
-    return Found(z, size, steps, False, "interrupted" if interrupt.stop else f"not converged in {STEPS} Newton steps")
+    return Found(
+        z, size, steps, False, "interrupted" if interrupt.stop else f"not converged in {MOST_STEPS} Newton steps"
+    )

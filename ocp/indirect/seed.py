@@ -1,6 +1,7 @@
-"""Bang-bang controls: which bound each is at, and where it switches, read from a direct solution.
+"""From a direct solution to where Newton's method starts: the arcs of bang-bang controls, unknowns and data.
 
-Where Newton's method starts: unknowns and data of the boundary value problem, read from a seed.
+The signs of dH/du along the seed say which bound each control is at in which H is linear, and where it switches; a
+seed with a singular arc or chattering is refused. States, costates and switch times of the seed are the first unknowns.
 """
 
 from __future__ import annotations
@@ -12,21 +13,23 @@ import numpy as np
 
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Formulation, at_samples
 from ocp.solution import Solution
 
-__all__ = ["Arcs", "read_arcs", "read_unknowns"]
+__all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
 
 INSIDE = 0.1  # share of its range by which a control must be off both bounds to count as inside them
 SINGULAR = 0.1  # share of the horizon that a control may spend inside its bounds, for the sake of coarse seeds
 LONG = 3  # and the number of the seed's samples in a row
 NOISE = 1e-6  # share of the largest value of a switching function that says nothing of its sign
 CHATTER = 3  # arcs in a row that are shorter than an interval of the seed
+FREE_BEYOND = 1e-5  # a control of the seed nearer to its bound is at it
+Bounds = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Arcs:
-    """Arcs between the switches of the controls in which the Hamiltonian is linear.
+class ControlArcs:
+    """ControlArcs between the switches of the controls in which the Hamiltonian is linear.
 
     Attributes:
         switches: Fractions of the horizon. Shape (A - 1,).
@@ -57,30 +60,28 @@ def read_arcs(
     outputs: Any,
     seed: Solution,
     p: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
+    bounds: Bounds,
     segments: int,
-) -> Arcs:
-    """Arcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
+) -> ControlArcs:
+    """ControlArcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
 
     Raises:
         SolveError: A control in which H is linear stays inside its bounds: a singular arc.
     """
     form = ham.form
     if not ham.linear:
-        return Arcs(np.zeros(0), (), (segments,), np.zeros((segments, 0)))
+        return ControlArcs(np.zeros(0), (), (segments,), np.zeros((segments, 0)))
     index_of = list(ham.linear)
     index = form.bounds.places["control"][index_of]
     low, high = bounds[0][index], bounds[1][index]
-    m = len(seed.t)
-    x, lam, u = (np.hstack([np.zeros((m, 0)), *[pool[name] for name in places]]) for pool, places in (
-        (seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls)))  # fmt: skip
-    linear = u[:, list(ham.linear)]
-    guess = np.hstack([u[:, list(ham.smooth)], np.zeros((m, len(form.path)))])
-    ones = np.ones((1, m))
-    arguments = (x.T, lam.T, seed.t[None, :], seed.horizon * ones, p[:, None] * ones, linear.T, guess.T)
-    slope = np.asarray(outputs.map(m)(*arguments)[3].full()).T
+    x, lam, u = (
+        np.hstack([np.zeros((len(seed.t), 0)), *[pool[name] for name in places]])
+        for pool, places in ((seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls))
+    )
+    guess = np.hstack([u[:, list(ham.smooth)], np.zeros((len(u), len(form.path)))])
+    slope = at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
     own_low, own_high = own_bounds(form, seed, bounds)
-    check_singular(form.control_labels, ham.linear, seed, own_low[index_of], own_high[index_of], list(form.controls))
+    check_singular(ham, seed, own_low[index_of], own_high[index_of])
 
     at_lower = signs(slope) > 0
     events: list[tuple[float, int]] = []
@@ -91,7 +92,7 @@ def read_arcs(
             events.append((float(seed.t[k] + share * (seed.t[k + 1] - seed.t[k])) / seed.horizon, j))
     events = sorted(event for event in events if 1e-6 < event[0] < 1 - 1e-6)
     switches = np.array([at for at, _ in events])
-    check_chattering(form.control_labels, ham.linear, events, seed)
+    check_chattering(ham, events, seed)
     widths = np.diff(np.concatenate([[0.0], switches, [1.0]]))
     counts = tuple(int(max(2, round(segments * width))) for width in widths)
     state = at_lower[0].copy()
@@ -100,12 +101,10 @@ def read_arcs(
         values += [np.where(state, low, high)] * count
         if arc < len(events):
             state[events[arc][1]] = ~state[events[arc][1]]
-    return Arcs(switches, tuple(j for _, j in events), counts, np.array(values))
+    return ControlArcs(switches, tuple(j for _, j in events), counts, np.array(values))
 
 
-def own_bounds(
-    form: Formulation, seed: Solution, bounds: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def own_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the controls that the seed was solved with, which may be other ones. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
@@ -131,59 +130,52 @@ def signs(slope: np.ndarray) -> np.ndarray:
     return np.asarray(found)
 
 
-def check_singular(
-    labels: tuple[str, ...],
-    linear: tuple[int, ...],
-    seed: Solution,
-    low: np.ndarray,
-    high: np.ndarray,
-    order: list[str],
-) -> None:
+def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.ndarray) -> None:
     """Raise SolveError where a linear control of the seed stays inside its bounds for long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
-    own = {name: np.arange(seed.controls[name].shape[1]) for name in seed.controls}  # the seed's own order
-    offsets = dict(zip(own, np.cumsum([0, *[len(i) for i in own.values()]]), strict=False))
-    columns = np.concatenate([offsets[name] + own[name] for name in order])[list(linear)]
-    values = samples.values.reshape(len(at), -1)[:, columns]
-    for j, index in enumerate(linear):
+    sizes = [values.shape[1] for values in seed.controls.values()]
+    columns = dict(zip(seed.controls, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
+    order = np.concatenate([columns[name] for name in ham.form.controls])[list(ham.linear)]  # the seed's own
+    values = samples.values.reshape(len(at), -1)[:, order]
+    for j, index in enumerate(ham.linear):
         margin = INSIDE * (high[j] - low[j])
         inside = (values[:, j] > low[j] + margin) & (values[:, j] < high[j] - margin)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             width = at[end - 1] - at[begin]
             if end - begin > LONG and width > SINGULAR:
+                label = ham.form.control_labels[index]
                 raise SolveError(
-                    f"control {labels[index]!r} has a singular arc from {at[begin] * seed.horizon:.4g} to "
+                    f"control {label!r} has a singular arc from {at[begin] * seed.horizon:.4g} to "
                     f"{at[end - 1] * seed.horizon:.4g} s, where the Hamiltonian does not determine it; use a direct "
-                    "method, or add a small quadratic term in it to the cost"
+                    "method, or add a small quadratic term in it to the cost",
+                    name=label,
+                    time=float(at[begin] * seed.horizon),
                 )
 
 
-def check_chattering(
-    labels: tuple[str, ...], linear: tuple[int, ...], events: list[tuple[float, int]], seed: Solution
-) -> None:
+def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: Solution) -> None:
     """Raise SolveError where a control switches again and again within the width of the seed's intervals."""
     width = 1.5 * float(np.max(np.diff(seed.control_interpolant.breaks)))
-    for j, index in enumerate(linear):
+    for j, index in enumerate(ham.linear):
+        label = ham.form.control_labels[index]
         at = np.array([time for time, component in events if component == j])
         quick = np.diff(at) < width
         for k in range(len(quick) - CHATTER + 1):
             if quick[k : k + CHATTER].all():
                 raise SolveError(
-                    f"control {labels[index]!r} switches in every interval from {at[k] * seed.horizon:.4g} s on: "
+                    f"control {label!r} switches in every interval from {at[k] * seed.horizon:.4g} s on: "
                     "a singular arc or chattering, where the Hamiltonian does not determine it; use a direct method "
-                    "with held controls, or add a small quadratic term in it to the cost"
+                    "with held controls, or add a small quadratic term in it to the cost",
+                    name=label,
+                    time=float(at[k] * seed.horizon),
                 )
 
 
-NEAR = 1e-5  # a control of the seed nearer to its bound is at it
-Bounds = tuple[np.ndarray, np.ndarray]
-
-
 def read_unknowns(
-    ham: Hamiltonian, seed: Solution, arcs: Arcs, p: np.ndarray, bounds: Bounds, *, backward: bool
+    ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, bounds: Bounds, *, backward: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unknowns and data, laid out as :class:`ocp.indirect.boundary.BoundaryProblem` has them, from a seed.
 
@@ -196,13 +188,12 @@ def read_unknowns(
     fractions = times / horizon
     x, lam, _ = sampled(form, seed, fractions)
     places = form.bounds.places
-    given = [bounds[0][places[k]] == bounds[1][places[k]] for k in ("initial", "terminal")]
-    values = [
-        np.where(fixed, bounds[0][places[k]], 0.0) for fixed, k in zip(given, ("initial", "terminal"), strict=True)
-    ]
-    ends = np.concatenate([given[0], values[0], given[1], values[1]])
+    ends = []
+    for end in ("initial", "terminal"):
+        given = bounds[0][places[end]] == bounds[1][places[end]]
+        ends += [given, np.where(given, bounds[0][places[end]], 0.0)]
     guess = control_guess(ham, seed, 0.5 * (fractions[:-1] + fractions[1:]), horizon, p, bounds)
-    data = np.concatenate([[horizon], p, ends, arcs.bang.ravel(), guess.ravel()])
+    data = np.concatenate([[horizon], p, *ends, arcs.bang.ravel(), guess.ravel()])
     if backward:
         return x[-1], data
     free = [horizon] if form.horizon_is_free else []
@@ -231,7 +222,6 @@ def control_guess(
     mu = np.zeros((count, len(form.path)))
     if len(form.path):
         low, high = (bound[form.bounds.places["control"]] for bound in bounds)
-        free = (control > low + NEAR) & (control < high - NEAR)
-        ones = np.ones((1, count))
-        mu = ham.multipliers(control, free, x.T, lam.T, fractions[None, :] * horizon, horizon * ones, p[:, None] * ones)
+        free = (control > low + FREE_BEYOND) & (control < high - FREE_BEYOND)
+        mu = ham.multipliers(free, x, control, lam, fractions * horizon, horizon, p)
     return np.hstack([control[:, list(ham.smooth)], mu])

@@ -7,6 +7,7 @@ multiplier that holds it. Bryson, Ho 1975, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -39,37 +40,37 @@ class Extremal:
     nu_start: np.ndarray
     nu_end: np.ndarray
 
+    def sampled(self, ham: Hamiltonian, outputs: list[Any], p: np.ndarray) -> list[np.ndarray]:
+        """Expressions of x, u, lam, mu, t, T, p at all K m samples in order; each output (K m, its size)."""
+        count = self.t.size
+        x, u, lam, mu = (v.reshape(count, -1) for v in (self.states, self.controls, self.costates, self.multipliers))
+        return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))
+
 
 def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Derivative of the optimal cost in the parameters. Shape (np,)."""
     form = ham.form
-    symbols = [form.x, form.u, ham.lam, ham.mu, form.t, form.T, form.p]
     slopes = [ca.gradient(ham.value, s) for s in (form.p, form.T, form.u)]
-    function = ca.Function("slopes", symbols, [ca.densify(s) for s in (*slopes, ham.value)])
-    count = path.t.size
+    by_p, by_horizon, by_control, value = path.sampled(ham, [*slopes, ham.value], p)
     weights = (path.widths[:, None] * quadrature_weights(path.places)).ravel()
-    ones = np.ones((1, count))
-    samples = [v.reshape(count, -1).T for v in (path.states, path.controls, path.costates, path.multipliers)]
-    arguments = (*samples, path.t.reshape(1, -1), path.horizon * ones, p[:, None] * ones)
-    by_p, by_horizon, by_control, value = (np.asarray(v.full()) for v in function.map(count)(*arguments))
 
     x0, x1 = path.states[0, 0], path.states[-1, -1]
     phi_p, phi_horizon, phi_x0, phi_x1 = end_gradients(ham, path, x0, x1, p)
     places = form.bounds.places
     push = np.zeros((2, len(bounds[0])))  # multipliers of lower and upper bounds, as of f + lam . g
-    controls = samples[1]
-    low, high = (bound[places["control"]][:, None] for bound in bounds)
+    controls = path.controls.reshape(len(weights), -1)
+    low, high = (bound[places["control"]] for bound in bounds)
     middle = 0.5 * (np.where(np.isfinite(low), low, controls) + np.where(np.isfinite(high), high, controls))
-    push[0, places["control"]] = -(by_control * (controls <= middle)) @ weights
-    push[1, places["control"]] = -(by_control * (controls > middle)) @ weights
+    push[0, places["control"]] = -weights @ (by_control * (controls <= middle))
+    push[1, places["control"]] = -weights @ (by_control * (controls > middle))
     push[0, form.start.bounds], push[0, form.end.bounds] = path.nu_start, path.nu_end
     push[0, places["initial"]] = -(path.costates[0, 0] + phi_x0)
     push[0, places["terminal"]] = path.costates[-1, -1] - phi_x1
     for end in ("initial", "terminal"):  # only given entries are held
         push[0, places[end]] *= bounds[0][places[end]] == bounds[1][places[end]]
     if not form.horizon_is_free:
-        push[0, places["horizon"]] = -(value[0, -1] + phi_horizon + float(by_horizon[0] @ weights))
-    return np.asarray(by_p @ weights + phi_p - form.bounds.pull(p, push))
+        push[0, places["horizon"]] = -(value[-1, 0] + phi_horizon + float(weights @ by_horizon[:, 0]))
+    return np.asarray(weights @ by_p + phi_p - form.bounds.pull(p, push))
 
 
 def end_gradients(

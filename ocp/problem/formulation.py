@@ -162,6 +162,11 @@ class Formulation:
         function = ca.Function("sampled", symbols, [ca.densify(ca.vec(output)) for output in outputs], {"cse": True})
         return at_samples(function, x, u, np.reshape(t, (-1, 1)), horizon, p, *(values for _, values in more))
 
+    def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
+        """The terminal cost of a final state, and of the state and controls at the start."""
+        symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
+        return float(ca.Function("terminal", symbols, [self.terminal])(x, x0, u0, horizon, horizon, p))
+
     def horizon_at(self, p: Any) -> Any:
         """The fixed horizon at parameters, numbers or symbols."""
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
