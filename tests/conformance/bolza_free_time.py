@@ -27,30 +27,22 @@ def build() -> Problem:
 
 def optimum(t: Array) -> Extremal:
     return Extremal(
-        state={"x": sqrt(2) * t},
-        control={"u": np.full_like(t, sqrt(2))},
-        costate={"x": np.full_like(t, -sqrt(2))},
+        state={"x": sqrt(2) * t}, control={"u": np.full_like(t, sqrt(2))}, costate={"x": np.full_like(t, -sqrt(2))}
     )
 
 
-CASE = Case(
-    name="Bolza, free time",
-    build=build,
-    cost=sqrt(2),
-    horizon=1 / sqrt(2),
-    optimum=optimum,
-    runs=(
-        # a constant control: every method holds the optimum exactly
-        *within(
-            radau(5),
-            legendre(5),
-            shooting(5, "held"),
-            shooting(5, "linear"),
-            cost=(1e-11, 1e-11),
-            state=1e-11,
-            control=1e-10,
-            costate=1e-10,
-            time=1e-10,
-        ),
+RUNS = (
+    # a constant control: every method holds the optimum exactly
+    *within(
+        radau(5),
+        legendre(5),
+        shooting(5, "held"),
+        shooting(5, "linear"),
+        cost=(1e-11, 1e-11),
+        state=1e-11,
+        control=1e-10,
+        costate=1e-10,
+        time=1e-10,
     ),
 )
+CASE = Case("Bolza, free time", build, sqrt(2), RUNS, horizon=1 / sqrt(2), optimum=optimum)

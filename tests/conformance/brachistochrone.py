@@ -49,23 +49,17 @@ def optimum(t: Array) -> Extremal:
     )
 
 
-CASE = Case(
-    name="brachistochrone",
-    build=build,
-    cost=HORIZON,
-    horizon=HORIZON,
-    optimum=optimum,
-    runs=(
-        *within(
-            radau(30, degree=5),
-            legendre(30, degree=4),
-            cost=(1e-12, 1e-12),
-            state=1e-8,
-            control=2e-6,
-            costate=2e-9,
-            time=1e-12,
-        ),
-        *within(shooting(50, "linear"), cost=(1e-8, 1e-8), state=3e-7, control=2e-4, costate=2e-7, time=1e-8),
-        *within(shooting(50, "held"), cost=(1e-8, 3e-4), state=2e-3, control=0.02, costate=1e-4, time=3e-4),
+RUNS = (
+    *within(
+        radau(30, degree=5),
+        legendre(30, degree=4),
+        cost=(1e-12, 1e-12),
+        state=1e-8,
+        control=2e-6,
+        costate=2e-9,
+        time=1e-12,
     ),
+    *within(shooting(50, "linear"), cost=(1e-8, 1e-8), state=3e-7, control=2e-4, costate=2e-7, time=1e-8),
+    *within(shooting(50, "held"), cost=(1e-8, 3e-4), state=2e-3, control=0.02, costate=1e-4, time=3e-4),
 )
+CASE = Case("brachistochrone", build, HORIZON, RUNS, horizon=HORIZON, optimum=optimum)

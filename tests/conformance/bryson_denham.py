@@ -15,22 +15,17 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, double_integrator, legendre, radau, shooting, within
 
 CEILING = 1 / 9
 T1 = 3 * CEILING  # contact begins; it ends at 1 - T1
 
 
 def build(*, as_path: bool = False) -> Problem:
-    problem = Problem("Bryson-Denham")
-    q = problem.state("q", initial=0.0, terminal=0.0, upper=None if as_path else CEILING)
+    bound = None if as_path else CEILING
+    problem, q, _, u = double_integrator("Bryson-Denham", (0.0, 1.0), (0.0, -1.0), ceiling=bound)
     if as_path:
         problem.path("ceiling", q, upper=CEILING)
-    v = problem.state("v", initial=1.0, terminal=-1.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
     problem.minimize(running=u**2 / 2)
     return problem
 
@@ -51,19 +46,12 @@ EXACT = within(
     radau(12), legendre(12), shooting(12, "linear"), cost=(2e-9, 2e-9), state=1e-5, control=2e-4, costate=2e-3
 )
 
-CASE = Case(
-    name="Bryson-Denham",
-    build=build,
-    cost=4 / (9 * CEILING),
-    horizon=1.0,
-    optimum=optimum,
-    jumps=(T1, 1 - T1),
-    runs=(
-        *EXACT,
-        # contact begins inside an interval: between the points the ceiling is overstepped a little
-        *within(radau(20), legendre(20), cost=(2e-4, 1e-8), state=2e-3, control=0.1, costate=0.1),
-        *within(shooting(48, "held"), cost=(1e-8, 1e-2), state=2e-3, control=0.2, costate=0.1),
-    ),
+RUNS = (
+    *EXACT,
+    # contact begins inside an interval: between the points the ceiling is overstepped a little
+    *within(radau(20), legendre(20), cost=(2e-4, 1e-8), state=2e-3, control=0.1, costate=0.1),
+    *within(shooting(48, "held"), cost=(1e-8, 1e-2), state=2e-3, control=0.2, costate=0.1),
 )
+CASE = Case("Bryson-Denham", build, 4 / (9 * CEILING), RUNS, horizon=1.0, optimum=optimum, jumps=(T1, 1 - T1))
 
 CASE_AS_PATH = replace(CASE, name="Bryson-Denham, ceiling as a path", build=partial(build, as_path=True), runs=EXACT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ocp import Collocation, MultipleShooting, Problem
 
 Array: TypeAlias = npt.NDArray[np.float64]
+Grid: TypeAlias = int | tuple[float, ...]  # equal intervals, or a mesh
 
 
 @dataclass(frozen=True)
@@ -103,29 +104,47 @@ def fitted(corners: Sequence[float], per_arc: int) -> tuple[float, ...]:
     return (*(float(node) for arc in arcs for node in arc), 1.0)
 
 
-def grid(intervals: int | tuple[float, ...]) -> tuple[int, tuple[float, ...] | None]:
-    """Number of intervals and mesh, from either."""
-    return (intervals, None) if isinstance(intervals, int) else (len(intervals) - 1, intervals)
-
-
-def radau(intervals: int | tuple[float, ...], degree: int = 3, control: str = "points") -> Collocation:
+def radau(intervals: Grid, degree: int = 3, control: str = "points", scheme: str = "radau") -> Collocation:
     """Radau collocation on equal intervals or a mesh."""
-    number, mesh = grid(intervals)
-    return Collocation(number, degree, "radau", control, mesh)
+    number, mesh = (intervals, None) if isinstance(intervals, int) else (len(intervals) - 1, intervals)
+    return Collocation(number, degree, scheme, control, mesh)
 
 
-def legendre(intervals: int | tuple[float, ...], degree: int = 3, control: str = "points") -> Collocation:
+def legendre(intervals: Grid, degree: int = 3, control: str = "points") -> Collocation:
     """Legendre collocation on equal intervals or a mesh."""
-    number, mesh = grid(intervals)
-    return Collocation(number, degree, "legendre", control, mesh)
+    return radau(intervals, degree, control, "legendre")
 
 
-def shooting(
-    intervals: int | tuple[float, ...], control: str, steps: int = 1, integrator: str = "rk4"
-) -> MultipleShooting:
+def shooting(intervals: Grid, control: str, steps: int = 1, integrator: str = "rk4") -> MultipleShooting:
     """Multiple shooting on equal intervals or a mesh."""
-    number, mesh = grid(intervals)
-    return MultipleShooting(number, integrator, steps, control, mesh)
+    like = radau(intervals)
+    return MultipleShooting(like.intervals, integrator, steps, control, like.mesh)
+
+
+def held(intervals: Grid) -> tuple[Collocation, Collocation, MultipleShooting]:
+    """Radau, Legendre and shooting with one control an interval."""
+    collocations = radau(intervals, control="held"), legendre(intervals, control="held")
+    return *collocations, shooting(intervals, "held")
+
+
+def double_integrator(
+    name: str,
+    start: tuple[float, float] = (0.0, 0.0),
+    end: tuple[float, float] = (1.0, 0.0),
+    horizon: float | None = 1.0,
+    limit: float | None = None,
+    ceiling: float | None = None,
+) -> tuple[Problem, Any, Any, Any]:
+    """q' = v, v' = u between two states (q, v), |u| <= limit, q <= ceiling; a horizon of None is left to declare."""
+    problem = Problem(name)
+    q = problem.state("q", initial=start[0], terminal=end[0], upper=ceiling)
+    v = problem.state("v", initial=start[1], terminal=end[1])
+    u = problem.control("u", lower=None if limit is None else -limit, upper=limit)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    if horizon is not None:
+        problem.horizon(horizon)
+    return problem, q, v, u
 
 
 def within(

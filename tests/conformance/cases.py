@@ -16,7 +16,6 @@ from . import (
     pendulum,
     quadratic_regulator,
     rayleigh,
-    rayleigh_bounded,
     soft_lander,
     van_der_pol,
 )
@@ -31,7 +30,7 @@ CASES: tuple[Case, ...] = (
     bryson_denham.CASE_AS_PATH,
     brachistochrone.CASE,
     rayleigh.CASE,
-    rayleigh_bounded.CASE,
+    rayleigh.CASE_BOUNDED,
     van_der_pol.CASE,
     *quadratic_regulator.CASES,
     soft_lander.CASE,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, fitted, held, shooting, within
 
 HORIZON = 1.0
 RATIO = (20 - sqrt(40)) / 180
@@ -63,32 +63,19 @@ def optimum(t: Array) -> Extremal:
     )
 
 
+RUNS = (
+    # held controls: free ones ring along a singular arc. Uniform intervals, then both switches on nodes
+    *within(*held(50)[:2], cost=(1e-8, 1e-6), state=2e-3, control=None, costate=2e-2),
+    *within(*held(MESH)[:2], cost=(1e-8, 1e-8), state=3e-7, control=1e-4, costate=4e-6),
+    # smooth enough but for the switches: shooting with both of them on nodes
+    *within(shooting(MESH, "held"), cost=(1e-8, 1e-8), state=3e-7, control=1e-4, costate=4e-6),
+)
 CASE = Case(
-    name="catalyst mixing",
-    build=build,
-    cost=X1_EXIT * (1 + RATIO * L_RATIO) - 1,
+    "catalyst mixing",
+    build,
+    X1_EXIT * (1 + RATIO * L_RATIO) - 1,
+    RUNS,
     horizon=HORIZON,
     optimum=optimum,
     switches=(Switch(T1), Switch(T2)),
-    runs=(
-        # held controls: free ones ring along a singular arc. Uniform intervals, then both switches on nodes
-        *within(
-            radau(50, control="held"),
-            legendre(50, control="held"),
-            cost=(1e-8, 1e-6),
-            state=2e-3,
-            control=None,
-            costate=2e-2,
-        ),
-        *within(
-            radau(MESH, control="held"),
-            legendre(MESH, control="held"),
-            cost=(1e-8, 1e-8),
-            state=3e-7,
-            control=1e-4,
-            costate=4e-6,
-        ),
-        # smooth enough but for the switches: shooting with both of them on nodes
-        *within(shooting(MESH, "held"), cost=(1e-8, 1e-8), state=3e-7, control=1e-4, costate=4e-6),
-    ),
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, fitted, held, within
 
 LIMIT = 5.0
 T1 = (1 - sqrt(1 - 4 / LIMIT)) / 2  # end of the first burn, s
@@ -45,36 +45,19 @@ def optimum(t: Array) -> Extremal:
     )
 
 
+RUNS = (
+    # held controls: both quadratures are exact, so every plan is admissible and none beats the optimum. The
+    # costate is known to an interval only: a switching function with its zeros a little aside switches alike
+    *within(*held(40), cost=(1e-8, 1e-3), state=1e-2, control=1e-7, costate=0.3, time=0.02),
+    # switches on nodes
+    *within(*held(MESH), cost=(1e-8, 1e-8), state=1e-8, control=1e-7, costate=0.3, time=0.03),
+)
 CASE = Case(
-    name="consumption",
-    build=build,
-    cost=5 - sqrt(5),
+    "consumption",
+    build,
+    5 - sqrt(5),
+    RUNS,
     horizon=1.0,
     optimum=optimum,
     switches=(Switch(T1, lambda x, lam: 1 + lam["v"]), Switch(1 - T1, lambda x, lam: 1 - lam["v"])),
-    runs=(
-        # held controls: both quadratures are exact, so every plan is admissible and none beats the optimum. The
-        # costate is known to an interval only: a switching function with its zeros a little aside switches alike
-        *within(
-            radau(40, control="held"),
-            legendre(40, control="held"),
-            shooting(40, "held"),
-            cost=(1e-8, 1e-3),
-            state=1e-2,
-            control=1e-7,
-            costate=0.3,
-            time=0.02,
-        ),
-        # switches on nodes
-        *within(
-            radau(MESH, control="held"),
-            legendre(MESH, control="held"),
-            shooting(MESH, "held"),
-            cost=(1e-8, 1e-8),
-            state=1e-8,
-            control=1e-7,
-            costate=0.3,
-            time=0.03,
-        ),
-    ),
 )

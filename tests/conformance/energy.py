@@ -10,17 +10,11 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, double_integrator, legendre, radau, shooting, within
 
 
 def build() -> Problem:
-    problem = Problem("energy")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
+    problem, _, _, u = double_integrator("energy")
     problem.minimize(running=u**2 / 2)
     return problem
 
@@ -35,24 +29,12 @@ def optimum(t: Array) -> Extremal:
 
 HELD = 6 / (50**2 - 1)  # what 50 held controls cost more than free ones
 
-CASE = Case(
-    name="energy",
-    build=build,
-    cost=6.0,
-    horizon=1.0,
-    optimum=optimum,
-    runs=(
-        # q is a cubic, v a quadratic, u a line: these hold the optimum exactly
-        *within(
-            radau(5),
-            legendre(5),
-            shooting(10, "linear"),
-            cost=(1e-11, 1e-11),
-            state=1e-11,
-            control=1e-10,
-            costate=1e-10,
-        ),
-        # N held controls: the best of them costs 6 N^2 / (N^2 - 1), exactly
-        *within(shooting(50, "held"), cost=(1e-9 - HELD, 1e-9 + HELD), state=1e-3, control=0.13, costate=1e-2),
+RUNS = (
+    # q is a cubic, v a quadratic, u a line: these hold the optimum exactly
+    *within(
+        radau(5), legendre(5), shooting(10, "linear"), cost=(1e-11, 1e-11), state=1e-11, control=1e-10, costate=1e-10
     ),
+    # N held controls: the best of them costs 6 N^2 / (N^2 - 1), exactly
+    *within(shooting(50, "held"), cost=(1e-9 - HELD, 1e-9 + HELD), state=1e-3, control=0.13, costate=1e-2),
 )
+CASE = Case("energy", build, 6.0, RUNS, horizon=1.0, optimum=optimum)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, double_integrator, fitted, legendre, radau, shooting, within
 
 LIMIT = 5.0
 A = sqrt(3 / 20)  # half of the unsaturated arc, s
@@ -21,13 +21,7 @@ MESH = fitted((0.5 - A, 0.5 + A), 16)
 
 
 def build() -> Problem:
-    problem = Problem("energy, bounded")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u", lower=-LIMIT, upper=LIMIT)
-    problem.horizon(1.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
+    problem, _, _, u = double_integrator("energy, bounded", limit=LIMIT)
     problem.minimize(running=u**2 / 2)
     return problem
 
@@ -44,30 +38,15 @@ def optimum(t: Array) -> Extremal:
     )
 
 
-CASE = Case(
-    name="energy, bounded",
-    build=build,
-    cost=12.5 - 50 * A / 3,
-    horizon=1.0,
-    optimum=optimum,
-    switches=(
-        Switch(0.5 - A, lambda x, lam: lam["v"] + LIMIT),
-        Switch(0.5 + A, lambda x, lam: lam["v"] - LIMIT),
+RUNS = (
+    *within(radau(40), legendre(40), cost=(2e-6, 2e-6), state=5e-4, control=3e-3, costate=8e-3, time=5e-4),
+    # corners on nodes: a cubic an arc
+    *within(radau(MESH), cost=(1e-8, 1e-8), state=3e-6, control=2e-5, costate=5e-5, time=1e-5),
+    *within(
+        legendre(MESH), shooting(MESH, "linear"), cost=(1e-8, 1e-8), state=1e-8, control=1e-6, costate=2e-7, time=1e-8
     ),
-    runs=(
-        *within(radau(40), legendre(40), cost=(2e-6, 2e-6), state=5e-4, control=3e-3, costate=8e-3, time=5e-4),
-        # corners on nodes: a cubic an arc
-        *within(radau(MESH), cost=(1e-8, 1e-8), state=3e-6, control=2e-5, costate=5e-5, time=1e-5),
-        *within(
-            legendre(MESH),
-            shooting(MESH, "linear"),
-            cost=(1e-8, 1e-8),
-            state=1e-8,
-            control=1e-6,
-            costate=2e-7,
-            time=1e-8,
-        ),
-        # held controls: every plan is admissible
-        *within(shooting(50, "held"), cost=(1e-8, 5e-3), state=1e-3, control=0.15, costate=5e-3, time=1e-3),
-    ),
+    # held controls: every plan is admissible
+    *within(shooting(50, "held"), cost=(1e-8, 5e-3), state=1e-3, control=0.15, costate=5e-3, time=1e-3),
 )
+SWITCHES = (Switch(0.5 - A, lambda x, lam: lam["v"] + LIMIT), Switch(0.5 + A, lambda x, lam: lam["v"] - LIMIT))
+CASE = Case("energy, bounded", build, 12.5 - 50 * A / 3, RUNS, horizon=1.0, optimum=optimum, switches=SWITCHES)

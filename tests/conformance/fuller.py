@@ -17,7 +17,7 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, within
+from .case import Array, Case, Extremal, Switch, double_integrator, fitted, held, legendre, radau, within
 
 HORIZON = 3.5
 Z = sqrt((sqrt(33) - 1) / 24)
@@ -26,13 +26,7 @@ V1 = -1 / sqrt(1 + 2 * Z)  # velocity at the first switch, whose position is Z V
 
 
 def build() -> Problem:
-    problem = Problem("Fuller")
-    q = problem.state("q", initial=0.0, terminal=0.0)
-    v = problem.state("v", initial=1.0, terminal=0.0)
-    u = problem.control("u", lower=-1.0, upper=1.0)
-    problem.horizon(HORIZON)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
+    problem, q, _, _ = double_integrator("Fuller", (0.0, 1.0), (0.0, 0.0), HORIZON, limit=1.0)
     problem.minimize(running=q**2)
     return problem
 
@@ -84,44 +78,16 @@ def optimum(t: Array) -> Extremal:
 
 MESH = fitted([t / HORIZON for t, q, v in switch_states()[:4]], 10)
 
-CASE = Case(
-    name="Fuller",
-    build=build,
-    cost=optimal_cost(),
-    horizon=HORIZON,
-    optimum=optimum,
-    switches=(
-        *(Switch(t, lambda x, lam: lam["v"]) for t, q, v in switch_states()[:2]),
-        *(Switch(t) for t, q, v in switch_states()[2:]),
-    ),
-    runs=(
-        # held controls: q^2 is a quartic in time, which both quadratures integrate exactly, so no plan beats the
-        # optimum. No mesh can follow the chattering: the controls are not compared
-        *within(
-            radau(70, control="held"),
-            legendre(70, control="held"),
-            cost=(1e-8, 2e-4),
-            state=5e-2,
-            control=None,
-            costate=2e-3,
-            time=0.02,
-        ),
-        # the first four switches on nodes; what is left of the motion is W^4 = 1/290 of it
-        *within(
-            radau(MESH, control="held"),
-            cost=(1e-8, 1e-8),
-            state=2e-2,
-            control=5e-3,
-            costate=2e-4,
-            time=1e-3,
-        ),
-        *within(
-            legendre(MESH, control="held"),
-            cost=(1e-8, 1e-8),
-            state=2e-2,
-            control=5e-3,
-            costate=3e-5,
-            time=1e-3,
-        ),
-    ),
+RUNS = (
+    # held controls: q^2 is a quartic in time, which both quadratures integrate exactly, so no plan beats the
+    # optimum. No mesh can follow the chattering: the controls are not compared
+    *within(*held(70)[:2], cost=(1e-8, 2e-4), state=5e-2, control=None, costate=2e-3, time=0.02),
+    # the first four switches on nodes; what is left of the motion is W^4 = 1/290 of it
+    *within(radau(MESH, control="held"), cost=(1e-8, 1e-8), state=2e-2, control=5e-3, costate=2e-4, time=1e-3),
+    *within(legendre(MESH, control="held"), cost=(1e-8, 1e-8), state=2e-2, control=5e-3, costate=3e-5, time=1e-3),
 )
+SWITCHES = (
+    *(Switch(t, lambda x, lam: lam["v"]) for t, q, v in switch_states()[:2]),
+    *(Switch(t) for t, q, v in switch_states()[2:]),
+)
+CASE = Case("Fuller", build, optimal_cost(), RUNS, horizon=HORIZON, optimum=optimum, switches=SWITCHES)

@@ -10,7 +10,6 @@ with events.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
 from math import exp
 
 import casadi as ca
@@ -18,8 +17,8 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
-from .flow import Flow, flow
+from .case import Array, Case, Extremal, Switch, fitted, held, legendre, radau, shooting, within
+from .flow import flow
 
 THRUST = 3.5
 T1, T2, HORIZON = 0.0235096840414634, 0.0726707434414771, 0.198856262105147
@@ -50,9 +49,7 @@ def singular_thrust(h: float, v: float, m: float) -> float:
     return -(by_h * v - by_v * (drag / m + 1 / h**2)) / (by_v / m + 2 / h**2)
 
 
-def canonical(
-    thrust_law: Callable[[float, float, float], float],
-) -> Callable[[float, Array], Sequence[float]]:
+def canonical(thrust_law: Callable[[float, float, float], float]) -> Callable[[float, Array], Sequence[float]]:
     """Rates of states and costates under a law of thrust."""
 
     def rates(t: float, y: Array) -> Sequence[float]:
@@ -72,19 +69,16 @@ def canonical(
     return rates
 
 
-@cache
-def arcs() -> tuple[Flow, Flow, Flow]:
-    """States and costates along full thrust, singular arc and coast."""
-    burn = flow(canonical(lambda h, v, m: THRUST), (1.0, 0.0, 1.0, *COSTATE_AT_START), (0.0, T1))
-    singular = flow(canonical(singular_thrust), burn(np.array(T1)), (T1, T2))
-    coast = flow(canonical(lambda h, v, m: 0.0), singular(np.array(T2)), (T2, HORIZON))
-    return burn, singular, coast
+# states and costates along full thrust, singular arc and coast
+BURN = flow(canonical(lambda h, v, m: THRUST), (1.0, 0.0, 1.0, *COSTATE_AT_START), (0.0, T1))
+ARC = flow(canonical(singular_thrust), lambda: BURN(np.array(T1)), (T1, T2))
+COAST = flow(canonical(lambda h, v, m: 0.0), lambda: ARC(np.array(T2)), (T2, HORIZON))
 
 
 def optimum(t: Array) -> Extremal:
     y = np.empty((6, t.size))
     where = (t < T1, (t >= T1) & (t < T2), t >= T2)
-    for arc, on in zip(arcs(), where, strict=True):
+    for arc, on in zip((BURN, ARC, COAST), where, strict=True):
         if on.any():
             y[:, on] = arc(t[on])
     h, v, m, lh, lv, lm = y
@@ -93,40 +87,13 @@ def optimum(t: Array) -> Extremal:
     return Extremal(state={"h": h, "v": v, "m": m}, control={"F": thrust}, costate={"h": lh, "v": lv, "m": lm})
 
 
+RUNS = (
+    # held controls: free ones ring along the singular arc and beat the optimum
+    *within(*held(60)[:2], cost=(1e-7, 1e-7), state=5e-3, control=None, costate=1e-2, time=3e-6),
+    *within(radau(MESH, control="held"), cost=(1e-8, 1e-8), state=2e-4, control=0.2, costate=2e-3, time=2e-6),
+    *within(legendre(MESH, control="held"), cost=(1e-8, 1e-8), state=2e-4, control=0.2, costate=2e-4, time=2e-6),
+    *within(shooting(MESH, "held"), cost=(1e-8, 3e-7), state=2e-4, control=0.2, costate=1e-3, time=5e-6),
+)
 CASE = Case(
-    name="Goddard",
-    build=build,
-    cost=-1.0128369183175,
-    horizon=HORIZON,
-    optimum=optimum,
-    switches=(Switch(T1), Switch(T2)),
-    runs=(
-        # held controls: free ones ring along the singular arc and beat the optimum
-        *within(
-            radau(60, control="held"),
-            legendre(60, control="held"),
-            cost=(1e-7, 1e-7),
-            state=5e-3,
-            control=None,
-            costate=1e-2,
-            time=3e-6,
-        ),
-        *within(
-            radau(MESH, control="held"),
-            cost=(1e-8, 1e-8),
-            state=2e-4,
-            control=0.2,
-            costate=2e-3,
-            time=2e-6,
-        ),
-        *within(
-            legendre(MESH, control="held"),
-            cost=(1e-8, 1e-8),
-            state=2e-4,
-            control=0.2,
-            costate=2e-4,
-            time=2e-6,
-        ),
-        *within(shooting(MESH, "held"), cost=(1e-8, 3e-7), state=2e-4, control=0.2, costate=1e-3, time=5e-6),
-    ),
+    "Goddard", build, -1.0128369183175, RUNS, horizon=HORIZON, optimum=optimum, switches=(Switch(T1), Switch(T2))
 )

@@ -10,18 +10,12 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, double_integrator, held, radau, shooting, within
 
 
 def build() -> Problem:
-    problem = Problem("minimum time")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u", lower=-1.0, upper=1.0)
-    horizon = problem.horizon(lower=0.1, upper=10.0, guess=3.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
-    problem.minimize(terminal=horizon)
+    problem, *_ = double_integrator("minimum time", horizon=None, limit=1.0)
+    problem.minimize(terminal=problem.horizon(lower=0.1, upper=10.0, guess=3.0))
     return problem
 
 
@@ -33,41 +27,13 @@ def optimum(t: Array) -> Extremal:
     )
 
 
+RUNS = (
+    # held controls and an even number of intervals: the switch lies on a node, the optimum is held exactly
+    *within(*held(20), cost=(2e-9, 2e-9), state=2e-9, control=1e-8, costate=1e-8, time=1e-8),
+    # an odd number: the switch lies inside an interval; still every plan is admissible
+    *within(radau(21, control="held"), cost=(1e-8, 3e-3), state=5e-2, control=1e-8, costate=5e-3, time=5e-3),
+    *within(shooting(21, "held"), cost=(1e-8, 3e-3), state=3e-3, control=1e-8, costate=5e-3, time=5e-3),
+)
 CASE = Case(
-    name="minimum time",
-    build=build,
-    cost=2.0,
-    horizon=2.0,
-    optimum=optimum,
-    switches=(Switch(1.0, lambda x, lam: lam["v"]),),
-    runs=(
-        # held controls and an even number of intervals: the switch lies on a node, the optimum is held exactly
-        *within(
-            radau(20, control="held"),
-            legendre(20, control="held"),
-            shooting(20, "held"),
-            cost=(2e-9, 2e-9),
-            state=2e-9,
-            control=1e-8,
-            costate=1e-8,
-            time=1e-8,
-        ),
-        # an odd number: the switch lies inside an interval; still every plan is admissible
-        *within(
-            radau(21, control="held"),
-            cost=(1e-8, 3e-3),
-            state=5e-2,
-            control=1e-8,
-            costate=5e-3,
-            time=5e-3,
-        ),
-        *within(
-            shooting(21, "held"),
-            cost=(1e-8, 3e-3),
-            state=3e-3,
-            control=1e-8,
-            costate=5e-3,
-            time=5e-3,
-        ),
-    ),
+    "minimum time", build, 2.0, RUNS, horizon=2.0, optimum=optimum, switches=(Switch(1.0, lambda x, lam: lam["v"]),)
 )

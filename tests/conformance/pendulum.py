@@ -10,7 +10,6 @@ costates were found by shooting. Betts, Practical Methods for Optimal Control, 3
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from math import pi
 
 import casadi as ca
@@ -19,7 +18,7 @@ import numpy as np
 from ocp import Problem
 
 from .case import Array, Case, Extremal, legendre, radau, shooting, within
-from .flow import Flow, flow
+from .flow import flow
 
 G = 9.81
 HORIZON = 3.0
@@ -80,18 +79,12 @@ def canonical_in_angle(t: float, s: Array) -> Sequence[float]:
     return (w, -G * np.cos(a) - lw / 2, -lw * G * np.sin(a), -la)
 
 
-@cache
-def extremal() -> Flow:
-    return flow(canonical, (1.0, 0.0, 0.0, 0.0, *COSTATE_AT_START), (0.0, HORIZON))
-
-
-@cache
-def extremal_in_angle() -> Flow:
-    return flow(canonical_in_angle, (0.0, 0.0, *ANGLE_COSTATE_AT_START), (0.0, HORIZON))
+EXTREMAL = flow(canonical, (1.0, 0.0, 0.0, 0.0, *COSTATE_AT_START), (0.0, HORIZON))
+EXTREMAL_IN_ANGLE = flow(canonical_in_angle, (0.0, 0.0, *ANGLE_COSTATE_AT_START), (0.0, HORIZON))
 
 
 def optimum(t: Array) -> Extremal:
-    x, y, vx, vy, lx, ly, lvx, lvy = extremal()(t)
+    x, y, vx, vy, lx, ly, lvx, lvy = EXTREMAL(t)
     return Extremal(
         state={"x": x, "y": y, "vx": vx, "vy": vy},
         control={"u": (lvy * x - lvx * y) / 2, "z": (vx**2 + vy**2 - G * y) / 2},
@@ -100,33 +93,23 @@ def optimum(t: Array) -> Extremal:
 
 
 def optimum_in_angle(t: Array) -> Extremal:
-    a, w, la, lw = extremal_in_angle()(t)
+    a, w, la, lw = EXTREMAL_IN_ANGLE(t)
     return Extremal(state={"a": a, "w": w}, control={"u": lw / 2}, costate={"a": la, "w": lw})
 
 
-CASE = Case(
-    name="pendulum as DAE",
-    build=build,
-    cost=COST,
-    horizon=HORIZON,
-    optimum=optimum,
-    runs=(
-        # no shooting: z held or linear over an interval meets the path equality at the nodes only
-        *within(radau(20, degree=7), cost=(1e-9, 1e-9), state=5e-7, control=1e-4, costate=5e-4),
-        *within(legendre(30, degree=4), cost=(2e-6, 2e-6), state=5e-5, control=2e-3, costate=2e-3),
-    ),
+RUNS = (
+    # no shooting: z held or linear over an interval meets the path equality at the nodes only
+    *within(radau(20, degree=7), cost=(1e-9, 1e-9), state=5e-7, control=1e-4, costate=5e-4),
+    *within(legendre(30, degree=4), cost=(2e-6, 2e-6), state=5e-5, control=2e-3, costate=2e-3),
 )
+CASE = Case("pendulum as DAE", build, COST, RUNS, horizon=HORIZON, optimum=optimum)
 
+RUNS_IN_ANGLE = (
+    *within(radau(20, degree=7), cost=(1e-10, 1e-10), state=1e-8, control=5e-7, costate=1e-5),
+    *within(legendre(30, degree=4), cost=(2e-9, 2e-9), state=5e-6, control=1e-4, costate=1e-4),
+    *within(shooting(60, "linear"), cost=(1e-6, 5e-4), state=1e-4, control=2e-2, costate=2e-3),
+    *within(shooting(60, "held"), cost=(1e-6, 5e-2), state=3e-3, control=0.3, costate=0.1),
+)
 CASE_IN_ANGLE = Case(
-    name="pendulum in its angle",
-    build=build_in_angle,
-    cost=COST,
-    horizon=HORIZON,
-    optimum=optimum_in_angle,
-    runs=(
-        *within(radau(20, degree=7), cost=(1e-10, 1e-10), state=1e-8, control=5e-7, costate=1e-5),
-        *within(legendre(30, degree=4), cost=(2e-9, 2e-9), state=5e-6, control=1e-4, costate=1e-4),
-        *within(shooting(60, "linear"), cost=(1e-6, 5e-4), state=1e-4, control=2e-2, costate=2e-3),
-        *within(shooting(60, "held"), cost=(1e-6, 5e-2), state=3e-3, control=0.3, costate=0.1),
-    ),
+    "pendulum in its angle", build_in_angle, COST, RUNS_IN_ANGLE, horizon=HORIZON, optimum=optimum_in_angle
 )

@@ -81,14 +81,8 @@ class Regulator:
             u = np.array([-self.gain(ti, pi) @ xi for ti, pi, xi in zip(t, p, x, strict=True)])
             return Extremal(state={"x": x}, control={"u": u}, costate={"x": np.einsum("kij,kj->ki", p, x)})
 
-        return Case(
-            name=name,
-            build=self.build,
-            cost=float(self.x0 @ cost_to_go(np.array(0.0)).reshape(N, N) @ self.x0) / 2,
-            horizon=HORIZON,
-            optimum=optimum,
-            runs=self.runs,
-        )
+        cost = float(self.x0 @ cost_to_go(np.array(0.0)).reshape(N, N) @ self.x0) / 2
+        return Case(name, self.build, cost, self.runs, HORIZON, optimum)
 
 
 def draw(seed: int, swing: float, runs: tuple[Run, ...]) -> Regulator:
@@ -99,17 +93,9 @@ def draw(seed: int, swing: float, runs: tuple[Run, ...]) -> Regulator:
     root = rng.standard_normal((N + M, N + M))
     weight = root @ root.T / (N + M) + 0.1 * np.eye(N + M)
     end = rng.standard_normal((N, N))
-    return Regulator(
-        a=a,
-        b=rng.standard_normal((N, M)),
-        q=weight[:N, :N],
-        s=weight[:N, N:],
-        r=weight[N:, N:],
-        f=end @ end.T / N,
-        x0=rng.standard_normal(N),
-        swing=swing,
-        runs=runs,
-    )
+    b = rng.standard_normal((N, M))
+    q, s, r, f = weight[:N, :N], weight[:N, N:], weight[N:, N:], end @ end.T / N
+    return Regulator(a, b, q, s, r, f, rng.standard_normal(N), swing, runs)
 
 
 CONSTANT = (

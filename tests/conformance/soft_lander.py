@@ -13,7 +13,7 @@ import numpy as np
 
 from ocp import Problem
 
-from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, fitted, held, radau, within
 
 GRAVITY, THRUST = 1.5, 3.0
 T1 = (sqrt(68) - 4) / 3
@@ -47,38 +47,21 @@ def optimum(t: Array) -> Extremal:
     )
 
 
+RUNS = (
+    # held controls: both quadratures are exact, so every plan is admissible and none beats the optimum. The
+    # costate is known to an interval only: a switching function with its zero a little aside switches alike
+    *within(*held(50), cost=(1e-8, 1e-4), state=5e-3, control=5e-8, costate=0.05, time=0.05),
+    # the switch on a node
+    *within(*held(MESH), cost=(1e-8, 1e-8), state=1e-8, control=5e-8, costate=0.05, time=0.15),
+    # a polynomial across the switch overshoots between its points and beats the optimum, here by 3.0e-5
+    *within(radau(51), cost=(1e-4, 0.0), state=2e-2, control=1e-7, costate=0.02, time=0.05),
+)
 CASE = Case(
-    name="soft lander",
-    build=build,
-    cost=sqrt(68),
+    "soft lander",
+    build,
+    sqrt(68),
+    RUNS,
     horizon=HORIZON,
     optimum=optimum,
     switches=(Switch(T1, lambda x, lam: 1 + lam["v"]),),
-    runs=(
-        # held controls: both quadratures are exact, so every plan is admissible and none beats the optimum. The
-        # costate is known to an interval only: a switching function with its zero a little aside switches alike
-        *within(
-            radau(50, control="held"),
-            legendre(50, control="held"),
-            shooting(50, "held"),
-            cost=(1e-8, 1e-4),
-            state=5e-3,
-            control=5e-8,
-            costate=0.05,
-            time=0.05,
-        ),
-        # the switch on a node
-        *within(
-            radau(MESH, control="held"),
-            legendre(MESH, control="held"),
-            shooting(MESH, "held"),
-            cost=(1e-8, 1e-8),
-            state=1e-8,
-            control=5e-8,
-            costate=0.05,
-            time=0.15,
-        ),
-        # a polynomial across the switch overshoots between its points and beats the optimum, here by 3.0e-5
-        *within(radau(51), cost=(1e-4, 0.0), state=2e-2, control=1e-7, costate=0.02, time=0.05),
-    ),
 )

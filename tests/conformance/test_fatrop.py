@@ -26,8 +26,7 @@ def is_supported(case: Case, run: Run) -> bool:
 
 
 every_run = pytest.mark.parametrize(
-    ("case", "run"),
-    [pytest.param(c, r, id=f"{c.name}: {r}") for c in CASES for r in c.runs if is_supported(c, r)],
+    ("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c in CASES for r in c.runs if is_supported(c, r)]
 )
 
 
