@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem, checked_problem
-from ocp.solution import Solution
+from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
 
@@ -15,12 +14,7 @@ __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
 class PreparedProblem(Protocol):
     """A problem that a method has made ready to be solved many times."""
 
-    def solve(
-        self,
-        parameters: Mapping[str, Any] | None = None,
-        guess: Solution | Mapping[str, Any] | None = None,
-        check: bool = True,
-    ) -> Solution:
+    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
         """Solve with these parameters from this guess; see :func:`solve`."""
         ...
 
@@ -29,24 +23,14 @@ class Method(Protocol):
     """What solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
-        self,
-        problem: Problem,
-        *,
-        solver: str = "ipopt",
-        options: Mapping[str, Any] | None = None,
-        compiled: bool = False,
+        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
     ) -> PreparedProblem:
         """Build a problem once, to be solved many times; see :func:`prepare`."""
         ...
 
 
 def prepare(
-    problem: Problem,
-    method: Method,
-    *,
-    solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    compiled: bool = False,
+    problem: Problem, method: Method, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
 ) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
@@ -72,10 +56,10 @@ def solve(
     problem: Problem,
     method: Method,
     *,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: ByName = None,
     solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    guess: Solution | Mapping[str, Any] | None = None,
+    options: ByName = None,
+    guess: Guess = None,
     check: bool = True,
 ) -> Solution:
     """Solve a problem by a method.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import ProblemError, RefinementWarning, checked_count
 from ocp.methods import solve
 from ocp.problem.problem import Problem
-from ocp.solution import Refinement, Solution
+from ocp.solution import ByName, Guess, Refinement, Solution
 
 __all__ = ["refine", "split"]
 
@@ -28,10 +26,10 @@ def refine(
     *,
     tolerance: float = 1e-6,
     max_intervals: int = 400,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: ByName = None,
     solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    guess: Solution | Mapping[str, Any] | None = None,
+    options: ByName = None,
+    guess: Guess = None,
 ) -> Solution:
     """Solve, and split intervals by their error until the audit's integration error is under ``tolerance``.
 

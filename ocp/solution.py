@@ -8,15 +8,17 @@ import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
 
-__all__ = ["Refinement", "Sample", "Solution", "check_belongs", "stack", "unstack"]
+__all__ = ["ByName", "Guess", "Refinement", "Sample", "Solution", "check_belongs", "stack", "unstack"]
 
+ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
+Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 1
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 PLAIN = ("t", "variables", "multipliers")

@@ -6,7 +6,6 @@ bound is drawn in, interval by interval, by what the plan exceeded it there, unt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ import numpy as np
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError
-from ocp.problem.formulation import Formulation
-from ocp.solution import Solution
+from ocp.problem.formulation import Bounds, Formulation
+from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["tighten"]
 
@@ -29,10 +28,10 @@ def tighten(
     method: DirectMethod,
     *,
     tolerance: float = 1e-6,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: ByName = None,
     solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
-    guess: Solution | Mapping[str, Any] | None = None,
+    options: ByName = None,
+    guess: Guess = None,
 ) -> Solution:
     """Solve so that every inequality holds between the points of the grid as well.
 
@@ -98,7 +97,7 @@ def _places(form: Formulation, fragment: Fragment) -> dict[str, tuple[np.ndarray
 
 
 def _excess(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Largest excess below and above the bounds in every interval, (N, nx + nu + path) each; ends of intervals, s."""
     breaks = solution.control_interpolant.breaks

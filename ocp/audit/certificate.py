@@ -97,10 +97,7 @@ class Certificate:
 
 
 def certificate(
-    problem: Problem,
-    solutions: Mapping[str, Solution] | Sequence[Solution],
-    *,
-    tolerance: float = 1e-3,
+    problem: Problem, solutions: Mapping[str, Solution] | Sequence[Solution], *, tolerance: float = 1e-3
 ) -> Certificate:
     """Compare solutions of one problem by different methods, and audit each.
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from ocp.console import quiet
 from ocp.curves import integrator, lagrange_expressions
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution, stack
 
 __all__ = ["Adjoint", "active_sides", "adjoint", "costates_at_samples"]
@@ -61,7 +61,7 @@ class Adjoint:
         return float(np.max(np.abs(self.integrated - self.plan), initial=0.0) / self.scale)
 
 
-def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> Adjoint:
+def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Adjoint:
     """Integrate the costates of a plan backwards and look at their conditions at the ends."""
     breaks = solution.state_interpolant.breaks
     n = len(breaks) - 1
@@ -123,7 +123,7 @@ class CostatePieces:
         return lam
 
 
-def obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+def obstacle(form: Formulation, solution: Solution, bounds: Bounds) -> str:
     """Why the costate equation alone does not say what the costates are, or ""."""
     x = stack(solution.states)
     index = form.bounds.places["state"]
@@ -132,7 +132,7 @@ def obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np
     return path_obstacle(form, solution, bounds)
 
 
-def path_obstacle(form: Formulation, solution: Solution, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+def path_obstacle(form: Formulation, solution: Solution, bounds: Bounds) -> str:
     """Why the multipliers of path constraints are not known, or ""."""
     if len(form.path) and not np.all(form.path.equality & form.path.uses_control):
         return "there are path constraints beyond equalities with a control"
@@ -187,9 +187,7 @@ def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray
     return integrator("costates", dae)
 
 
-def end_residuals(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-) -> tuple[float, float]:
+def end_residuals(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> tuple[float, float]:
     """What of the transversality conditions no multiplier explains: (of the states, of the horizon)."""
     low, high = bounds
     nx = form.nx
@@ -241,7 +239,7 @@ def end_residuals(
 
 
 def costates_at_samples(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds
 ) -> tuple[np.ndarray, np.ndarray]:
     """Costates at the samples of the controls, (N, samples, nx), and which intervals are beside a jump, (N,) bool."""
     interpolant = solution.control_interpolant
@@ -270,7 +268,7 @@ def _pushing(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarr
 
 
 def _between_nodes(
-    form: Formulation, solution: Solution, p: np.ndarray, sides: tuple[np.ndarray, np.ndarray], costates: np.ndarray
+    form: Formulation, solution: Solution, p: np.ndarray, sides: Bounds, costates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Costates that jump at the nodes only, and which intervals are beside a jump."""
     before, pieces = stack(solution.costates), CostatePieces(form, solution, p)
@@ -289,12 +287,7 @@ def _between_nodes(
 
 
 def _end(
-    form: Formulation,
-    solution: Solution,
-    p: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
-    reported: np.ndarray,
-    sides: tuple[np.ndarray, np.ndarray],
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, reported: np.ndarray, sides: Bounds
 ) -> np.ndarray:
     """Costates just before a free end: those that hold a bound there are continued from the points before it.
 

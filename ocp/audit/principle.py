@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.costates import active_sides, costates_at_samples
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution, stack
 
 __all__ = ["Optimality", "minimum_principle"]
@@ -43,9 +43,7 @@ class Optimality:
         return float(np.ptp(self.hamiltonian))
 
 
-def minimum_principle(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-) -> Optimality:
+def minimum_principle(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Optimality:
     """Evaluate the minimum principle along a plan at its own control samples and reported points."""
     horizon = solution.horizon
     pools = (solution.states, solution.controls, solution.costates)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ocp.console import quiet
 from ocp.curves import integrator, lagrange_expressions
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 
 __all__ = ["Reintegration", "reintegrate", "violations"]
@@ -113,13 +113,7 @@ def interval_integrator(form: Formulation, nodes: np.ndarray, places: np.ndarray
     return integrator("reintegrate", dae, places.tolist())
 
 
-def violations(
-    form: Formulation,
-    again: Reintegration,
-    bounds: tuple[np.ndarray, np.ndarray],
-    p: np.ndarray,
-    horizon: float,
-) -> list[Check]:
+def violations(form: Formulation, again: Reintegration, bounds: Bounds, p: np.ndarray, horizon: float) -> list[Check]:
     """How far every bound and constraint is missed, at every point of the fine grid."""
     lower, upper = bounds
     places = form.bounds.places

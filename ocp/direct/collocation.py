@@ -102,10 +102,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
     )
     data = form.sym("d", 3)  # fraction, width, weight
     function = form.point_function(
-        "point",
-        data,
-        data[2] * form.T * form.running,
-        ca.vertcat(-data[1] * form.T * form.f, rows.expression),
+        "point", data, data[2] * form.T * form.running, ca.vertcat(-data[1] * form.T * form.f, rows.expression)
     )
     numbers = np.vstack([at, np.repeat(width, d), np.outer(width, weights).ravel()])
     build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
@@ -146,10 +143,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
         costate_rows[::d] = -1  # at nodes what the next interval says is more accurate
         costate_scale = np.concatenate([[1.0], scale.ravel()])
     else:
-        report = (
-            np.concatenate([np.repeat(stages, d + 1), [n - 1]]),
-            np.concatenate([np.tile(nodes, n), [1.0]]),
-        )
+        report = (np.concatenate([np.repeat(stages, d + 1), [n - 1]]), np.concatenate([np.tile(nodes, n), [1.0]]))
         report_states = np.vstack([states.reshape(-1, nx), lay.node[:, -1]])
         before = np.vstack([np.full((1, nx), -1), joints.T[:-1]])[:, None, :]
         costate_rows = np.vstack([np.concatenate([before, by_interval], axis=1).reshape(-1, nx), joints.T[-1:]])
@@ -159,10 +153,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
     def interpolants(
         values: np.ndarray, parameters: np.ndarray, horizon: float
     ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        return (
-            PiecewisePolynomial(mesh, nodes, values[states]),
-            PiecewisePolynomial(mesh, samples, values[controls]),
-        )
+        return (PiecewisePolynomial(mesh, nodes, values[states]), PiecewisePolynomial(mesh, samples, values[controls]))
 
     costate_nodes = report[0] + (report[1] == 1.0)
     return build.finish(report, report_states, costate_rows, costate_nodes, costate_scale, interpolants)

@@ -10,21 +10,16 @@ import numpy as np
 
 from ocp.direct.fragment import Fragment
 from ocp.errors import ProblemError, unknown_name
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
-from ocp.solution import Solution
+from ocp.solution import Guess, Solution
 
 __all__ = ["Samples", "initial_point"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 
-def initial_point(
-    form: Formulation,
-    fragment: Fragment,
-    guess: Solution | Mapping[str, Any] | None,
-    bounds: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:
+def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: Bounds) -> np.ndarray:
     """Values of all variables to start from. Shape (size,).
 
     What ``guess`` says comes first, then the guess declared with the variable, then a straight line between the given
@@ -147,7 +142,7 @@ def fitted(name: str, value: Any, size: int) -> np.ndarray:
     return np.broadcast_to(array, size)
 
 
-def default_horizon(form: Formulation, bounds: tuple[np.ndarray, np.ndarray]) -> float:
+def default_horizon(form: Formulation, bounds: Bounds) -> float:
     """The declared guess, or a value inside the bounds."""
     place = form.bounds.places["horizon"][0]
     low, high = bounds[0][place], bounds[1][place]
@@ -156,7 +151,7 @@ def default_horizon(form: Formulation, bounds: tuple[np.ndarray, np.ndarray]) ->
     return float(np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high))
 
 
-def default(form: Formulation, role: str, place: slice, bounds: tuple[np.ndarray, np.ndarray]) -> Trajectory:
+def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
     """A straight line between given ends, else the nearest point of the bounds to zero or their middle."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:

@@ -133,12 +133,7 @@ def finite(expression: Any) -> Any:
     return ca.MX(expression.sparsity(), ca.fmin(expression.nz[:], HUGE))
 
 
-def call_solver(
-    solver: Any,
-    progress: Progress | None,
-    arguments: dict[str, np.ndarray],
-    options: dict[str, Any] | None = None,
-) -> Outcome:
+def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned.
 
     fatrop has no way to be stopped; what it ends with counts as interrupted.

@@ -20,7 +20,7 @@ from ocp.direct.nlp import Outcome, build_solver, call_solver
 from ocp.errors import ProblemError, checked_count, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution
+from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
@@ -48,12 +48,7 @@ class DirectMethod:
         raise NotImplementedError
 
     def prepare(
-        self,
-        problem: Problem,
-        *,
-        solver: str = "ipopt",
-        options: Mapping[str, Any] | None = None,
-        compiled: bool = False,
+        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
     ) -> Prepared:
         """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
         return Prepared(problem, self, solver, options, compiled)
@@ -107,9 +102,7 @@ class Prepared:
         formulation, fragment, program: What was built. seconds: Wall time of the build.
     """
 
-    def __init__(
-        self, problem: Problem, method: DirectMethod, solver: str, options: Mapping[str, Any] | None, compiled: bool
-    ) -> None:
+    def __init__(self, problem: Problem, method: DirectMethod, solver: str, options: ByName, compiled: bool) -> None:
         began = time.monotonic()
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
@@ -121,8 +114,8 @@ class Prepared:
 
     def solve(
         self,
-        parameters: Mapping[str, Any] | None = None,
-        guess: Solution | Mapping[str, Any] | None = None,
+        parameters: ByName = None,
+        guess: Guess = None,
         check: bool = True,
         tighter: Mapping[str, np.ndarray] | None = None,
     ) -> Solution:
@@ -246,7 +239,7 @@ def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> N
 
 
 def compiler_options() -> dict[str, Any]:
-    """Options that make casadi compile a function with the machine's C compiler, its files in the temporary folder."""
+    """ByName that make casadi compile a function with the machine's C compiler, its files in the temporary folder."""
     shell = {"flags": ["-O1"], "directory": tempfile.gettempdir() + os.sep}
     return {"jit": True, "compiler": "shell", "jit_name": "selfmotion", "jit_options": shell}
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -25,9 +25,9 @@ from ocp.indirect.minimality import not_least
 from ocp.indirect.newton import Found, newton
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
-from ocp.problem.formulation import Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation, at_samples
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_belongs
+from ocp.solution import ByName, Guess, Solution, check_belongs
 
 __all__ = ["Indirect", "PreparedIndirect"]
 
@@ -64,12 +64,7 @@ class Indirect:
             )
 
     def prepare(
-        self,
-        problem: Problem,
-        *,
-        solver: str = "ipopt",
-        options: Mapping[str, Any] | None = None,
-        compiled: bool = False,
+        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
     ) -> PreparedIndirect:
         """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
 
@@ -99,12 +94,7 @@ class PreparedIndirect:
         self.boundary = BoundaryProblem(self.hamiltonian, backward=backward, tolerance=method.tolerance)
         self.seconds = time.monotonic() - began
 
-    def solve(
-        self,
-        parameters: Mapping[str, Any] | None = None,
-        guess: Solution | Mapping[str, Any] | None = None,
-        check: bool = True,
-    ) -> Solution:
+    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
         """Solve with these parameters; a solution as ``guess`` seeds states and costates, anything else its own seed.
 
         Raises:
@@ -161,7 +151,7 @@ class PreparedIndirect:
 
     # ---- before and after ------------------------------------------------------------------------------------
 
-    def _check_order(self, found: Found, arcs: ControlArcs, bounds: tuple[np.ndarray, np.ndarray]) -> Found:
+    def _check_order(self, found: Found, arcs: ControlArcs, bounds: Bounds) -> Found:
         """A root whose switches are out of order, or whose horizon is beyond its bounds, is no plan."""
         if self.method.shooting == "backward" or not found.success:
             return found
@@ -190,7 +180,7 @@ class PreparedIndirect:
         arcs: ControlArcs,
         data: np.ndarray,
         p: np.ndarray,
-        bounds: tuple[np.ndarray, np.ndarray],
+        bounds: Bounds,
         note: str,
         seconds: float,
     ) -> Solution:
@@ -255,9 +245,7 @@ class PreparedIndirect:
             problem=self.problem,
         )
 
-    def _pieces(
-        self, y: np.ndarray, inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-    ) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _pieces(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
         """(first y, q) of every reported piece: the segments, cut where a control meets its bound."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]

@@ -13,6 +13,7 @@ import numpy as np
 
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.sensitivity import Extremal
+from ocp.problem.formulation import Bounds
 
 __all__ = ["not_least"]
 
@@ -21,7 +22,7 @@ SLOPE_LIMIT = 1e-6  # largest slope of H against what holds the control, relativ
 CURVATURE_LIMIT = 1e-8  # most negative curvature of H in the free controls, relative to its largest entry
 
 
-def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> str:
+def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
     """What keeps the controls of an extremal from making the Hamiltonian least, or "".
 
     Each sample must be stationary in the free controls, push those at a bound outwards, and not curve downwards.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.problem.formulation import Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation, at_samples
 from ocp.solution import Solution
 
 __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
@@ -24,12 +24,11 @@ LONG = 3  # and the number of the seed's samples in a row
 NOISE = 1e-6  # share of the largest value of a switching function that says nothing of its sign
 CHATTER = 3  # arcs in a row that are shorter than an interval of the seed
 FREE_BEYOND = 1e-5  # a control of the seed nearer to its bound is at it
-Bounds = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class ControlArcs:
-    """ControlArcs between the switches of the controls in which the Hamiltonian is linear.
+    """Arcs between the switches of the controls in which the Hamiltonian is linear.
 
     Attributes:
         switches: Fractions of the horizon. Shape (A - 1,).
@@ -56,14 +55,9 @@ class ControlArcs:
 
 
 def read_arcs(
-    ham: Hamiltonian,
-    outputs: Any,
-    seed: Solution,
-    p: np.ndarray,
-    bounds: Bounds,
-    segments: int,
+    ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """ControlArcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
+    """Arcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
 
     Raises:
         SolveError: A control in which H is linear stays inside its bounds: a singular arc.

@@ -14,6 +14,7 @@ import numpy as np
 
 from ocp.curves import quadrature_weights
 from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.problem.formulation import Bounds
 
 __all__ = ["Extremal", "cost_gradient"]
 
@@ -47,7 +48,7 @@ class Extremal:
         return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))
 
 
-def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> np.ndarray:
     """Derivative of the optimal cost in the parameters. Shape (np,)."""
     form = ham.form
     slopes = [ca.gradient(ham.value, s) for s in (form.p, form.T, form.u)]

@@ -6,7 +6,7 @@ Time runs as the fraction ``s`` of the horizon, ``t = s * T``, so that a free fi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -15,7 +15,9 @@ from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.problem import Constraint, Problem, Variable, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
-__all__ = ["BoundTable", "Formulation", "Rows", "at_samples"]
+__all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "at_samples"]
+
+Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
 
 @dataclass(frozen=True)
@@ -209,7 +211,7 @@ class Formulation:
             vector[place] = value
         return vector
 
-    def bound_values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def bound_values(self, p: np.ndarray) -> Bounds:
         """The bound table at given parameters, checked: (lower, upper), each (n,)."""
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places

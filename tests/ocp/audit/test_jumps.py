@@ -52,11 +52,7 @@ def test_a_final_cost_that_presses_on_the_bound_is_no_fault(method: Any) -> None
     assert audit.passed, str(audit)
 
 
-@pytest.mark.parametrize(
-    "other",
-    [{"rate": 1.6}, {"effort": 0.02}, {"rate": 2.2, "effort": 0.012}],
-    ids=str,
-)
+@pytest.mark.parametrize("other", [{"rate": 1.6}, {"effort": 0.02}, {"rate": 2.2, "effort": 0.012}], ids=str)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_the_plan_of_another_problem_does_not_pass(method: Any, other: dict[str, float]) -> None:
     """It ends at the same bound."""

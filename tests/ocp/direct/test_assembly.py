@@ -200,11 +200,7 @@ def chain(first: Fragment, second: Fragment) -> Fragment:
     """Two phases as one program, with linear rows that join the end of the first to the start of the second."""
     moved = shifted(second, first.size, first.n_rows)
     n, rows = len(first.end), first.n_rows + second.n_rows
-    join = (
-        np.tile(rows + np.arange(n), 2),
-        np.concatenate([first.end, moved.start]),
-        np.repeat([1.0, -1.0], n),
-    )
+    join = (np.tile(rows + np.arange(n), 2), np.concatenate([first.end, moved.start]), np.repeat([1.0, -1.0], n))
     at, columns, values = (np.concatenate(part) for part in zip(first.linear, moved.linear, join, strict=True))
     return replace(
         first,

@@ -46,11 +46,7 @@ def entries(fragment: Any, point: Array, role: str, entry: int) -> tuple[Array, 
 
 @pytest.mark.parametrize("staged", [False, True], ids=["plain", "staged"])
 @pytest.mark.parametrize("method", METHODS)
-@given(
-    horizon=st.floats(0.6, 7.0),
-    level=st.floats(-5.0, 5.0),
-    slope=st.floats(-5.0, 5.0),
-)
+@given(horizon=st.floats(0.6, 7.0), level=st.floats(-5.0, 5.0), slope=st.floats(-5.0, 5.0))
 @settings(max_examples=5)
 def test_functions_of_time_are_read_at_every_variable(
     method: str, staged: bool, horizon: float, level: float, slope: float

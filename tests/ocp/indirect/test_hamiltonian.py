@@ -502,9 +502,7 @@ def test_the_wrong_branch_of_a_heading_is_no_extremal() -> None:
     np.testing.assert_allclose(right["angle"], np.pi, atol=1e-9)
     curve = seed.control_interpolant
     turned = replace(
-        seed,
-        controls={"angle": 0 * seed["angle"]},
-        control_interpolant=replace(curve, values=0 * curve.values),
+        seed, controls={"angle": 0 * seed["angle"]}, control_interpolant=replace(curve, values=0 * curve.values)
     )
     with pytest.raises(SolveError, match="stationary but not least in control 'angle' at 0 s"):
         solve(compass(), Indirect(), guess=turned)

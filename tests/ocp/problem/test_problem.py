@@ -290,11 +290,7 @@ def test_wrong_declarations_are_named_where_they_are_made(case: str) -> None:
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [
-        ("states", "has no state"),
-        ("dynamics", "state 'q' has no dynamics"),
-        ("horizon", "has no horizon"),
-    ],
+    [("states", "has no state"), ("dynamics", "state 'q' has no dynamics"), ("horizon", "has no horizon")],
 )
 def test_incomplete_problems_are_named_when_they_are_solved(missing: str, message: str) -> None:
     problem = empty()
