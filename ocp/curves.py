@@ -130,7 +130,12 @@ def integrator(
         smooth: Adams' formulas, for smooth dynamics that are not stiff, and no word about a trial step that fails,
             which may go anywhere; else backward differentiation formulas.
     """
-    options = {"reltol": tolerance, "abstol": tolerance, "max_num_steps": max_steps, "quad_err_con": True}
+    options: dict[str, Any] = {
+        "reltol": tolerance,
+        "abstol": tolerance,
+        "max_num_steps": max_steps,
+        "quad_err_con": True,
+    }
     if smooth:
         options |= {"linear_multistep_method": "adams", "show_eval_warnings": False, "disable_internal_warnings": True}
     return ca.integrator(name, "cvodes", dae, start, list(places), options)

@@ -73,7 +73,7 @@ class DirectMethod:
             object.__setattr__(self, name, checked_count(f"{kind}: {name}", getattr(self, name), most=limit))
         if self.mesh is None:
             return
-        told = {"name": "mesh", "value": self.mesh}
+        told: dict[str, Any] = {"name": "mesh", "value": self.mesh}
         try:
             at = np.asarray(self.mesh, dtype=float)
         except (TypeError, ValueError) as error:

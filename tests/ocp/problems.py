@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -32,6 +33,28 @@ CVODES: dict[str, Method] = {
 }
 METHODS = {**COLLOCATIONS, **SHOOTINGS}
 EVERY_METHOD = {**METHODS, **CVODES}
+
+
+def plant(
+    name: str,
+    *,
+    state: str = "x",
+    size: int | None = None,
+    u: Mapping[str, Any] | None = None,
+    horizon: Any = 1.0,
+    symbols: Any = ca.SX,
+    **declared: Any,
+) -> tuple[Problem, Any, Any]:
+    """A problem of one state and one control, and their symbols; dynamics and cost are left to declare.
+
+    ``declared`` and ``u`` are what is declared of the state and of the control; a horizon of None is left to declare.
+    """
+    problem = Problem(name, symbols)
+    x = problem.state(state, size, **declared)
+    control = problem.control(**{"name": "u", **(u or {})})
+    if horizon is not None:
+        problem.horizon(horizon)
+    return problem, x, control
 
 
 def energy(**control: Any) -> Problem:

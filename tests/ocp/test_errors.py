@@ -11,7 +11,7 @@ import pytest
 import ocp
 from ocp import AuditError, Collocation, MultipleShooting, Problem, ProblemError, RefinementWarning, SolveError, solve
 from ocp.errors import unknown_name
-from tests.ocp.problems import energy, van_der_pol
+from tests.ocp.problems import energy, plant, van_der_pol
 
 
 def with_parameter(size: int = 1) -> Problem:
@@ -26,7 +26,64 @@ def test_exceptions_are_of_the_kinds_that_callers_expect() -> None:
     assert issubclass(AuditError, RuntimeError)
     assert issubclass(RefinementWarning, UserWarning)
     assert SolveError("x").solution is None
-    assert isinstance(pickle.loads(pickle.dumps(ProblemError("x"))), ProblemError)
+
+
+@pytest.mark.parametrize("kind", [ProblemError, SolveError, AuditError, RefinementWarning])
+def test_exceptions_are_pickled_with_what_they_carry(kind: Any) -> None:
+    error = kind("too fast", name="speed", value=3.0, limit=(0.0, 2.0), time=0.5)
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is kind
+    assert str(again) == "too fast"
+    assert (again.name, again.value, again.limit, again.time) == ("speed", 3.0, (0.0, 2.0), 0.5)
+    assert kind("nothing").name is kind("nothing").value is kind("nothing").limit is kind("nothing").time is None
+
+
+@pytest.mark.parametrize("method", [Collocation(6), MultipleShooting(6)])
+def test_a_failure_carries_what_would_have_to_give_way(method: Any) -> None:
+    """From 0 to 1 in 1 s at 0.4/s at most: 0.6 is missing, of the end or of the speed."""
+    problem, x, u = plant("too far", initial=0.0, u={"lower": -0.4, "upper": 0.4})
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2)
+    problem.end("gate", x, lower=1.0)
+    with pytest.raises(SolveError) as caught:
+        solve(problem, method)
+    error = pickle.loads(pickle.dumps(caught.value))
+    (conflict,) = error.conflicts
+    assert (error.name, error.value, error.limit, error.time) == (conflict.label, conflict.amount, conflict.bound,
+                                                                  conflict.time)  # fmt: skip
+    assert conflict.label in ("gate", "u")
+    assert error.value == pytest.approx(0.6, abs=1e-3)
+    assert str(conflict) in str(error)
+    assert not error.solution.success
+    np.testing.assert_array_equal(error.solution["x"], caught.value.solution["x"])
+
+
+@pytest.mark.parametrize(
+    ("raises", "name", "value"),
+    [
+        (lambda p: p.state("x", lower=2.0, upper=1.0), "x", 2.0),
+        (lambda p: p.state("x", initial=[3.0, 1.0], upper=2.0), "x", 3.0),
+        (lambda p: p.state("x", size=0), "size", 0),
+        (lambda p: p.control("u", guess=np.nan), "u", [np.nan]),
+        (lambda p: p.horizon(-1.0), "horizon", -1.0),
+        (lambda p: p.path("wall", 1.0), "wall", None),
+        (lambda p: Collocation(4, 12), "degree", 12),
+        (lambda p: Collocation(4, scheme="gauss"), "scheme", "gauss"),
+        (lambda p: MultipleShooting(0), "intervals", 0),
+        (lambda p: MultipleShooting(2, mesh=(0.0, 1.0)), "mesh", (0.0, 1.0)),
+        (lambda p: solve(energy(), Collocation(2), solver="snopt"), "solver", "snopt"),
+        (lambda p: solve(energy(), Collocation(2), parameters={"mass": 1.0}), "mass", None),
+        (lambda p: solve(with_parameter(2), Collocation(2), parameters={"mass": np.ones(3)}), "mass", 3),
+        (lambda p: solve(energy(), Collocation(2)).at(2.0), "time", 2.0),
+        (lambda p: solve(energy(), Collocation(2)).audit(drift=-1.0), "drift", -1.0),
+        (lambda p: solve(energy(), Collocation(2)).audit(tolerances={"spin": 1.0}), "spin", None),
+    ],
+)
+def test_the_offending_name_and_value_are_fields(raises: Any, name: str, value: Any) -> None:
+    with pytest.raises(ProblemError) as caught:
+        raises(Problem("fields"))
+    assert caught.value.name == name
+    np.testing.assert_equal(caught.value.value, value)
 
 
 def test_everything_public_is_there() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, RefinementWarning, SolveError, refine, solve
 from ocp.refinement import MOST, split
-from tests.ocp.problems import SWING, Method, energy, swing, van_der_pol
+from tests.ocp.problems import SWING, Method, energy, plant, swing, van_der_pol
 
 START: dict[str, Method] = {
     "radau": Collocation(3),
@@ -26,12 +26,9 @@ START: dict[str, Method] = {
 
 def layer(width: float = 0.01) -> Problem:
     """A target that rises within ``width`` at 0.7 s: smooth, but sharp there and nowhere else."""
-    problem = Problem("layer")
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u")
+    problem, x, u = plant("layer", initial=0.0)
     target = 0.5 * (1 + ca.tanh((problem.time - 0.7) / width))
     problem.dynamics(x, u + target / width * ca.exp(-(((problem.time - 0.7) / width) ** 2)))
-    problem.horizon(1.0)
     problem.minimize(running=(x - target) ** 2 + 0.1 * u**2)
     return problem
 

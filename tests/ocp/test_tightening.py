@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
+from tests.ocp.problems import plant
 
 METHODS = [
     Collocation(10, degree=3),
@@ -49,11 +50,8 @@ def test_limits_hold_between_the_points(method: Any) -> None:
 
 
 def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:
-    problem = Problem("free")
-    q = problem.state("q", initial=0.0, terminal=1.0, lower=-1.0, upper=2.0)
-    u = problem.control("u", upper=5.0)
+    problem, q, u = plant("free", state="q", initial=0.0, terminal=1.0, lower=-1.0, upper=2.0, u={"upper": 5.0})
     problem.dynamics(q, u)
-    problem.horizon(1.0)
     problem.minimize(running=u**2)
     assert tighten(problem, Collocation(4)).cost == solve(problem, Collocation(4)).cost
 
@@ -76,12 +74,9 @@ def test_it_takes_parameters_and_a_free_horizon() -> None:
 
 def test_what_cannot_be_held_is_named() -> None:
     """A bump in time alone, which no plan can avoid and nodes do not see."""
-    problem = Problem("bump")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    u = problem.control("u")
+    problem, q, u = plant("bump", state="q", initial=0.0, terminal=1.0)
     problem.dynamics(q, u)
     problem.path("bump", ca.sin(20 * np.pi * problem.time) ** 2 + 0 * q, upper=0.5)
-    problem.horizon(1.0)
     problem.minimize(running=u**2)
     assert solve(problem, MultipleShooting(20)).success
     with pytest.raises(SolveError, match=r"bump would have to go"):

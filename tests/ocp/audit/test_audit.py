@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from ocp import Audit, Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
 from ocp.curves import PiecewisePolynomial
-from tests.ocp.problems import SWING, Array, LogarithmicRegulator, Method, energy, swing, van_der_pol
+from tests.ocp.problems import SWING, Array, LogarithmicRegulator, Method, energy, plant, swing, van_der_pol
 
 FINE: dict[str, Method] = {
     "radau": Collocation(20),
@@ -68,11 +68,8 @@ def test_a_plan_with_everything_in_it_passes(solver: str) -> None:
 
 @every_method
 def test_a_plan_without_cost_is_optimal_if_it_is_feasible(method: str) -> None:
-    problem = Problem("indifferent")
-    x = problem.state("x", initial=1.0, terminal=0.0)
-    u = problem.control("u", lower=-3.0, upper=3.0)
+    problem, x, u = plant("indifferent", initial=1.0, terminal=0.0, u={"lower": -3.0, "upper": 3.0})
     problem.dynamics(x, u)
-    problem.horizon(1.0)
     assert failed(solve(problem, FINE[method]).audit()) == set()
 
 
@@ -243,9 +240,7 @@ def test_a_plan_of_another_duration_is_no_optimum_of_a_free_time(method: str, du
     """Bolza's problem has its optimum at 1/sqrt 2 s."""
 
     def bolza(*fixed: float) -> Problem:
-        problem = Problem("Bolza")
-        x = problem.state("x", initial=0.0, terminal=1.0)
-        u = problem.control("u", guess=1.0)
+        problem, x, u = plant("Bolza", initial=0.0, terminal=1.0, u={"guess": 1.0}, horizon=None)
         horizon = problem.horizon(*fixed) if fixed else problem.horizon(lower=0.1, upper=5.0, guess=1.0)
         problem.dynamics(x, u)
         problem.minimize(running=u**2 / 2, terminal=horizon)
@@ -335,11 +330,8 @@ def test_a_constraint_that_is_cut_between_nodes_fails() -> None:
 
 def test_a_plan_that_jumps_over_a_singularity_fails() -> None:
     """x' = u, but the optimum would leave through 1/x: the coarse plan steps from one side to the other."""
-    problem = Problem("pole")
-    x = problem.state("x", initial=-1.0, terminal=1.0)
-    u = problem.control("u")
+    problem, x, u = plant("pole", initial=-1.0, terminal=1.0)
     problem.dynamics(x, u)
-    problem.horizon(1.0)
     problem.path("near", x**2, lower=0.04)
     problem.minimize(running=u**2)
     solution = solve(problem, MultipleShooting(3))
@@ -349,22 +341,16 @@ def test_a_plan_that_jumps_over_a_singularity_fails() -> None:
 
 
 def test_unstable_dynamics_on_a_coarse_mesh_fail() -> None:
-    problem = Problem("unstable")
-    x = problem.state("x", initial=0.01)
-    u = problem.control("u")
+    problem, x, u = plant("unstable", initial=0.01, horizon=2.0)
     problem.dynamics(x, 12 * x + u)
-    problem.horizon(2.0)
     problem.minimize(running=x**2 + u**2)
     assert INTEGRATION in failed(solve(problem, Collocation(4, 2)).audit())
 
 
 def test_a_plan_that_breaks_the_integrator_down_is_told(capfd: pytest.CaptureFixture[str]) -> None:
     """x' = x^2 + u escapes to infinity before the end when its control is taken away."""
-    problem = Problem("escape")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u")
+    problem, x, u = plant("escape", initial=1.0, horizon=2.0)
     problem.dynamics(x, x**2 + u)
-    problem.horizon(2.0)
     problem.minimize(running=x**2 + 0.1 * u**2)
     solution = solve(problem, Collocation(10))
     assert failed(solution.audit()) == set()

@@ -25,7 +25,7 @@ from ocp import (
 from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
-from tests.ocp.problems import energy, van_der_pol
+from tests.ocp.problems import energy, plant, van_der_pol
 
 NAMES: dict[str, Any] = {
     "Collocation": Collocation(50, 3, "legendre"),
@@ -110,10 +110,7 @@ def test_differences_are_relative_and_measured() -> None:
     """Energy scaled: the same relative differences whatever the unit of the cost."""
     rows = []
     for weight in (1.0, 1e6):
-        problem = Problem("weighted")
-        x = problem.state("x", initial=1.0)
-        u = problem.control("u")
-        problem.horizon(1.0)
+        problem, x, u = plant("weighted", initial=1.0)
         problem.dynamics(x, u - x**3)
         problem.minimize(running=weight * (x**2 + u**2))
         found = certificate(
@@ -127,10 +124,7 @@ def test_differences_are_relative_and_measured() -> None:
 
 def test_a_hamiltonian_and_a_cost_that_vanish_are_compared_by_their_parts() -> None:
     """A cost that an offset brings to zero, and H = 0 of a free horizon (in the test above)."""
-    problem = Problem("vanishing")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("vanishing", initial=1.0)
     problem.dynamics(x, -x + u)
     problem.minimize(running=x + u**2 / 2 - offset())
     plans = {"indirect": solve(problem, Indirect()), "direct": solve(problem, Collocation(20))}

@@ -13,7 +13,7 @@ import pytest
 from ocp import Audit, Collocation, Indirect, MultipleShooting, Problem, Solution, solve
 from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
-from tests.ocp.problems import SOLVERS, Method, energy, started_anywhere, van_der_pol
+from tests.ocp.problems import SOLVERS, Method, energy, plant, started_anywhere, van_der_pol
 
 EQUATION, ENDS, HORIZON = (
     "costate equation, relative",
@@ -39,9 +39,7 @@ def free_end(method: str, solver: str = "ipopt") -> Solution:
 
 def bolza(**ends: Any) -> Problem:
     """x' = u, x: 0 -> 1 in a free time, min T + int u^2/2: T = 1/sqrt 2, H = -1."""
-    problem = Problem("Bolza")
-    x = problem.state("x", initial=0.0, **ends)
-    u = problem.control("u", guess=1.0)
+    problem, x, u = plant("Bolza", initial=0.0, **ends, u={"guess": 1.0}, horizon=None)
     horizon = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=u**2 / 2, terminal=horizon)
@@ -173,10 +171,7 @@ def test_conditions_at_the_start_are_looked_at_too(what: str) -> None:
 @pytest.mark.parametrize("method", ["radau", "legendre", "radau-held"])
 def test_a_path_constraint_active_at_the_end_is_a_condition_there(method: str) -> None:
     """x' = u under a ceiling that it meets at 0.31 s and follows to the end: the costate there is the multiplier's."""
-    problem = Problem("ceiling")
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("ceiling", initial=0.0)
     problem.dynamics(x, u)
     problem.path("ceiling", x, upper=0.6)
     problem.minimize(running=(x - 2 * problem.time) ** 2 + 0.01 * u**2)
@@ -201,9 +196,7 @@ def test_a_free_horizon_balances_the_hamiltonian(method: str, solver: str) -> No
 @every_method
 def test_a_horizon_at_its_bound_balances_nothing(method: str) -> None:
     """Held at 1/2: H(T) + 1 = 1 - u^2/2 = -1 there."""
-    problem = Problem("short")
-    x = problem.state("x", initial=0.0, terminal=1.0)
-    u = problem.control("u", guess=1.0)
+    problem, x, u = plant("short", initial=0.0, terminal=1.0, u={"guess": 1.0}, horizon=None)
     horizon = problem.horizon(lower=0.1, upper=0.5, guess=0.4)
     problem.dynamics(x, u)
     problem.minimize(running=u**2 / 2, terminal=horizon)
@@ -215,9 +208,7 @@ def test_a_horizon_at_its_bound_balances_nothing(method: str) -> None:
 
 def test_the_end_constraint_may_move_with_the_horizon() -> None:
     """x' = u to the moving target 1 + T: the multiplier enters the balance of the horizon as well."""
-    problem = Problem("moving target")
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u", guess=2.0)
+    problem, x, u = plant("moving target", initial=0.0, u={"guess": 2.0}, horizon=None)
     horizon = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
     problem.dynamics(x, u)
     problem.end("meet", x - 1 - horizon, 0, 0)
@@ -233,10 +224,7 @@ def test_the_end_constraint_may_move_with_the_horizon() -> None:
 
 
 def test_what_the_costate_equation_alone_cannot_say_is_said() -> None:
-    problem = Problem("corridor")
-    x = problem.state("x", 2, initial=[0.0, 0.0], terminal=[1.0, 0.0])
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("corridor", size=2, initial=[0.0, 0.0], terminal=[1.0, 0.0])
     problem.dynamics(x, ca.vertcat(x[1], u))
     problem.path("speed", x[1], upper=1.2)
     problem.minimize(running=u**2 / 2)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ocp import Collocation, Problem, ProblemError, Solution, solve
 from ocp.curves import quadrature_weights
 from ocp.problem.formulation import Formulation
-from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, relative, van_der_pol
+from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, plant, relative, van_der_pol
 
 TIGHT = {"tol": 1e-13, "constr_viol_tol": 1e-13, "dual_inf_tol": 1e-11}
 # degree: horizon and meshes on which the error is asymptotic and far above rounding
@@ -103,11 +103,8 @@ def test_states_obey_the_dynamics_at_every_collocation_point(
 ) -> None:
     """On any mesh the derivative of the state polynomial equals f at the points, and the pieces join."""
     mesh = np.concatenate([[0.0], np.cumsum(steps)[:-1] / np.sum(steps), [1.0]])
-    problem = Problem("linear")
-    x = problem.state("x", 2, initial=[1.0, -0.5])
-    u = problem.control("u")
+    problem, x, u = plant("linear", size=2, initial=[1.0, -0.5], horizon=time_scale)
     problem.dynamics(x, ca.vertcat(x[1], -x[0] - 0.3 * x[1] + u + 0.2 * problem.time / time_scale) / time_scale)
-    problem.horizon(time_scale)
     problem.minimize(running=ca.sumsqr(x) + u**2)
     method = Collocation(len(steps), degree, scheme, control, tuple(mesh.tolist()))
     solution = solve(problem, method)

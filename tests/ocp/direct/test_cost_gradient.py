@@ -12,7 +12,7 @@ import pytest
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, ProblemError, Solution, prepare, solve
 from tests.ocp.indirect.extremals import EXTREMA, regulator
-from tests.ocp.problems import EVERY_METHOD, SOLVERS, SWING, Array, swing
+from tests.ocp.problems import EVERY_METHOD, SOLVERS, SWING, Array, plant, swing
 
 STEP = 1e-4
 
@@ -248,10 +248,7 @@ def test_gradients_survive_save_and_load(method: Collocation | None, tmp_path: P
 
 
 def test_a_problem_without_parameters_has_no_gradients() -> None:
-    problem = Problem("plain")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("plain", initial=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=x**2 + u**2)
     for method in (Indirect(), Collocation(5)):

@@ -10,6 +10,7 @@ import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
 from ocp.direct import diagnosis as elastic
+from tests.ocp.problems import plant
 
 METHODS = [Collocation(8), Collocation(8, scheme="legendre"), Collocation(8, control="held"), MultipleShooting(8)]
 NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
@@ -75,9 +76,7 @@ def test_a_path_constraint_in_the_way_is_named_where_it_stands() -> None:
 
 def test_a_final_time_that_is_too_short_is_named() -> None:
     """A speed of 1 m/s and at most 0.9 s for 1 m; the speed may not give way, for it stands in the dynamics."""
-    problem = Problem("race")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem, q, u = plant("race", state="q", initial=0.0, terminal=1.0, u={"lower": -1.0, "upper": 1.0}, horizon=None)
     problem.dynamics(q, u / (1 + u**4))  # at most 0.5699 m/s, wherever u goes
     final = problem.horizon(lower=0.1, upper=0.9, guess=0.5)
     problem.minimize(terminal=final)
@@ -102,12 +101,9 @@ def test_a_plan_that_exists_is_not_called_impossible() -> None:
 
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_a_condition_that_ties_both_ends_gives_way_or_makes_a_limit_do_so(solver: str) -> None:
-    problem = Problem("tied")
-    q = problem.state("q")
-    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem, q, u = plant("tied", state="q", u={"lower": -1.0, "upper": 1.0})
     far = problem.parameter("far")
     problem.dynamics(q, u)
-    problem.horizon(1.0)
     problem.start("from", q, lower=0.0, upper=0.0)
     problem.end("far", q - problem.at_start(q), lower=far)
     problem.minimize(running=u**2)

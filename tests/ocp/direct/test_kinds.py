@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, prepare, solve
-from tests.ocp.problems import EVERY_METHOD, METHODS, SOLVERS, SWING, energy, relative, swing, van_der_pol
+from tests.ocp.problems import EVERY_METHOD, METHODS, SOLVERS, SWING, energy, plant, relative, swing, van_der_pol
 
 every_method = pytest.mark.parametrize("method", EVERY_METHOD)
 both_solvers = pytest.mark.parametrize("solver", SOLVERS)
@@ -25,11 +25,8 @@ def table() -> Any:
 
 
 def driven(symbols: Any, hill: Any) -> Problem:
-    problem = Problem("over a hill", symbols)
-    x = problem.state("x", initial=0.0, terminal=1.5)
-    u = problem.control("u", guess=1.0)
+    problem, x, u = plant("over a hill", symbols=symbols, initial=0.0, terminal=1.5, u={"guess": 1.0})
     problem.dynamics(x, u / hill(x))
-    problem.horizon(1.0)
     problem.minimize(running=u**2 / 2)
     return problem
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
-from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, relative, swing, van_der_pol
+from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, plant, relative, swing, van_der_pol
 
 FINE: dict[str, Method] = {
     "radau": Collocation(10),
@@ -142,11 +142,8 @@ def test_options_reach_the_solver(solver: str) -> None:
 
 def too_far() -> Problem:
     """1 m in 1 s at no more than 0.1 m/s."""
-    problem = Problem("too far")
-    x = problem.state("x", initial=0.0, terminal=1.0)
-    u = problem.control("u", lower=-0.1, upper=0.1)
+    problem, x, u = plant("too far", initial=0.0, terminal=1.0, u={"lower": -0.1, "upper": 0.1})
     problem.dynamics(x, u)
-    problem.horizon(1.0)
     problem.minimize(running=u**2)
     return problem
 
@@ -194,11 +191,8 @@ def test_a_stop_before_the_optimum_is_told() -> None:
 
 def test_a_feasible_plan_that_is_not_optimal_is_told_so() -> None:
     """Linear dynamics are met after one step; the cost is far from its optimum."""
-    problem = Problem("quartic")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u", guess=5.0)
+    problem, x, u = plant("quartic", initial=1.0, u={"guess": 5.0})
     problem.dynamics(x, u - x)
-    problem.horizon(1.0)
     problem.minimize(running=(u - 3) ** 4 + x**4)
     with pytest.raises(SolveError, match="all constraints are met; the plan is feasible but not optimal"):
         solve(problem, Collocation(4), options={"max_iter": 3})
@@ -206,11 +200,8 @@ def test_a_feasible_plan_that_is_not_optimal_is_told_so() -> None:
 
 def rooted() -> Problem:
     """The root of a state that the first guess takes below zero."""
-    problem = Problem("rooted")
-    x = problem.state("x", initial=1.0, terminal=-1.0)
-    u = problem.control("u", lower=-5.0, upper=5.0)
+    problem, x, u = plant("rooted", initial=1.0, terminal=-1.0, u={"lower": -5.0, "upper": 5.0})
     problem.dynamics(x, u + ca.sqrt(x))
-    problem.horizon(1.0)
     problem.minimize(running=u**2)
     return problem
 
@@ -231,7 +222,7 @@ def test_fatrop_does_not_hang_on_functions_that_are_not_finite() -> None:
     code = """
     import casadi as ca
     from ocp import Collocation, SolveError, solve
-    from tests.ocp.test_nlp import rooted
+    from tests.ocp.direct.test_nlp import rooted
     try:
         solve(rooted(), Collocation(3), solver="fatrop")
     except SolveError as error:
@@ -242,11 +233,8 @@ def test_fatrop_does_not_hang_on_functions_that_are_not_finite() -> None:
 
 
 def test_an_unbounded_cost_is_told() -> None:
-    problem = Problem("endless")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u")
+    problem, x, u = plant("endless", initial=1.0)
     problem.dynamics(x, u)
-    problem.horizon(1.0)
     problem.minimize(running=u)
     with pytest.raises(SolveError, match="endless"):
         solve(problem, Collocation(3), options={"max_iter": 100})

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Problem, prepare, solve
+from ocp import prepare, solve
 from tests.ocp.problems import (
     COLLOCATIONS,
     CVODES,
@@ -19,6 +19,7 @@ from tests.ocp.problems import (
     Array,
     Method,
     energy,
+    plant,
     started_anywhere,
 )
 
@@ -109,9 +110,7 @@ def test_costate_at_a_constrained_end_stands_on_the_constraint(method: str, solv
 @pytest.mark.parametrize("method", METHODS)
 def test_hamiltonian_is_constant_and_vanishes_on_a_free_horizon(method: str, solver: str) -> None:
     """Bolza: x' = u, x from 0 to 1 in a free time, min T + int u^2/2: cost sqrt 2, costate -sqrt 2, H = -1."""
-    problem = Problem("Bolza")
-    x = problem.state("x", initial=0.0, terminal=1.0)
-    u = problem.control("u", guess=1.0)
+    problem, x, u = plant("Bolza", initial=0.0, terminal=1.0, u={"guess": 1.0}, horizon=None)
     horizon = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=u**2 / 2, terminal=horizon)

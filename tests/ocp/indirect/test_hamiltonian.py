@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,7 @@ from ocp import Collocation, Indirect, Problem, ProblemError, Solution, SolveErr
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Formulation
 from tests.ocp.indirect.extremals import EXTREMA, bang_bang
-from tests.ocp.problems import Array, energy, swing, van_der_pol
+from tests.ocp.problems import Array, energy, plant, swing, van_der_pol
 
 SMOOTH = [name for name, case in EXTREMA.items() if case.switches == 0]
 RNG_SEED = 7
@@ -100,12 +101,9 @@ def joined(form: Formulation, x: Array, t: Array, T: Array, p: Array) -> tuple[A
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
 def test_smooth_and_linear_controls_are_told_apart(symbols: Any) -> None:
-    problem = Problem("kinds", symbols)
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u", 2, lower=-1, upper=1)
+    problem, x, u = plant("kinds", symbols=symbols, initial=0.0, u={"size": 2, "lower": -1, "upper": 1})
     w = problem.control("w", 2)
     b = problem.control("b", lower=-1, upper=2)
-    problem.horizon(1.0)
     problem.dynamics(x, u[0] * ca.sin(x) + u[1] + w[0] - w[1] + b)
     problem.path("tie", w[1] - x, 0, 0)
     problem.minimize(running=u[1] ** 2 + ca.exp(w[0]) + b * x)
@@ -121,10 +119,7 @@ def declare(
     running: Callable[[Any, Any], Any], *, size: int = 1, lower: Any = None, upper: Any = None, name: str = "plain"
 ) -> Problem:
     """x' = v, v' = sum u from rest, 1 s, terminal cost (x - 1)^2."""
-    problem = Problem(name)
-    x = problem.state("x", 2, initial=[0.0, 0.0])
-    u = problem.control("u", size, lower=lower, upper=upper)
-    problem.horizon(1.0)
+    problem, x, u = plant(name, size=2, initial=[0.0, 0.0], u={"size": size, "lower": lower, "upper": upper})
     problem.dynamics(x, ca.vertcat(x[1], ca.sum1(u)))
     problem.minimize(running=running(x, u), terminal=(x[0] - 1) ** 2)
     return problem
@@ -134,81 +129,48 @@ def quadratic() -> Problem:
     return declare(lambda x, u: ca.sumsqr(u))
 
 
-def symbol(problem: Problem, name: str) -> Any:
-    return {**problem.declared.states, **problem.declared.controls}[name].symbol
-
-
-def with_path_inequality() -> Problem:
+def quadratic_and(more: Callable[[Problem, Any, Any], None]) -> Problem:
+    """The quadratic problem with another declaration of its state and control."""
     problem = quadratic()
-    problem.path("corridor", symbol(problem, "x")[1], upper=0.7)
+    more(problem, problem.declared.states["x"].symbol, problem.declared.controls["u"].symbol)
     return problem
 
 
 def with_state_bounds() -> Problem:
-    problem = Problem("bounded state")
-    x = problem.state("x", initial=0.0, upper=2.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("bounded state", initial=0.0, upper=2.0)
     problem.dynamics(x, u)
     problem.minimize(running=u**2)
     return problem
 
 
-def with_state_path_equality() -> Problem:
-    problem = quadratic()
-    problem.path("rail", symbol(problem, "x")[0] - problem.time, 0, 0)
-    return problem
-
-
-def with_start_inequality() -> Problem:
-    problem = quadratic()
-    problem.start("above", symbol(problem, "x")[1], lower=-1)
-    return problem
-
-
-def with_end_inequality() -> Problem:
-    problem = quadratic()
-    problem.end("beyond", symbol(problem, "x")[0], lower=0.9)
-    return problem
-
-
-def with_end_constraint_on_the_control() -> Problem:
-    problem = quadratic()
-    problem.end("rest", symbol(problem, "u"), 0, 0)
-    return problem
-
-
-def with_start_constraint_on_the_control() -> Problem:
-    problem = quadratic()
-    problem.start("push", symbol(problem, "u"), 0, 0)
-    return problem
-
-
-def with_tie_of_the_control() -> Problem:
-    problem = quadratic()
-    problem.end("tie", symbol(problem, "x")[0] - problem.at_start(symbol(problem, "u")), 0, 0)
-    return problem
-
-
 def with_cost_on_the_first_control() -> Problem:
-    problem = Problem("first control")
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("first control", initial=0.0)
     problem.dynamics(x, u)
     problem.minimize(running=u**2, terminal=problem.at_start(u) ** 2)
     return problem
 
 
+CONSTRAINED: dict[str, tuple[Callable[[Problem, Any, Any], None], str]] = {
+    "path inequality": (lambda p, x, u: p.path("corridor", x[1], upper=0.7), "path inequality 'corridor'"),
+    "path equality without control": (
+        lambda p, x, u: p.path("rail", x[0] - p.time, 0, 0),
+        "path equality 'rail', which contains no control",
+    ),
+    "start inequality": (lambda p, x, u: p.start("above", x[1], lower=-1), "start inequality 'above'"),
+    "end inequality": (lambda p, x, u: p.end("beyond", x[0], lower=0.9), "end inequality 'beyond'"),
+    "end constraint on the control": (lambda p, x, u: p.end("rest", u, 0, 0), "end constraint 'rest' on the control"),
+    "start constraint on the control": (
+        lambda p, x, u: p.start("push", u, 0, 0),
+        "start constraint 'push' on the control",
+    ),
+    "tie of the control": (
+        lambda p, x, u: p.end("tie", x[0] - p.at_start(u), 0, 0),
+        "end constraint 'tie' on the control",
+    ),
+}
 REFUSED: dict[str, tuple[Callable[[], Problem], str]] = {
-    "path inequality": (with_path_inequality, "path inequality 'corridor'"),
+    **{kind: (partial(quadratic_and, more), message) for kind, (more, message) in CONSTRAINED.items()},
     "state bounds": (with_state_bounds, "bounds of state 'x'"),
-    "path equality without control": (with_state_path_equality, "path equality 'rail', which contains no control"),
-    "start inequality": (with_start_inequality, "start inequality 'above'"),
-    "end inequality": (with_end_inequality, "end inequality 'beyond'"),
-    "end constraint on the control": (with_end_constraint_on_the_control, "end constraint 'rest' on the control"),
-    "start constraint on the control": (with_start_constraint_on_the_control, "start constraint 'push' on the control"),
-    "tie of the control": (with_tie_of_the_control, "end constraint 'tie' on the control"),
     "cost on the first control": (with_cost_on_the_first_control, "terminal cost on the control at the start"),
     "linear in a free control": (lambda: declare(lambda x, u: x[0] ** 2), "linear in control 'u'"),
     "linear in a half-bounded control": (lambda: declare(lambda x, u: x[0] ** 2, lower=0.0), "linear in control 'u'"),
@@ -223,8 +185,10 @@ REFUSED: dict[str, tuple[Callable[[], Problem], str]] = {
 @pytest.mark.parametrize("kind", REFUSED)
 def test_a_problem_that_it_cannot_take_is_refused_by_name_before_it_is_solved(kind: str) -> None:
     build, message = REFUSED[kind]
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         prepare(build(), Indirect())
+    quoted = message.split("'")
+    assert caught.value.name is None or caught.value.name in quoted
 
 
 def test_the_first_obstacle_of_a_problem_with_many_is_named() -> None:
@@ -233,10 +197,7 @@ def test_the_first_obstacle_of_a_problem_with_many_is_named() -> None:
 
 
 def free_start() -> Problem:
-    problem = Problem("free start")
-    x = problem.state("x", 2, initial=[1.0, np.nan])
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("free start", size=2, initial=[1.0, np.nan])
     problem.dynamics(x, ca.vertcat(x[1], u))
     problem.minimize(running=u**2, terminal=ca.sumsqr(x))
     return problem
@@ -314,10 +275,7 @@ def test_a_guess_of_another_problem_is_refused() -> None:
 
 
 def test_a_guess_with_other_controls_is_refused() -> None:
-    problem = Problem("one state")
-    q = problem.state("q", initial=0.0)
-    u = problem.control("u", 2)
-    problem.horizon(1.0)
+    problem, q, u = plant("one state", state="q", initial=0.0, u={"size": 2})
     problem.dynamics(q, ca.sum1(u))
     problem.minimize(running=ca.sumsqr(u - 1))
     with pytest.raises(ProblemError, match=r"plan 'other' has controls \{'w': 1\}"):
@@ -365,10 +323,7 @@ def test_variables_of_the_guess_may_be_declared_in_another_order() -> None:
 
 def singular_arc() -> Problem:
     """x' = u, |u| <= 1, int (x - t^2/4)^2: from 0.3 the state meets the curve and follows it."""
-    problem = Problem("follow")
-    x = problem.state("x", initial=0.3)
-    u = problem.control("u", lower=-1, upper=1)
-    problem.horizon(1.5)
+    problem, x, u = plant("follow", initial=0.3, u={"lower": -1, "upper": 1}, horizon=1.5)
     problem.dynamics(x, u)
     problem.minimize(running=(x - problem.time**2 / 4) ** 2)
     return problem
@@ -407,10 +362,7 @@ def test_chattering_is_told_from_the_switches_of_the_seed() -> None:
 
 def oscillator(horizon: float, rate: float) -> Problem:
     """min int x cos(rate t) of x'' = u - x: the costates do not depend on the plan, so nothing but signs is wrong."""
-    problem = Problem("oscillator")
-    x = problem.state("x", 2, initial=[0.0, 0.0])
-    u = problem.control("u", lower=-1, upper=1)
-    problem.horizon(horizon)
+    problem, x, u = plant("oscillator", size=2, initial=[0.0, 0.0], u={"lower": -1, "upper": 1}, horizon=horizon)
     problem.dynamics(x, ca.vertcat(x[1], -x[0] + u))
     problem.minimize(running=x[0] * ca.cos(rate * problem.time))
     return problem
@@ -466,10 +418,7 @@ def test_switches_out_of_order_are_no_plan() -> None:
 
 def test_a_maximum_of_the_hamiltonian_is_no_extremal() -> None:
     """H = -u^2/2 + lambda u is stationary at u = lambda, where it is greatest."""
-    problem = Problem("concave")
-    x = problem.state("x", initial=0.0)
-    u = problem.control("u", lower=-1, upper=2, guess=0.1)
-    problem.horizon(1.0)
+    problem, x, u = plant("concave", initial=0.0, u={"lower": -1, "upper": 2, "guess": 0.1})
     problem.dynamics(x, u)
     problem.minimize(running=-(u**2) / 2, terminal=x**2)
     with pytest.raises(SolveError, match="stationary but not least in control 'u'"):
@@ -486,10 +435,7 @@ def test_a_saddle_of_the_hamiltonian_is_no_extremal() -> None:
 
 def compass() -> Problem:
     """x' = sin a, min int cos a: H = cos a, for lambda = 0, is stationary at 0 too, where it is greatest."""
-    problem = Problem("compass")
-    x = problem.state("x", initial=0.0)
-    angle = problem.control("angle")
-    problem.horizon(1.0)
+    problem, x, angle = plant("compass", initial=0.0, u={"name": "angle"})
     problem.dynamics(x, ca.sin(angle))
     problem.minimize(running=ca.cos(angle))
     return problem
@@ -527,9 +473,7 @@ def test_costates_of_the_wrong_sign_are_mended_or_fail_with_words() -> None:
 
 def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:
     """Bolza: the best horizon is 1/sqrt 2, beyond the upper bound 1/2."""
-    problem = Problem("short")
-    x = problem.state("x", initial=0.0, terminal=1.0)
-    u = problem.control("u", guess=1.0)
+    problem, x, u = plant("short", initial=0.0, terminal=1.0, u={"guess": 1.0}, horizon=None)
     horizon = problem.horizon(lower=0.1, upper=0.5, guess=0.4)
     problem.dynamics(x, u)
     problem.minimize(running=u**2 / 2, terminal=horizon)
@@ -538,10 +482,7 @@ def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:
 
 
 def stiff(shove: float) -> Problem:
-    problem = Problem("stiff")
-    x = problem.state("x", 2, initial=[1.0, 0.0])
-    u = problem.control("u")
-    problem.horizon(10.0)
+    problem, x, u = plant("stiff", size=2, initial=[1.0, 0.0], horizon=10.0)
     problem.dynamics(x, ca.vertcat(x[1], shove * (1 - x[0] ** 2) * x[1] - x[0] + u))
     problem.minimize(running=(ca.sumsqr(x) + u**2) / 2)
     return problem
@@ -571,10 +512,7 @@ def test_a_guess_that_is_not_finite_is_a_failure_with_words() -> None:
 
 
 def unreachable() -> Problem:
-    problem = Problem("unreachable")
-    x = problem.state("x", initial=0.0, terminal=10.0)
-    u = problem.control("u", lower=-1, upper=1)
-    problem.horizon(1.0)
+    problem, x, u = plant("unreachable", initial=0.0, terminal=10.0, u={"lower": -1, "upper": 1})
     problem.dynamics(x, u)
     problem.minimize(running=u**2)
     return problem
@@ -590,10 +528,7 @@ def test_a_failure_of_its_own_seed_is_named_as_such() -> None:
 
 def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
     """A cycle without a drive may stand still anywhere: Newton's matrix is singular at a root."""
-    problem = Problem("anywhere")
-    x = problem.state("x", 2)
-    u = problem.control("u")
-    problem.horizon(2.0)
+    problem, x, u = plant("anywhere", size=2, horizon=2.0)
     problem.dynamics(x, ca.vertcat(x[1], u))
     problem.end("cyclic", x - problem.at_start(x), 0, 0)
     problem.minimize(running=u**2 / 2)

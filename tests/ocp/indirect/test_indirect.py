@@ -17,7 +17,7 @@ from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.problem.formulation import Formulation
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA
-from tests.ocp.problems import Array, energy
+from tests.ocp.problems import Array, energy, plant
 
 PAPER_COST = 1.735114311245  # two independent methods, to twelve digits
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])
@@ -245,9 +245,7 @@ def test_a_free_horizon_meets_its_condition_with_the_horizon_in_every_place() ->
     free = solved("free horizon")[0]
 
     def held(horizon: float) -> float:
-        problem = Problem("held")
-        x = problem.state("x", initial=1.0)
-        u = problem.control("u")
+        problem, x, u = plant("held", initial=1.0, horizon=None)
         T = problem.horizon(horizon)
         problem.dynamics(x, u * ca.exp(-0.2 * T) - x * problem.time / T)
         problem.end("gate", x - 0.2 * T, -0.1, -0.1)
@@ -292,10 +290,7 @@ def test_least_energy_is_exact(segments: int) -> None:
 
 def test_a_quartic_cost_gives_the_cube_root_of_the_costate() -> None:
     """min int u^4/4 of x' = u - x, 0 -> 1 in 1 s: lambda = -c e^t, u = (c e^t)^(1/3); x(1) = 1 gives c."""
-    problem = Problem("cube root")
-    x = problem.state("x", initial=0.0, terminal=1.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
+    problem, x, u = plant("cube root", initial=0.0, terminal=1.0)
     problem.dynamics(x, u - x)
     problem.minimize(running=u**4 / 4)
     solution = solve(problem, Indirect())
@@ -316,10 +311,7 @@ def test_a_heading_across_still_water_is_straight() -> None:
 
 def test_two_controls_that_switch_at_once() -> None:
     """x_i' = u_i, min int cos(t) (x1 + x2) over 5 s: both costates are sin 5 - sin t, zero at 3 pi - 5."""
-    problem = Problem("at once")
-    x = problem.state("x", 2, initial=[0.0, 0.0])
-    u = problem.control("u", 2, lower=-1, upper=1)
-    problem.horizon(5.0)
+    problem, x, u = plant("at once", size=2, initial=[0.0, 0.0], u={"size": 2, "lower": -1, "upper": 1}, horizon=5.0)
     problem.dynamics(x, u)
     problem.minimize(running=ca.cos(problem.time) * (x[0] + x[1]))
     solution = solve(problem, Indirect())
@@ -338,10 +330,7 @@ def test_a_switching_function_that_vanishes_at_a_free_start_is_no_switch(noise: 
 
     The costate of the free initial velocity is zero: the sign of the seed's noise there must not start the plan.
     """
-    problem = Problem("free start, bang")
-    x = problem.state("x", 2, initial=[1.0, np.nan])
-    u = problem.control("u", lower=-1, upper=1)
-    problem.horizon(2.0)
+    problem, x, u = plant("free start, bang", size=2, initial=[1.0, np.nan], u={"lower": -1, "upper": 1}, horizon=2.0)
     problem.dynamics(x, ca.vertcat(x[1], u))
     problem.minimize(terminal=x[0] ** 2 + (x[1] - 5) ** 2)
     seed = solve(problem, Collocation(40, control="held"))
