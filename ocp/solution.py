@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -26,29 +26,11 @@ PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
 
 
-@dataclass(frozen=True)
-class Sample(Mapping[str, np.ndarray]):
+class Sample(dict[str, np.ndarray]):
     """States and controls at one time (each (n,)) or at several (each (M, n)), by name."""
 
-    arrays: dict[str, np.ndarray]
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self.arrays:
-            raise unknown_name("state or control", name, self.arrays)
-        return self.arrays[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.arrays
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """The value by that name, or the default."""
-        return self.arrays.get(name, default)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.arrays)
-
-    def __len__(self) -> int:
-        return len(self.arrays)
+    def __missing__(self, name: str) -> np.ndarray:
+        raise unknown_name("state or control", name, self)
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,9 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
     entries = dict(form.guesses)
     horizon = default_horizon(form, bounds)
     given: dict[str, Any] = {}
+    curves: dict[str, Trajectory] = {}
     if isinstance(guess, Solution):
-        given = from_solution(form, guess)
-        horizon = guess.horizon
+        curves, horizon = from_solution(form, guess), guess.horizon
     elif isinstance(guess, Mapping):
         given = {name: value for name, value in guess.items() if name != "t"}
         known = [*form.states, *form.controls, "horizon", "t"]
@@ -41,11 +41,13 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
             if name not in known:
                 raise unknown_name("variable in guess", name, known)
     elif guess is not None:
-        raise ProblemError(f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}")
+        words = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
+        raise ProblemError(words, name="guess", value=guess)
     if "horizon" in given:
         number = numeric("guess of the horizon", given.pop("horizon"))
         if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
-            raise ProblemError(f"guess of the horizon must be one positive finite number, not {number.tolist()} s")
+            words = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
+            raise ProblemError(words, name="horizon", value=number.tolist())
         horizon = float(number[0])
     entries.update(given)
     times = None if guess is None or isinstance(guess, Solution) else guess.get("t")
@@ -59,20 +61,22 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
         table = np.zeros((len(where), size))
         for name, place in pool.items():
             value = entries.get(name)
-            n = place.stop - place.start
-            line = default(form, role, place, bounds)
-            curve = line if value is None else trajectory(name, value, n, horizon, times)
+            if name in curves:
+                curve = curves[name]
+            elif value is None:
+                curve = default(form, role, place, bounds)
+            else:
+                curve = trajectory(name, value, place.stop - place.start, horizon, times)
             table[:, place] = curve(where)
             for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
-                raise ProblemError(f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}")
+                words = f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}"
+                raise ProblemError(words, name=name, value=table[i, place], time=float(where[i] * horizon))
         point[mine] = table[slot, fragment.variable_entry[mine]]
     return point
 
 
 def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
     """A guess as a function of the fraction: from a function of time, samples (M, n) over ``times``, or a value."""
-    if isinstance(value, OverFraction):
-        return value.curve
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
     if callable(value):
@@ -82,9 +86,10 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
         rows = len(array)
         at = np.linspace(0.0, horizon, rows) if times is None else numeric("guess: its times 't'", times)
         if len(at) != rows or array.shape[1] != size:
-            raise ProblemError(f"guess of {name!r} has shape {array.shape}, ({len(at)}, {size}) expected")
+            words = f"guess of {name!r} has shape {array.shape}, ({len(at)}, {size}) expected"
+            raise ProblemError(words, name=name, value=array.shape, limit=(len(at), size))
         if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):
-            raise ProblemError(f"guess of {name!r}: its times 't' must be finite and increase")
+            raise ProblemError(f"guess of {name!r}: its times 't' must be finite and increase", name=name)
         sampled = Samples(at, array)
         return lambda s: sampled.over(s * horizon)
     constant = fitted(name, value, size)
@@ -112,24 +117,19 @@ class Samples:
         return np.asarray(self.over(np.array([time]))[0])
 
 
-class OverFraction:
-    """A guess that is a function of the fraction of the horizon rather than of time."""
-
-    def __init__(self, curve: Trajectory) -> None:
-        self.curve = curve
-
-
-def from_solution(form: Formulation, guess: Solution) -> dict[str, Any]:
-    """Guesses from an earlier solution, for every state and control that it shares with the problem."""
-    shared: dict[str, Any] = {}
+def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
+    """Curves of an earlier solution, for every state and control that it shares with the problem."""
+    shared: dict[str, Trajectory] = {}
     for name, place in {**form.states, **form.controls}.items():
         pool = guess.states if name in guess.states else guess.controls
         if name not in pool:
             continue
-        if pool[name].shape[1] != place.stop - place.start:
-            have = pool[name].shape[1]
-            raise ProblemError(f"guess of {name!r} has {have} entries, {place.stop - place.start} expected")
-        shared[name] = OverFraction(lambda s, name=name: guess.at_fraction(s)[name])  # type: ignore[misc]
+        have, size = pool[name].shape[1], place.stop - place.start
+        if have != size:
+            raise ProblemError(
+                f"guess of {name!r} has {have} entries, {size} expected", name=name, value=have, limit=size
+            )
+        shared[name] = lambda s, name=name: guess.at_fraction(s)[name]  # type: ignore[misc]
     if not shared:
         raise ProblemError(f"the guess, plan {guess.name!r}, shares no state or control with problem {form.name!r}")
     return shared
@@ -138,7 +138,8 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Any]:
 def fitted(name: str, value: Any, size: int) -> np.ndarray:
     array = numeric(f"guess of {name!r}", value)
     if array.size not in (1, size):
-        raise ProblemError(f"guess of {name!r} has {array.size} entries, {size} expected")
+        words = f"guess of {name!r} has {array.size} entries, {size} expected"
+        raise ProblemError(words, name=name, value=array.size, limit=size)
     return np.broadcast_to(array, size)
 
 

@@ -6,7 +6,7 @@ obey lambda' = -dH/dx, the control makes H least. Bryson, Ho, Applied Optimal Co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -66,9 +66,9 @@ class Hamiltonian:
         in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
         smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
         linear = [i for i in range(form.nu) if i not in smooth]
-        system = Stationarity(form, lam, mu, rows, value, smooth, linear)
-        unknowns, how = system.solve()
-        return cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), unknowns, how)
+        system = cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), None, "")
+        unknowns, how = system._solve()
+        return replace(system, unknowns=unknowns, how=how)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -123,6 +123,77 @@ class Hamiltonian:
         found = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
         return ca.Function(name, arguments, found, {"cse": True})
 
+    # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
+
+    def _solve(self) -> tuple[Any, str]:
+        """Function (x, lam, t, T, p, bang, guess) -> w, and how it works."""
+        form, n, m = self.form, len(self.smooth), len(self.form.path)
+        sym = form.sym
+        self._check_linear()
+        w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
+        known = [form.x, self.lam, form.t, form.T, form.p, bang]
+        residual = self._residual(w, bang)
+        matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
+        pattern = nonzeros(matrix, [*known, w])
+        if isinstance(matrix, ca.SX):
+            matrix = ca.sparsify(matrix)
+        self._check_regular(matrix, [*known, w])
+        bounded = self._has_bounds()
+        index = form.bounds.places["control"][list(self.smooth)].tolist()
+        low, high = (bound[index] for bound in form.bounds.function(form.p))
+        separate = m == 0 and pattern.is_diag()
+        if not ca.depends_on(matrix, w) and (not bounded or separate):
+            offset = ca.substitute([residual], [w], [ca.DM.zeros(n + m)])[0]
+            found = -symmetric_solve(matrix, offset, n) if n + m else w
+            if bounded:
+                found = ca.fmax(low, ca.fmin(high, found))
+            return ca.Function("unknowns", [*known, guess], [found]), "projected" if bounded else "quadratic"
+        if bounded:  # stationary or at a bound: u is the projection of u - H_u on the bounds
+            inside = ca.fmax(low, ca.fmin(high, w[:n, :] - residual[:n, :]))
+            residual = ca.vertcat(w[:n, :] - inside, residual[n:, :])
+        equations = ca.Function("stationary", [w, ca.vertcat(*known)], [residual])
+        options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
+        finder = ca.rootfinder("control", "newton", equations, options)
+        symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
+        return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
+
+    def _residual(self, w: Any, bang: Any) -> Any:
+        """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        n = len(self.smooth)
+        gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
+        stacked = ca.densify(ca.vertcat(gradient, self.rows))
+        control = assemble_control(self.form, self.smooth, self.linear, w, bang)
+        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
+
+    def _has_bounds(self) -> bool:
+        low, high = numeric_bounds(self.form)
+        index = self.form.bounds.places["control"][list(self.smooth)]
+        return bool(np.any(np.isfinite(low[index]) | np.isfinite(high[index])))
+
+    def _check_linear(self) -> None:
+        low, high = numeric_bounds(self.form)
+        for i in self.linear:
+            at = self.form.bounds.places["control"][i]
+            if not (np.isfinite(low[at]) and np.isfinite(high[at])):
+                raise ProblemError(
+                    f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
+                    "both sides: no control makes it least; bound it or add a quadratic term to the cost",
+                    name=self.form.control_labels[i],
+                )
+
+    def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
+        """Raise where the equations of the control are singular at a random point."""
+        if 0 in matrix.shape:
+            return
+        rng = np.random.default_rng(SEED)
+        sample = numbers(matrix, symbols, rng)
+        singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
+        if singular[-1] < REGULAR * singular[0]:
+            raise ProblemError(
+                "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
+                "that the path equalities leave; add a quadratic term in the control to the cost"
+            )
+
 
 def assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
     """All controls, from the smooth ones (first entries of ``w``) and those at their bounds."""
@@ -163,88 +234,6 @@ def check_constraints(form: Formulation) -> None:
                     raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
                 if form.nu and ca.depends_on(rows.expression[i], controls):
                     raise ProblemError(f"the indirect method cannot take {kind} constraint {label!r} on the control")
-
-
-@dataclass(frozen=True)
-class Stationarity:
-    """The equations that make H stationary in the smooth controls, and their solution."""
-
-    form: Formulation
-    lam: Any
-    mu: Any
-    rows: Any
-    value: Any
-    smooth: list[int]
-    linear: list[int]
-
-    def solve(self) -> tuple[Any, str]:
-        """Function (x, lam, t, T, p, bang, guess) -> w, and how it works."""
-        form, n, m = self.form, len(self.smooth), len(self.form.path)
-        sym = form.sym
-        self._check_linear()
-        w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
-        known = [form.x, self.lam, form.t, form.T, form.p, bang]
-        residual = self._residual(w, bang)
-        matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
-        pattern = nonzeros(matrix, [*known, w])
-        if isinstance(matrix, ca.SX):
-            matrix = ca.sparsify(matrix)
-        self._check_regular(matrix, [*known, w])
-        bounded = self._has_bounds()
-        index = form.bounds.places["control"][self.smooth].tolist()
-        low, high = (bound[index] for bound in form.bounds.function(form.p))
-        separate = m == 0 and pattern.is_diag()
-        if not ca.depends_on(matrix, w) and (not bounded or separate):
-            offset = ca.substitute([residual], [w], [ca.DM.zeros(n + m)])[0]
-            found = -symmetric_solve(matrix, offset, n) if n + m else w
-            if bounded:
-                found = ca.fmax(low, ca.fmin(high, found))
-            return ca.Function("unknowns", [*known, guess], [found]), "projected" if bounded else "quadratic"
-        if bounded:  # stationary or at a bound: u is the projection of u - H_u on the bounds
-            inside = ca.fmax(low, ca.fmin(high, w[:n, :] - residual[:n, :]))
-            residual = ca.vertcat(w[:n, :] - inside, residual[n:, :])
-        equations = ca.Function("stationary", [w, ca.vertcat(*known)], [residual])
-        options = {"abstol": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
-        finder = ca.rootfinder("control", "newton", equations, options)
-        symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
-        return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
-
-    def _residual(self, w: Any, bang: Any) -> Any:
-        """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
-        n = len(self.smooth)
-        gradient = ca.gradient(self.value, self.form.u)[self.smooth] if n else self.form.problem.symbols(0, 1)
-        stacked = ca.densify(ca.vertcat(gradient, self.rows))
-        control = assemble_control(self.form, self.smooth, self.linear, w, bang)
-        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
-
-    def _has_bounds(self) -> bool:
-        low, high = numeric_bounds(self.form)
-        index = self.form.bounds.places["control"][self.smooth]
-        return bool(np.any(np.isfinite(low[index]) | np.isfinite(high[index])))
-
-    def _check_linear(self) -> None:
-        low, high = numeric_bounds(self.form)
-        for i in self.linear:
-            at = self.form.bounds.places["control"][i]
-            if not (np.isfinite(low[at]) and np.isfinite(high[at])):
-                raise ProblemError(
-                    f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
-                    "both sides: no control makes it least; bound it or add a quadratic term to the cost",
-                    name=self.form.control_labels[i],
-                )
-
-    def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
-        """Raise where the equations of the control are singular at a random point."""
-        if 0 in matrix.shape:
-            return
-        rng = np.random.default_rng(SEED)
-        sample = numbers(matrix, symbols, rng)
-        singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
-        if singular[-1] < REGULAR * singular[0]:
-            raise ProblemError(
-                "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
-                "that the path equalities leave; add a quadratic term in the control to the cost"
-            )
 
 
 def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
