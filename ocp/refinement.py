@@ -15,9 +15,9 @@ from ocp.solution import ByName, Guess, Refinement, Solution
 
 __all__ = ["refine", "split"]
 
-SAFETY = 0.5
-MOST = 4  # pieces that an interval is split into at once
-ROUNDS = 20
+TARGET_SHARE = 0.5  # of the tolerance, which every interval is split for
+MOST_PIECES = 4  # that an interval is split into at once
+MOST_ROUNDS = 20
 
 
 def refine(
@@ -38,7 +38,7 @@ def refine(
     round starts from the plan before.
 
     Args:
-        problem, parameters, solver, options, guess: As for :func:`ocp.methods`.
+        problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
         method: The mesh to start from.
         tolerance: Largest integration error, relative to the size of each state.
         max_intervals: Cap on the number of intervals.
@@ -70,8 +70,8 @@ def refine(
         intervals.append(method.intervals)
         errors.append(audit.integration_error)
         reached = audit.integration_error <= tolerance
-        finer = split(method.fractions, audit.local_errors, SAFETY * tolerance, method.order, max_intervals)
-        if reached or len(finer) == method.intervals + 1 or len(errors) == ROUNDS:
+        finer = split(method.fractions, audit.local_errors, TARGET_SHARE * tolerance, method.order, max_intervals)
+        if reached or len(finer) == method.intervals + 1 or len(errors) == MOST_ROUNDS:
             break
         method = method.with_mesh(finer)
         guess = solution
@@ -89,7 +89,7 @@ def split(mesh: np.ndarray, errors: np.ndarray, target: float, order: int, most:
     """A finer mesh of at most ``most`` intervals, the worst intervals split first. Shape (N' + 1,)."""
     with np.errstate(over="ignore"):
         wanted = np.ceil((np.where(np.isfinite(errors), errors, np.inf) / target) ** (1.0 / order))
-    pieces = np.clip(wanted, 1, MOST).astype(int)
+    pieces = np.clip(wanted, 1, MOST_PIECES).astype(int)
     if np.all(pieces == 1):  # every interval is good, their sum is not: halve the worse half
         pieces[errors >= np.median(errors)] = 2
     room = most - len(errors)

@@ -18,9 +18,9 @@ from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["tighten"]
 
-FINER = 10  # places looked at for each degree of the plan's polynomials in an interval
-ROUNDS = 20
-FURTHER = 1.2  # share of the excess that a bound is drawn in by: the plan follows it in part only
+PLACES_A_DEGREE = 10  # places looked at for each degree of the plan's polynomials in an interval
+MOST_ROUNDS = 20
+DRAWN_IN = 1.2  # share of the excess that a bound is drawn in by: the plan follows it in part only
 
 
 def tighten(
@@ -36,10 +36,10 @@ def tighten(
     """Solve so that every inequality holds between the points of the grid as well.
 
     The plan is the optimum under bounds that are drawn in where it would have exceeded them, so it costs a little more
-    than that of :func:`ocp.methods`; finer grids close the gap. Equalities are not touched: refine the grid for them.
+    than that of :func:`ocp.methods.solve`; finer grids close the gap. Equalities are not touched: refine for them.
 
     Args:
-        problem, parameters, solver, options, guess: As for :func:`ocp.methods`.
+        problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
         method: Collocation or MultipleShooting.
         tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
 
@@ -54,7 +54,7 @@ def tighten(
     bounds = form.bound_values(p)
     where = _places(form, fragment)
     moves = {key: np.zeros(len(where[key[-1]][0])) for key in ("lbx", "ubx", "lbg", "ubg")}
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         solution = prepared.solve(parameters, guess, tighter=moves)
         beyond, times = _excess(form, solution, p, bounds)
         if max(part.max(initial=0.0) for part in beyond) <= tolerance:
@@ -62,13 +62,13 @@ def tighten(
         for side, part in zip(("l", "u"), beyond, strict=True):
             for kind, (entry, left, right) in where.items():
                 most = np.where(entry >= 0, np.maximum(part[left, entry], part[right, entry]), 0.0)
-                moves[f"{side}b{kind}"] += np.where(most > tolerance / 2, FURTHER * most, 0.0)
+                moves[f"{side}b{kind}"] += np.where(most > tolerance / 2, DRAWN_IN * most, 0.0)
         guess = solution
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = np.maximum(*beyond)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
     raise SolveError(
-        f"problem {form.name!r}: after {ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
+        f"problem {form.name!r}: after {MOST_ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
         f"between {times[k]:.4g} and {times[k + 1]:.4g} s; take more intervals",
         solution,
         name=labels[i],
@@ -103,7 +103,7 @@ def _excess(
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     pieces = (len(solution.state_interpolant.breaks) - 1) // n
-    count = FINER * (len(solution.state_interpolant.nodes) - 1) * pieces
+    count = PLACES_A_DEGREE * (len(solution.state_interpolant.nodes) - 1) * pieces
     place = np.linspace(0.0, 1.0, count + 1)
     owner = np.repeat(np.arange(n), len(place))
     s = breaks[owner] + np.diff(breaks)[owner] * np.tile(place, n)

@@ -22,7 +22,7 @@ from ocp.solution import Solution, check_belongs, stack, unstack
 
 __all__ = ["Audit", "Finding", "audit"]
 
-FINER = 10  # times as fine as the plan's own points is the grid on which constraints are looked at
+GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which constraints are looked at
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def audit(
     bounds = form.bound_values(p)
     points = max(solution.state_interpolant.values.shape[1] - 1, 1)
     pieces = (len(solution.state_interpolant.breaks) - 1) // (len(solution.control_interpolant.breaks) - 1)
-    again = reintegrate(form, solution, p, FINER * points * max(pieces, 1))
+    again = reintegrate(form, solution, p, GRID_FACTOR * points * max(pieces, 1))
     optimality = minimum_principle(form, solution, p, bounds)
 
     scale = state_scale(form, again.plan)

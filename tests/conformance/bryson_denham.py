@@ -14,8 +14,9 @@ from functools import partial
 import numpy as np
 
 from ocp import Problem
+from tests.ocp.problems import double_integrator
 
-from .case import Array, Case, Extremal, double_integrator, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, legendre, radau, shooting, within
 
 CEILING = 1 / 9
 T1 = 3 * CEILING  # contact begins; it ends at 1 - T1

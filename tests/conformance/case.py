@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -125,26 +125,6 @@ def held(intervals: Grid) -> tuple[Collocation, Collocation, MultipleShooting]:
     """Radau, Legendre and shooting with one control an interval."""
     collocations = radau(intervals, control="held"), legendre(intervals, control="held")
     return *collocations, shooting(intervals, "held")
-
-
-def double_integrator(
-    name: str,
-    start: tuple[float, float] = (0.0, 0.0),
-    end: tuple[float, float] = (1.0, 0.0),
-    horizon: float | None = 1.0,
-    limit: float | None = None,
-    ceiling: float | None = None,
-) -> tuple[Problem, Any, Any, Any]:
-    """q' = v, v' = u between two states (q, v), |u| <= limit, q <= ceiling; a horizon of None is left to declare."""
-    problem = Problem(name)
-    q = problem.state("q", initial=start[0], terminal=end[0], upper=ceiling)
-    v = problem.state("v", initial=start[1], terminal=end[1])
-    u = problem.control("u", lower=None if limit is None else -limit, upper=limit)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
-    if horizon is not None:
-        problem.horizon(horizon)
-    return problem, q, v, u
 
 
 def within(

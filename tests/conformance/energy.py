@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from ocp import Problem
+from tests.ocp.problems import double_integrator
 
-from .case import Array, Case, Extremal, double_integrator, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, legendre, radau, shooting, within
 
 
 def build() -> Problem:

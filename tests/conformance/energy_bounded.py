@@ -11,8 +11,9 @@ from math import sqrt
 import numpy as np
 
 from ocp import Problem
+from tests.ocp.problems import double_integrator
 
-from .case import Array, Case, Extremal, Switch, double_integrator, fitted, legendre, radau, shooting, within
+from .case import Array, Case, Extremal, Switch, fitted, legendre, radau, shooting, within
 
 LIMIT = 5.0
 A = sqrt(3 / 20)  # half of the unsaturated arc, s

@@ -16,8 +16,9 @@ from math import sqrt
 import numpy as np
 
 from ocp import Problem
+from tests.ocp.problems import double_integrator
 
-from .case import Array, Case, Extremal, Switch, double_integrator, fitted, held, legendre, radau, within
+from .case import Array, Case, Extremal, Switch, fitted, held, legendre, radau, within
 
 HORIZON = 3.5
 Z = sqrt((sqrt(33) - 1) / 24)

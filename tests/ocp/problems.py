@@ -57,15 +57,30 @@ def plant(
     return problem, x, control
 
 
-def energy(**control: Any) -> Problem:
-    """Double integrator from (0, 0) to (1, 0) in 1 s with least energy: cost 6, costates at the start -12 and -6."""
-    problem = Problem("energy")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u", **control)
+def double_integrator(
+    name: str,
+    start: tuple[float, float] = (0.0, 0.0),
+    end: tuple[float, float] = (1.0, 0.0),
+    horizon: float | None = 1.0,
+    limit: float = np.inf,
+    ceiling: float | None = None,
+    **control: Any,
+) -> tuple[Problem, Any, Any, Any]:
+    """q' = v, v' = u between two states (q, v), |u| <= limit, q <= ceiling; a horizon of None is left to declare."""
+    problem = Problem(name)
+    q = problem.state("q", initial=start[0], terminal=end[0], upper=ceiling)
+    v = problem.state("v", initial=start[1], terminal=end[1])
+    u = problem.control("u", **{"lower": -limit, "upper": limit, **control})
     problem.dynamics(q, v)
     problem.dynamics(v, u)
-    problem.horizon(1.0)
+    if horizon is not None:
+        problem.horizon(horizon)
+    return problem, q, v, u
+
+
+def energy(**control: Any) -> Problem:
+    """Double integrator from (0, 0) to (1, 0) in 1 s with least energy: cost 6, costates at the start -12 and -6."""
+    problem, _, _, u = double_integrator("energy", **control)
     problem.minimize(running=u**2 / 2)
     return problem
 

@@ -9,8 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange
-from tests.ocp.problems import Array
+from ocp.curves import (
+    PiecewisePolynomial,
+    differentiation_matrix,
+    integrator,
+    lagrange,
+    lagrange_expressions,
+    rk4_step,
+)
+from tests.ocp.problems import Array, order
 
 DEGREES = range(1, 11)
 
@@ -76,3 +83,36 @@ def test_one_node_makes_a_piecewise_constant() -> None:
 def test_no_entries_are_interpolated_too() -> None:
     nothing = PiecewisePolynomial(np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.zeros((1, 2, 0)))
     assert nothing(np.linspace(0, 1, 5)).shape == (5, 0)
+
+
+@pytest.mark.parametrize("count", DEGREES)
+def test_the_basis_as_expressions_is_the_basis_in_numbers(count: int) -> None:
+    nodes, place = nodes_of(count, "legendre"), ca.SX.sym("place")
+    basis = ca.Function("basis", [place], [lagrange_expressions(nodes, place)])
+    at = np.linspace(0.0, 1.0, 7)
+    np.testing.assert_allclose(np.asarray(basis(at[None]).full()).T, lagrange(nodes, at), atol=1e-9)
+
+
+def swung(t: float, x: Array) -> Array:
+    """x0' = x1, x1' = -x0 + cos 2t; from (1, 0): x0 = (4 cos t - cos 2t) / 3."""
+    return np.array([x[1], -x[0] + np.cos(2 * t)])
+
+
+def test_runge_kutta_steps_are_of_the_fourth_order() -> None:
+    widths, errors = np.array([0.2, 0.1, 0.05]), []
+    for h in widths:
+        x = np.array([1.0, 0.0])
+        for k in range(round(1.0 / h)):
+            x = rk4_step(lambda place, state, k=k, h=h: swung((k + place) * h, state), x, h)
+        errors.append(abs(x[0] - (4 * np.cos(1.0) - np.cos(2.0)) / 3))
+    assert order(widths, np.array(errors)) == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_integrators_keep_their_tolerance(smooth: bool) -> None:
+    x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
+    dae = {"x": x, "t": t, "ode": ca.vertcat(x[1], -x[0] + ca.cos(2 * t)), "quad": x[0]}
+    places = np.array([0.5, 1.0, 2.0])
+    found = integrator("swung", dae, places.tolist(), smooth=smooth)(x0=[1.0, 0.0])
+    np.testing.assert_allclose(found["xf"].full()[0], (4 * np.cos(places) - np.cos(2 * places)) / 3, atol=1e-9)
+    np.testing.assert_allclose(found["qf"].full()[0], (4 * np.sin(places) - np.sin(2 * places) / 2) / 3, atol=1e-9)

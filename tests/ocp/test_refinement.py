@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, RefinementWarning, SolveError, refine, solve
-from ocp.refinement import MOST, split
+from ocp.refinement import MOST_PIECES, split
 from tests.ocp.problems import SWING, Method, energy, plant, swing, van_der_pol
 
 START: dict[str, Method] = {
@@ -165,9 +165,9 @@ def test_split_meshes_are_finer_ordered_and_never_beyond_the_cap(
     assert finer[0] == 0.0
     assert finer[-1] == 1.0
     assert np.all(np.diff(finer) > 0)
-    assert n <= len(finer) - 1 <= min(n + room, MOST * n)
+    assert n <= len(finer) - 1 <= min(n + room, MOST_PIECES * n)
     assert set(mesh) <= set(finer)
-    if room >= MOST * n:
+    if room >= MOST_PIECES * n:
         assert len(finer) > n + 1
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
-from tests.ocp.problems import plant
+from tests.ocp.problems import double_integrator, plant
 
 METHODS = [
     Collocation(10, degree=3),
@@ -20,14 +20,8 @@ METHODS = [
 
 def walled() -> Problem:
     """The double integrator under a ceiling of 1/9 (Bryson, Denham) with a moving limit of its push."""
-    problem = Problem("walled")
-    q = problem.state("q", initial=0.0, terminal=0.0, upper=1 / 9)
-    v = problem.state("v", initial=1.0, terminal=-1.0)
-    u = problem.control("u", lower=-9.0, upper=9.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
+    problem, _, v, u = double_integrator("walled", (0.0, 1.0), (0.0, -1.0), limit=9.0, ceiling=1 / 9)
     problem.path("power", u * v, lower=-4.5, upper=4.5)
-    problem.horizon(1.0)
     problem.minimize(running=u**2 / 2)
     return problem
 

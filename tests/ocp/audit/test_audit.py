@@ -16,7 +16,17 @@ from hypothesis import strategies as st
 
 from ocp import Audit, Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
 from ocp.curves import PiecewisePolynomial
-from tests.ocp.problems import SWING, Array, LogarithmicRegulator, Method, energy, plant, swing, van_der_pol
+from tests.ocp.problems import (
+    SWING,
+    Array,
+    LogarithmicRegulator,
+    Method,
+    double_integrator,
+    energy,
+    plant,
+    swing,
+    van_der_pol,
+)
 
 FINE: dict[str, Method] = {
     "radau": Collocation(20),
@@ -290,14 +300,8 @@ def test_a_bound_that_the_plan_does_not_keep_is_found(method: str) -> None:
 @pytest.mark.parametrize("scheme", ["radau", "legendre"])
 def test_a_control_that_overshoots_its_bound_between_points_fails(scheme: str) -> None:
     """Polynomials over a switch: inside the bounds at every point, outside between them."""
-    problem = Problem("minimum time")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u", lower=-1.0, upper=1.0)
-    horizon = problem.horizon(lower=0.5, upper=5.0, guess=2.5)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
-    problem.minimize(terminal=horizon)
+    problem, *_ = double_integrator("minimum time", horizon=None, limit=1.0)
+    problem.minimize(terminal=problem.horizon(lower=0.5, upper=5.0, guess=2.5))
     solution = solve(problem, Collocation(5, 4, scheme))
     assert np.abs(solution.control_interpolant.values).max() <= 1.0
     audit = solution.audit()
@@ -459,13 +463,7 @@ def test_auditing_changes_nothing() -> None:
 
 @pytest.mark.parametrize("method", [MultipleShooting(20), Collocation(20, control="held")])
 def test_a_held_control_is_stationary_with_the_constraints_at_both_ends_of_its_interval(method: Any) -> None:
-    problem = Problem("mixed")
-    q = problem.state("q", initial=0.0, terminal=1.0)
-    v = problem.state("v", initial=0.0, terminal=0.0)
-    u = problem.control("u")
-    problem.horizon(1.0)
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
+    problem, q, _, u = double_integrator("mixed")
     problem.path("mixed", u - 4 * q, upper=3.0)
     problem.minimize(running=u**2 / 2)
     audit = solve(problem, method).audit()

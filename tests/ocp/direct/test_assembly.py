@@ -17,7 +17,7 @@ from ocp.curves import differentiation_matrix, lagrange
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.fragment import Fragment, shifted
 from ocp.problem.formulation import Formulation
-from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, energy, swing, van_der_pol
+from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, energy, plant, swing, van_der_pol
 
 KINDS: dict[str, Callable[[Any], Problem]] = {
     "swing": lambda symbols: swing(symbols),
@@ -159,10 +159,8 @@ def test_jacobian_and_hessian_agree_with_finite_differences(method: str) -> None
 def test_collocation_rows_are_the_textbook_equations(scheme: str, control: str) -> None:
     """At random variables: sum_i l_i'(tau_j) x_i = h T f(x_j, u_j, t_j), with the quadrature of the running cost."""
     degree, mesh = 3, np.array([0.0, 0.3, 1.0])
-    problem = Problem("anything")
+    problem, x, u = plant("anything", size=2, horizon=None)
     p = problem.parameter("p")
-    x = problem.state("x", 2)
-    u = problem.control("u")
     horizon = problem.horizon(lower=0.1, upper=9.0)
     problem.dynamics(x, ca.vertcat(x[1] * ca.cos(u) + problem.time, p * x[0] - u**2 / horizon))
     problem.minimize(running=x[0] ** 2 + u * problem.time, terminal=horizon * x[1])

@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from ocp import Collocation, Problem, ProblemError, Solution, solve
 from ocp.curves import quadrature_weights
 from ocp.problem.formulation import Formulation
-from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, plant, relative, van_der_pol
+from tests.ocp.problems import (
+    Array,
+    LogarithmicRegulator,
+    double_integrator,
+    energy,
+    order,
+    plant,
+    relative,
+    van_der_pol,
+)
 
 TIGHT = {"tol": 1e-13, "constr_viol_tol": 1e-13, "dual_inf_tol": 1e-11}
 # degree: horizon and meshes on which the error is asymptotic and far above rounding
@@ -210,13 +219,7 @@ def test_active_path_constraints_are_kept_where_they_are_imposed(scheme: str, co
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_bounds_of_states_hold_at_every_reported_point(scheme: str) -> None:
-    problem = Problem("bounded")
-    q = problem.state("q", initial=0.0, terminal=0.0, upper=1 / 9)
-    v = problem.state("v", initial=1.0, terminal=-1.0)
-    u = problem.control("u")
-    problem.dynamics(q, v)
-    problem.dynamics(v, u)
-    problem.horizon(1.0)
+    problem, _, _, u = double_integrator("bounded", (0.0, 1.0), (0.0, -1.0), ceiling=1 / 9)
     problem.minimize(running=u**2 / 2)
     solution = solve(problem, Collocation(12, 3, scheme))
     assert solution["q"].max() <= 1 / 9 + 1e-9

@@ -15,7 +15,7 @@ from ocp import MultipleShooting, Problem, ProblemError, solve
 from ocp.direct.assembly import assemble
 from ocp.problem.formulation import Formulation
 from tests.ocp.direct.test_collocation import constrained, imposed
-from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, van_der_pol
+from tests.ocp.problems import Array, LogarithmicRegulator, energy, order, plant, van_der_pol
 
 CONTROLS = ("held", "linear")
 TIGHT = {"tol": 1e-13, "constr_viol_tol": 1e-13, "dual_inf_tol": 1e-11}
@@ -106,10 +106,8 @@ def test_continuity_rows_are_runge_kutta_steps(
 ) -> None:
     """At random variables the rows and the cost equal the textbook method, written down here once more."""
     rng = np.random.default_rng(seed)
-    problem = Problem("anything")
+    problem, x, u = plant("anything", size=2, u={"size": 2}, horizon=None)
     p = problem.parameter("p")
-    x = problem.state("x", 2)
-    u = problem.control("u", 2)
     horizon = problem.horizon(lower=0.1, upper=9.0) if free_horizon else problem.horizon(width)
     problem.dynamics(x, ca.vertcat(x[1] * ca.cos(u[0]) + problem.time, p * x[0] - u[1] ** 2 / horizon))
     problem.minimize(running=x[0] ** 2 + u[0] * problem.time)

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ocp import Collocation, Problem
+from tests.ocp.problems import plant
 
 FINE = Collocation(60, 4, "legendre")
 KINKED = Collocation(240)
@@ -83,10 +84,8 @@ def fixed_horizon() -> Problem:
 
 def free_horizon() -> Problem:
     """The free horizon enters dynamics, both costs and the end constraint."""
-    problem = Problem("free horizon")
+    problem, x, u = plant("free horizon", initial=1.0, horizon=None)
     g = problem.parameter("g")
-    x = problem.state("x", initial=1.0)
-    u = problem.control("u")
     T = problem.horizon(lower=0.2, upper=5.0, guess=1.0)
     problem.dynamics(x, u * ca.exp(-0.2 * T) - x * problem.time / T)
     problem.end("gate", x - 0.2 * T, g, g)
@@ -96,11 +95,8 @@ def free_horizon() -> Problem:
 
 def cyclic() -> Problem:
     """A driven oscillator whose end is its start but for a parameter; nothing else is given there."""
-    problem = Problem("cyclic")
+    problem, x, u = plant("cyclic", size=2, horizon=2.0)
     a = problem.parameter("a")
-    x = problem.state("x", 2)
-    u = problem.control("u")
-    problem.horizon(2.0)
     problem.dynamics(x, ca.vertcat(x[1], u - x[0] - 0.2 * x[1] + ca.sin(np.pi * problem.time)))
     problem.end("cyclic", x - problem.at_start(x), a, a)
     problem.minimize(running=u**2 / 2 + (x[0] - 0.5) ** 2)
@@ -109,10 +105,8 @@ def cyclic() -> Problem:
 
 def free_period() -> Problem:
     """A cycle of van der Pol's oscillator from a given point in a free time: its period where the drive is cheap."""
-    problem = Problem("free period")
+    problem, x, u = plant("free period", size=2, guess=lambda t: [np.cos(t), -np.sin(t)], horizon=None)
     amplitude = problem.parameter("amplitude")
-    x = problem.state("x", 2, guess=lambda t: [np.cos(t), -np.sin(t)])
-    u = problem.control("u")
     T = problem.horizon(lower=3.0, upper=9.0, guess=6.0)
     problem.dynamics(x, ca.vertcat(x[1], 0.3 * (1 - x[0] ** 2) * x[1] - x[0] + u))
     problem.start("phase", x[1], 0, 0)
@@ -124,11 +118,8 @@ def free_period() -> Problem:
 
 def free_start() -> Problem:
     """Nothing at either end is given: natural conditions everywhere."""
-    problem = Problem("free start")
+    problem, x, u = plant("free start", size=2, horizon=1.5)
     c = problem.parameter("c")
-    x = problem.state("x", 2)
-    u = problem.control("u")
-    problem.horizon(1.5)
     problem.dynamics(x, ca.vertcat(x[1], u - ca.sin(x[0])))
     start = problem.at_start(x)
     problem.minimize(

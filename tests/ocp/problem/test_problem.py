@@ -147,6 +147,24 @@ def test_names_of_one_problem_do_not_clash_with_those_of_another() -> None:
     assert solve(first, Collocation(3)).cost == solve(second, Collocation(3)).cost
 
 
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+@pytest.mark.parametrize("samples", [0, 1, 5])
+def test_sampled_expressions_are_those_of_every_sample_alone(samples: int, symbols: Any) -> None:
+    form = Formulation(swing(symbols))
+    rng = np.random.default_rng(samples)
+    x, u = rng.uniform(-1, 1, (samples, form.nx)), rng.uniform(-1, 1, (samples, form.nu))
+    t, lam, p = np.linspace(0.0, 2.0, samples), rng.uniform(-1, 1, (samples, form.nx)), np.array([1.0, 1.1])
+    costate, first = form.sym("lam", form.nx), np.array([0.3, -0.2, 0.1])
+    outputs = [ca.jacobian(form.f, form.u), form.running + ca.dot(costate, form.f), form.x0 * form.T]
+    found = form.sampled(outputs, x, u, t, 2.0, p, (costate, lam), (form.x0, first))
+    assert [out.shape for out in found] == [(samples, form.nx * form.nu), (samples, 1), (samples, form.nx)]
+    inputs = [form.x, form.u, form.t, form.T, form.p, costate, form.x0]
+    alone = ca.Function("alone", inputs, [ca.densify(out) for out in outputs])
+    for k in range(samples):
+        for out, expected in zip(found, alone(x[k], u[k], t[k], 2.0, p, lam[k], first), strict=True):
+            np.testing.assert_allclose(out[k], np.asarray(expected.full()).ravel(order="F"), atol=1e-14)
+
+
 # ---- what is refused -------------------------------------------------------------------------------------------
 
 Act = Callable[[], Any]
