@@ -213,7 +213,7 @@ class Solution:
         except (FileNotFoundError, ProblemError):
             raise
         except Exception as error:  # what zip, zlib, numpy and JSON say of broken bytes is of many kinds
-            raise ProblemError(f"{path} is not a saved solution: {error}") from error
+            raise ProblemError(f"{path} is not a saved solution: {error}", name="path", value=str(path)) from error
 
 
 def plain(value: Any) -> Any:

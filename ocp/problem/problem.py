@@ -149,7 +149,8 @@ class Problem:
 
     def __init__(self, name: str, symbols: Any = ca.SX) -> None:
         if symbols not in (ca.SX, ca.MX):
-            raise ProblemError(f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}")
+            words = f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
+            raise ProblemError(words, name="symbols", value=symbols)
         self.name = str(name)
         self.symbols = symbols
         self.time = symbols.sym("time")
@@ -262,7 +263,12 @@ class Problem:
         }
         for label, cost in costs.items():
             if cost.numel() != 1:
-                raise ProblemError(f"{label} cost must be a scalar, it has {cost.numel()} entries")
+                raise ProblemError(
+                    f"{label} cost must be a scalar, it has {cost.numel()} entries",
+                    name=label,
+                    value=cost.numel(),
+                    limit=1,
+                )
         self.declared.running, self.declared.terminal = costs["running"], costs["terminal"]
 
     def check(self) -> None:
@@ -311,7 +317,9 @@ class Problem:
             array = numeric(f"{what}: guess", guess)
             check_finite(f"{what}: guess", array)
             if array.size not in (1, size):
-                raise ProblemError(f"{what}: guess has {array.size} entries, {size} expected")
+                raise ProblemError(
+                    f"{what}: guess has {array.size} entries, {size} expected", value=array.size, limit=size
+                )
         return Variable(name, symbol, low, high, guess=guess)
 
     def _horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
@@ -391,7 +399,8 @@ class Problem:
         if expression.numel() == 1:
             expression = ca.repmat(expression, size, 1)
         if expression.numel() != size:
-            raise ProblemError(f"{what} has {expression.numel()} entries, {size} expected")
+            words = f"{what} has {expression.numel()} entries, {size} expected"
+            raise ProblemError(words, value=expression.numel(), limit=size)
         return ca.densify(ca.vec(expression))
 
     def _bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:

@@ -67,29 +67,28 @@ def test_horizon_is_the_optimal_one(case: Case, run: Run) -> None:
     assert abs(horizon - case.horizon) <= (1e-12 if run.time is None else run.time)
 
 
+def assert_follows(case: Case, run: Run, kind: str, limit: float | None, corners: Iterable[float] = ()) -> None:
+    """States, controls or costates follow the optimum at the reported times that stand apart from corners."""
+    solution = solved(case, run)
+    where = apart(case, run, solution, corners)
+    assert limit is not None
+    for name, expected in getattr(known(case, solution), kind).items():
+        assert largest_error(getattr(solution, f"{kind}s")[name], expected, where) < limit, name
+
+
 @every_run
 def test_states_follow_the_optimum(case: Case, run: Run) -> None:
-    solution = solved(case, run)
-    everywhere = np.ones(solution.t.shape, dtype=bool)
-    for name, expected in known(case, solution).state.items():
-        assert largest_error(solution[name], expected, everywhere) < run.state, name
+    assert_follows(case, run, "state", run.state)
 
 
 @every_run
 def test_costates_follow_the_optimum(case: Case, run: Run) -> None:
-    solution = solved(case, run)
-    where = apart(case, run, solution, case.jumps)
-    for name, expected in known(case, solution).costate.items():
-        assert largest_error(solution.costate(name), expected, where) < run.costate, name
+    assert_follows(case, run, "costate", run.costate, case.jumps)
 
 
 @runs_with_comparable_controls
 def test_controls_follow_the_optimum(case: Case, run: Run) -> None:
-    solution = solved(case, run)
-    where = apart(case, run, solution, [switch.time for switch in case.switches])
-    assert run.control is not None
-    for name, expected in known(case, solution).control.items():
-        assert largest_error(solution[name], expected, where) < run.control, name
+    assert_follows(case, run, "control", run.control, [switch.time for switch in case.switches])
 
 
 @runs_with_switching_functions

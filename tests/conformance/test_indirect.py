@@ -52,20 +52,13 @@ def test_cost_is_the_optimum_from_both_sides(case: Case) -> None:
     assert abs(solved(case).horizon - case.horizon) < TIME
 
 
+@pytest.mark.parametrize(("kind", "limit"), [("state", STATE), ("costate", COSTATE)])
 @every_case
-def test_states_follow_the_optimum_at_all_reported_times(case: Case) -> None:
+def test_states_and_costates_follow_the_optimum_at_all_reported_times(case: Case, kind: str, limit: float) -> None:
     solution = solved(case)
     everywhere = np.ones(solution.t.shape, dtype=bool)
-    for name, expected in known(case, solution).state.items():
-        assert largest_error(solution[name], expected, everywhere) < STATE * scaled(expected), name
-
-
-@every_case
-def test_costates_follow_the_optimum_at_all_reported_times(case: Case) -> None:
-    solution = solved(case)
-    everywhere = np.ones(solution.t.shape, dtype=bool)
-    for name, expected in known(case, solution).costate.items():
-        assert largest_error(solution.costate(name), expected, everywhere) < COSTATE * scaled(expected), name
+    for name, expected in getattr(known(case, solution), kind).items():
+        assert largest_error(getattr(solution, f"{kind}s")[name], expected, everywhere) < limit * scaled(expected), name
 
 
 @every_case
