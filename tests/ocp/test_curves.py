@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -98,12 +100,16 @@ def swung(t: float, x: Array) -> Array:
     return np.array([x[1], -x[0] + np.cos(2 * t)])
 
 
+def from_place(begin: float, h: float, place: float, x: Array) -> Array:
+    return swung(begin + place * h, x)
+
+
 def test_runge_kutta_steps_are_of_the_fourth_order() -> None:
     widths, errors = np.array([0.2, 0.1, 0.05]), []
     for h in widths:
         x = np.array([1.0, 0.0])
-        for k in range(round(1.0 / h)):
-            x = rk4_step(lambda place, state, k=k, h=h: swung((k + place) * h, state), x, h)
+        for begin in h * np.arange(round(1.0 / h)):
+            x = rk4_step(partial(from_place, begin, h), x, h)
         errors.append(abs(x[0] - (4 * np.cos(1.0) - np.cos(2.0)) / 3))
     assert order(widths, np.array(errors)) == pytest.approx(4.0, abs=0.2)
 
