@@ -1,8 +1,9 @@
-"""Arrays that users give: read, checked, frozen."""
+"""What users give, read and checked: arrays, numbers, and names to choose from. Arrays are frozen."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Iterable
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,29 +12,102 @@ from models.errors import ModelError
 
 Array: TypeAlias = NDArray[np.float64]
 
-
 ArrayInput: TypeAlias = Any
 
+_Choice = TypeVar("_Choice")
 
-def frozenchecked_array(array: Array) -> Array:
+
+def frozen(array: Array) -> Array:
+    """The array itself, read-only from now on."""
     array.setflags(write=False)
     return array
 
 
-def checked_array(value: ArrayInput, shape: tuple[int, ...], owner: str, what: str, finite: bool = True) -> Array:
+def checked_array(
+    value: ArrayInput,
+    shape: tuple[int | str, ...],
+    owner: str,
+    what: str,
+    *,
+    finite: bool = True,
+    nan: bool = False,
+    positive: bool = False,
+    least: int = 1,
+    unit: str = "",
+) -> Array:
     """Read-only copy of `value` as floats.
 
-    ModelError naming `owner` and `what` for a wrong shape, nan, or inf.
+    Args:
+        value: Anything that numpy reads as floats.
+        shape: A name in it stands for a free dimension of at least `least`: ("points", 3). For a shape of one free
+            dimension a bare number will do as a list of one.
+        owner, what: The thing and its argument, for messages.
+        finite: Whether inf is refused.
+        nan: Whether nan is allowed.
+        positive: Whether all entries must be above zero.
+        unit: For messages.
+
+    Raises:
+        ModelError: Something that is not numeric, a wrong shape, nan, inf, an entry that is not positive. The error's
+            `name` is `what`.
     """
+    array = _read(value, owner, what)
+    if array.ndim == 0 and len(shape) == 1 and isinstance(shape[0], str):
+        array = array.reshape(1)
+    fits = array.ndim == len(shape) and all(
+        size >= least if isinstance(wanted, str) else size == wanted
+        for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("'", "")
+        hint = f", {least} at least" if any(isinstance(wanted, str) for wanted in shape) else ""
+        message = f"{owner}: {what} has shape {array.shape}, expected {expected}{hint}"
+        raise ModelError(message, name=what, value=array, limit=shape)
+    wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
+    if wrong.any():
+        raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
+    if positive and not (array > 0).all():
+        shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
+        raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
+    return frozen(array)
+
+
+def _read(value: ArrayInput, owner: str, what: str) -> Array:
     try:
-        array = np.array(value, dtype=float)
+        return np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"{owner}: {what} {value!r} is not numeric") from error
-    if array.shape != shape:
-        raise ModelError(f"{owner}: {what} has shape {array.shape}, expected {shape}")
-    if np.isnan(array).any() or (finite and not np.isfinite(array).all()):
-        raise ModelError(f"{owner}: {what} {array.tolist()} is not finite")
-    return frozenchecked_array(array)
+        raise ModelError(f"{owner}: {what} {value!r} is not numeric", name=what, value=value) from error
+
+
+def _shown(array: Array, wrong: Any, what: str) -> str:
+    """Name and values, of a table only the first row that is wrong."""
+    if array.ndim < 2:
+        return f"{what} {array.tolist()}"
+    row = int(np.flatnonzero(wrong.reshape(len(array), -1).any(axis=1))[0])
+    return f"{what} (row {row}) {array[row].tolist()}"
+
+
+def checked_number(
+    value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
+) -> float:
+    """`value` as a float; arguments and errors as of checked_array."""
+    return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
+
+
+def one_for_each(
+    value: ArrayInput, count: int, owner: str, what: str, items: str, *, positive: bool = False, unit: str = ""
+) -> Array:
+    """`value`, one number for all `items` or one for each of the `count`, as one for each. Shape (count,).
+
+    Raises:
+        ModelError: As checked_array.
+    """
+    array = _read(value, owner, what)
+    if array.ndim and array.shape != (count,):
+        message = f"{owner}: {what} has shape {array.shape}; give one number, or one for each of the {count} {items}"
+        raise ModelError(message, name=what, value=array, limit=(count,))
+    known = checked_array(array, array.shape, owner, what, positive=positive, unit=unit)
+    return frozen(np.array(np.broadcast_to(known, (count,))))
 
 
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
@@ -41,8 +115,18 @@ def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     matrix = checked_array(value, (3, 3), owner, what)
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if error > 1e-6 or np.linalg.det(matrix) < 0:
-        raise ModelError(f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)")
+        message = f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
+        raise ModelError(message, name=what, value=matrix)
     if error > 1e-12:  # printed to few digits: take the nearest rotation
         left, _, right = np.linalg.svd(matrix)
-        matrix = frozenchecked_array(left @ right)
+        matrix = frozen(left @ right)
     return matrix
+
+
+def checked_choice(value: _Choice, choices: Iterable[Any], owner: str, what: str) -> _Choice:
+    """`value` itself; ModelError naming `owner`, `what` and the choices when it is none of them."""
+    known = tuple(choices)
+    if value not in known:
+        message = f"{owner}: {what} {value!r} is unknown; use one of {list(known)}"
+        raise ModelError(message, name=what, value=value, limit=known)
+    return value

@@ -21,6 +21,9 @@ import numpy as np
 Expression = Any
 """A casadi SX, MX or DM, whatever numpy reads as an array of floats, or a (nested) list with casadi entries."""
 
+FULL_TURN = 2 * np.pi
+"""rad."""
+
 _Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
 
@@ -129,9 +132,7 @@ def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> E
 
     Shape (3, 3).
     """
-    return ca.mtimes(
-        [rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)],
-    )
+    return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])
 
 
 def quaternion_about(axis: Expression, angle: Expression) -> Expression:

@@ -193,12 +193,12 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
     corner, tool = frames[4].position, frames[7]
     behind = tool.point((-rig.sting, 0, 0))
     return {
-        "yaw link 1": Capsule(joint2, joint3, radii.yaw),
-        "yaw link 2": Capsule(joint3, joint4, radii.yaw),
-        "yaw offset": Capsule(joint4, side, radii.yaw),
-        "pitch link": Capsule(side, corner, radii.pitch),
-        "goose-neck": Capsule(corner, behind, radii.sting),
-        "sting": Capsule(behind, tool.position, radii.sting),
+        "yaw link 1": Capsule(radii.yaw, joint2, joint3),
+        "yaw link 2": Capsule(radii.yaw, joint3, joint4),
+        "yaw offset": Capsule(radii.yaw, joint4, side),
+        "pitch link": Capsule(radii.pitch, side, corner),
+        "goose-neck": Capsule(radii.sting, corner, behind),
+        "sting": Capsule(radii.sting, behind, tool.position),
     }
 
 

@@ -9,14 +9,14 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_rotation
+from models.arrays import Array, ArrayInput, checked_number, checked_rotation
 from models.errors import ModelError
 from models.machines.support import Support
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.robot.tree import absent
 from models.robot.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
-from models.spatial import Frame
+from models.spatial import FULL_TURN, Frame
 
 RIM = 32
 """Points by which the rim of a cylinder is described: its contact is this polygon, inside the true one."""
@@ -70,8 +70,8 @@ def footprint(
         ModelError: Unknown links, links with shapes that the robot lacks, no shape but meshes or the origin of a mesh
             below them, contact points in one line, sizes that are not positive, no rotation.
     """
-    if not (np.isfinite(depth) and depth >= 0):
-        raise ModelError(f"footprint: depth {depth!r} m must be zero or positive")
+    if checked_number(depth, "footprint", "depth") < 0:
+        raise ModelError(f"footprint: depth {depth!r} m must be zero or positive", name="depth", value=depth, limit=0.0)
     known = [link.name for link in robot.links]
     for name in links or ():
         if name not in known:
@@ -87,10 +87,11 @@ def footprint(
             continue
         if name not in frames:
             if element.find("collision") is not None:
-                raise ModelError(
+                message = (
                     f"footprint: the robot has no link {name!r}, whose shapes may be the lowest; take the footprint "
                     "before the robot is simplified or cut, or name the links that touch the ground"
                 )
+                raise ModelError(message, name=name)
             continue
         turn, place = (np.array(ca.DM(part)) for part in frames[name])
         for shape in element.findall("collision"):
@@ -108,18 +109,20 @@ def footprint(
     height = float(cloud[:, 2].min())
     if meshes and min(meshes)[0] < height:
         low, name = min(meshes)
-        raise ModelError(
+        message = (
             f"footprint: the mesh of link {name!r} begins {height - low:.3g} m lower than all shapes that are read; "
             "give the support yourself, or name the links that touch the ground"
         )
+        raise ModelError(message, name=name, value=low, limit=height)
     touching = cloud[:, 2] <= height + depth
     names = tuple(dict.fromkeys(name for name, low in zip(owners, touching, strict=True) if low))
     hull = convex_hull(cloud[touching, :2])
     if len(hull) < 3:
-        raise ModelError(
+        message = (
             f"footprint: the links {list(names)} touch the ground in one point or line, on which nothing stands; "
             f"name other links, allow for more depth than {depth:g} m, or give the support yourself"
         )
+        raise ModelError(message, name="links", value=names, limit=depth)
     return Footprint(Support(hull), np.array([0.0, 0.0, -height]), upright, names)
 
 
@@ -167,7 +170,7 @@ def _corners(shape: ElementTree.Element, owner: str, world_from_link: Array) -> 
             corners = ends + radius * down
         else:
             lowest = np.arctan2(down[1], down[0])  # the rim's own lowest point is one of its corners
-            angles = lowest + 2 * np.pi * np.arange(RIM) / RIM
+            angles = lowest + FULL_TURN * np.arange(RIM) / RIM
             rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
             rim = rim[rim @ down >= (rim @ down).max() - LEVEL * radius]  # a wheel stands on its lowest line alone
             corners = (ends[:, None] + rim[None]).reshape(-1, 3)
@@ -180,5 +183,5 @@ def _corners(shape: ElementTree.Element, owner: str, world_from_link: Array) -> 
 
 def _positive(value: Any, what: str, owner: str) -> Any:
     if not (np.asarray(value) > 0).all() or not np.isfinite(value).all():
-        raise ModelError(f"{owner}: {what} {value} of a collision shape is not positive")
+        raise ModelError(f"{owner}: {what} {value} of a collision shape is not positive", name=what, value=value)
     return value

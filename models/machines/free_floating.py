@@ -11,19 +11,19 @@ the same through solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven 
 paper's planar example 177 (337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240,
 292).
 
-What a free base does when the joints move, and which robots leave that undetermined (Kim, Kim 2011, (24), (25)).
+A machine in which some motion of the base carries no momentum has no such reaction and is refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_choice
 from models.errors import ModelError
 from models.machines.machine import TWIST_SIZE, jacobian_manipulability, require_joints
 from models.robot.kinematics import (
@@ -89,16 +89,14 @@ class FreeFloating:
     conserved_momentum: ArrayInput | None = None
 
     def __post_init__(self) -> None:
-        if self.base not in ("planar", "spatial"):
-            raise ModelError(f"unknown kind of base {self.base!r}; use 'planar' or 'spatial'")
+        checked_choice(self.base, get_args(BaseKind), "free-floating machine", "base")
         require_joints(self.robot)
         if self.base == "planar":
-            require_planar(self.robot)
-        require_inertia(self.robot, self.twist_rows)
-        given = np.zeros(len(self.twist_rows)) if self.conserved_momentum is None else self.conserved_momentum
-        momentum = checked_array(
-            given, (len(self.twist_rows),), f"{self.base} free-floating base", "conserved_momentum"
-        )
+            _require_planar(self.robot)
+        _require_inertia(self.robot, self.twist_rows)
+        size = len(self.twist_rows)
+        given = np.zeros(size) if self.conserved_momentum is None else self.conserved_momentum
+        momentum = checked_array(given, (size,), f"{self.base} free-floating base", "conserved_momentum")
         object.__setattr__(self, "conserved_momentum", momentum)
 
     @property
@@ -242,7 +240,7 @@ class FreeFloating:
         """Of the generalized Jacobian, as jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
-    def _tip_motion(self, base: Expression, reaction: Reaction) -> Expression:
+    def _tip_motion(self, base: Expression, reaction: _Reaction) -> Expression:
         turn = self.world_from_base(base).rotation
         angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
         return ca.densify(ca.vertcat(angular, linear))
@@ -262,17 +260,17 @@ class FreeFloating:
         center = center_of_mass(self.robot, q, self.world_from_base(base))
         return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
-    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> Reaction:
-        """As :func:`reaction`, with the conserved momentum in the base's axes where rates are given."""
+    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> _Reaction:
+        """Of the robot, with the conserved momentum in the base's axes where rates are given."""
         carried = None
         if joint_rates is not None and self._moves_by_itself:
             turn = self.world_from_base(base).rotation
-            angular, push = (ca.mtimes(turn.T, part) for part in self._spatial_momentum())
-            carried = angular, push
-        return reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar")
+            angular, linear = self._spatial_momentum()
+            carried = ca.mtimes(turn.T, angular), ca.mtimes(turn.T, linear)
+        return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar")
 
 
-class Reaction(NamedTuple):
+class _Reaction(NamedTuple):
     """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each.
 
     The latter with what the conserved momentum adds.
@@ -284,15 +282,15 @@ class Reaction(NamedTuple):
     tip_linear: Expression
 
 
-def reaction(
+def _reaction(
     robot: Robot,
     q: Expression,
     joint_rates: Expression | None = None,
     carried: tuple[Expression, Expression] | None = None,
     *,
     planar: bool = False,
-) -> Reaction:
-    """Reaction of a base that floats to unit rate of each joint (n columns), or to given joint rates (one column).
+) -> _Reaction:
+    """_Reaction of a base that floats to unit rate of each joint (n columns), or to given joint rates (one column).
 
     Args:
         robot: The kinematic tree, its root link free.
@@ -325,27 +323,23 @@ def reaction(
     # The centre of mass moves with the carried momentum alone, which fixes the velocity of the base's origin.
     linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
     tip_linear = ca.mtimes(skew(center - tip), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
-    return Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
+    return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
 
 
-def require_planar(robot: Robot) -> None:
+def _require_planar(robot: Robot) -> None:
     """Raise ModelError for a joint that moves the robot out of the plane z = constant of its root link."""
     _, axes = frames_and_axes(robot, np.zeros(robot.dof))
     for joint in robot.moving_joints:
         angular, linear = (np.array(part).ravel() for part in axes[joint.name])
         if joint.kind == "prismatic" and abs(linear[2]) > 1e-9:
-            raise ModelError(
-                f"joint {joint.name!r} moves along {linear.tolist()} of the base link, out of the plane of "
-                "a planar base; use base='spatial'"
-            )
+            message = f"joint {joint.name!r} moves along {linear.tolist()} of the base link, out of the plane of "
+            raise ModelError(f"{message}a planar base; use base='spatial'", name=joint.name, value=linear)
         if joint.kind != "prismatic" and np.hypot(angular[0], angular[1]) > 1e-9:
-            raise ModelError(
-                f"joint {joint.name!r} turns about {angular.tolist()} of the base link, not about z as a "
-                "planar base needs; use base='spatial'"
-            )
+            message = f"joint {joint.name!r} turns about {angular.tolist()} of the base link, not about z as a "
+            raise ModelError(f"{message}planar base needs; use base='spatial'", name=joint.name, value=angular)
 
 
-def require_inertia(robot: Robot, rows: list[int]) -> None:
+def _require_inertia(robot: Robot, rows: list[int]) -> None:
     """Raise ModelError where the momentum in these rows of it does not fix the motion of the base.
 
     Whatever the units of mass and length: judged by the moments relative to each other.
@@ -364,7 +358,9 @@ def require_inertia(robot: Robot, rows: list[int]) -> None:
             return
     bare = [link.name for link in robot.links if not link.mass]
     hint = f"; the links {bare} have no mass: in URDF, no <inertial>" if bare else ""
-    raise ModelError(
-        f"the links {[link.name for link in robot.links]} have no rotational inertia about some axis, "
+    names = [link.name for link in robot.links]
+    message = (
+        f"the links {names} have no rotational inertia about some axis, "
         f"so that the momentum does not fix the motion of the base; give the base link an inertia{hint}"
     )
+    raise ModelError(message, name="robot", value=names)

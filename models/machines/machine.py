@@ -95,14 +95,16 @@ def checked_rows(rows: Sequence[int]) -> list[int]:
     except (TypeError, ValueError):
         whole = False
     if not whole:
-        raise ModelError(f"rows must be a list of the twist rows 0..5, not {rows!r}")
-    if not chosen:
-        raise ModelError("rows is empty; a task fixes at least one of the twist rows 0..5")
-    if len(set(chosen)) < len(chosen):
-        raise ModelError(f"rows {chosen} name a twist row more than once")
-    if not all(0 <= row < TWIST_SIZE for row in chosen):
-        raise ModelError(f"rows {chosen} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)")
-    return chosen
+        message = f"rows must be a list of the twist rows 0..5, not {rows!r}"
+    elif not chosen:
+        message = "rows is empty; a task fixes at least one of the twist rows 0..5"
+    elif len(set(chosen)) < len(chosen):
+        message = f"rows {chosen} name a twist row more than once"
+    elif not all(0 <= row < TWIST_SIZE for row in chosen):
+        message = f"rows {chosen} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)"
+    else:
+        return chosen
+    raise ModelError(message, name="rows", value=rows, limit=(0, TWIST_SIZE - 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +189,8 @@ def with_tip(
         ModelError: Unknown link, wrong sizes, a machine that is no such dataclass.
     """
     if not is_dataclass(machine) or "robot" not in {part.name for part in fields(machine)}:
-        raise ModelError(f"{type(machine).__name__} is no dataclass with a field 'robot': its tip cannot be moved")
+        message = f"{type(machine).__name__} is no dataclass with a field 'robot': its tip cannot be moved"
+        raise ModelError(message, name="machine", value=machine)
     turn = np.eye(3) if rotation is None else rotation
     robot = replace(machine.robot, tip=link, tip_translation=translation, tip_rotation=turn)
     return cast(Machine, replace(machine, robot=robot))
@@ -196,4 +199,5 @@ def with_tip(
 def require_joints(robot: Robot) -> None:
     """Raise ModelError when the robot has no moving joint."""
     if robot.dof == 0:
-        raise ModelError(f"the robot of the links {[link.name for link in robot.links]} has no moving joint")
+        names = [link.name for link in robot.links]
+        raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)

@@ -10,31 +10,27 @@ det of the planar Jacobian is l1 l2 sin q2: singular where the arm is stretched 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-from models.spatial import Expression, Frame, expression, rotation
+from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
 __all__ = ["Elbow", "Scara"]
 
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
-SLACK = 1e-9
+LIMIT_SLACK = 1e-9
 """Joint limits are exceeded beyond this, rad or m: rounding is not."""
-ROUNDING = 1e-12
+REACH_ROUNDING = 1e-12
 """Reaches beyond the boundary by no more than this, relative, are on it."""
-
-
-def _unbounded(value: float) -> Array:
-    return np.full(4, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +50,24 @@ class Scara:
     upper_arm: float
     forearm: float
     mount: ArrayInput = (0.0, 0.0, 0.0)
-    lower: ArrayInput = field(default_factory=lambda: _unbounded(-np.inf))
-    upper: ArrayInput = field(default_factory=lambda: _unbounded(np.inf))
+    lower: ArrayInput = (-np.inf,) * 4
+    upper: ArrayInput = (np.inf,) * 4
     names: tuple[str, str, str, str] = ("shoulder", "elbow", "quill", "wrist")
 
     def __post_init__(self) -> None:
         for what in ("upper_arm", "forearm"):
-            length = checked_array(getattr(self, what), (), "scara", what).item()
-            if length <= 0:
-                raise ModelError(f"scara: {what} {length:g} m must be positive")
+            length = checked_number(getattr(self, what), "scara", what, positive=True, unit="m")
             object.__setattr__(self, what, length)
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
         for what in ("lower", "upper"):
             object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
         if len(self.names) != 4 or len(set(self.names)) != 4:
-            raise ModelError(f"scara: joint names {list(self.names)} must be four that differ")
+            message = f"scara: joint names {list(self.names)} must be four that differ"
+            raise ModelError(message, name="names", value=self.names)
         for name, low, high in zip(self.names, self.lower, self.upper, strict=True):
             if low > high:
-                raise ModelError(f"scara: joint {name!r} has its lower limit {low:g} above its upper limit {high:g}")
+                message = f"scara: joint {name!r} has its lower limit {low:g} above its upper limit {high:g}"
+                raise ModelError(message, name=name, value=low, limit=high)
 
     @property
     def outer(self) -> float:
@@ -100,7 +96,8 @@ class Scara:
         """Frame of the tool in world. `joints` of shape (4,), casadi or numbers."""
         q = expression(joints)
         if q.numel() != 4:
-            raise ModelError(f"scara: joints have {q.numel()} entries, expected 4: {list(self.names)}")
+            message = f"scara: joints have {q.numel()} entries, expected 4: {list(self.names)}"
+            raise ModelError(message, name="joints", value=joints, limit=(4,))
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
         y = self.upper_arm * ca.sin(q[0]) + self.forearm * ca.sin(bend)
@@ -121,16 +118,18 @@ class Scara:
             ModelError: nan, a point out of reach (the message says how far), joint limits.
         """
         point = checked_array(position, (3,), "scara", "position")
-        angle = checked_array(yaw, (), "scara", "yaw").item()
+        angle = checked_number(yaw, "scara", "yaw")
         self.check_reach(float(np.hypot(*(point - self.mount)[:2])), f"point {point.tolist()} m")
         q = np.array(ca.DM(self.inverse_expression(np.append(point, angle), elbow))).ravel()
         for joint, name in enumerate(self.names):
             turn = self.whole_turn(joint, q[joint], q[joint])
             if turn is None:
-                raise ModelError(
+                limits = float(self.lower[joint]), float(self.upper[joint])
+                message = (
                     f"scara: point {point.tolist()} m needs joint {name!r} at {q[joint]:g}, outside its limits "
-                    f"{self.lower[joint]:g} .. {self.upper[joint]:g}; take the other elbow, another yaw or point"
+                    f"{limits[0]:g} .. {limits[1]:g}; take the other elbow, another yaw or point"
                 )
+                raise ModelError(message, name=name, value=float(q[joint]), limit=limits)
             q[joint] += turn
         return q
 
@@ -143,21 +142,20 @@ class Scara:
             joint: Index.
             least, most: The range, rad or m.
         """
-        low, high, full = float(self.lower[joint]), float(self.upper[joint]), 2 * np.pi
+        low, high = float(self.lower[joint]), float(self.upper[joint])
         turn = 0.0
-        if joint != QUILL and least < low - SLACK:
-            turn = full * float(np.ceil((low - SLACK - least) / full))
-        elif joint != QUILL and most > high + SLACK:
-            turn = -full * float(np.ceil((most - high - SLACK) / full))
-        return turn if low - SLACK <= least + turn and most + turn <= high + SLACK else None
+        if joint != QUILL and least < low - LIMIT_SLACK:
+            turn = FULL_TURN * float(np.ceil((low - LIMIT_SLACK - least) / FULL_TURN))
+        elif joint != QUILL and most > high + LIMIT_SLACK:
+            turn = -FULL_TURN * float(np.ceil((most - high - LIMIT_SLACK) / FULL_TURN))
+        return turn if low - LIMIT_SLACK <= least + turn and most + turn <= high + LIMIT_SLACK else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
         """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).
 
         sin q2 from the product of the distances to both ends of the reach, which keeps its digits near them.
         """
-        if elbow not in get_args(Elbow):
-            raise ModelError(f"scara: elbow {elbow!r} is unknown; use one of {list(get_args(Elbow))}")
+        checked_choice(elbow, get_args(Elbow), "scara", "elbow")
         p = expression(pose)
         x, y, z = (p[i] - float(self.mount[i]) for i in range(3))
         a, b = self.upper_arm, self.forearm
@@ -188,8 +186,9 @@ class Scara:
 
     def check_reach(self, radius: float, what: str) -> None:
         """ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
-        if not self.inner * (1 - ROUNDING) <= radius <= self.outer * (1 + ROUNDING):
-            raise ModelError(
+        if not self.inner * (1 - REACH_ROUNDING) <= radius <= self.outer * (1 + REACH_ROUNDING):
+            message = (
                 f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
                 f"{self.inner:g} to {self.outer:g} m"
             )
+            raise ModelError(message, name="radius", value=radius, limit=(self.inner, self.outer))

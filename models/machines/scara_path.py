@@ -9,19 +9,21 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput
+from models.arrays import Array, ArrayInput, checked_number
 from models.errors import ModelError
 from models.machines.scara import Elbow, Scara
 from models.paths import SmoothPath
+from models.spatial import FULL_TURN
 
 __all__ = ["JointsAlong", "ScaraPath", "scara_along"]
 
-CLEARANCE = 1e-3
+DEFAULT_CLEARANCE = 1e-3
 """m that the path keeps from both ends of the reach unless told otherwise."""
-TILT = 1e-9
-STEP = 0.3
+LARGEST_TILT = 1e-9  # of the entries x and y of a quaternion
+LARGEST_STEP = 0.3
 """Largest change (rad) of an angle between two entries of the table that tells its turn."""
-ROUNDS = 40
+MOST_REFINEMENTS = 40
+ANGLES = (0, 1, 3)  # joints that turn
 
 
 class JointsAlong(NamedTuple):
@@ -63,7 +65,9 @@ class ScaraPath:
         return JointsAlong(*values)
 
 
-def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = CLEARANCE) -> ScaraPath:
+def scara_along(
+    scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = DEFAULT_CLEARANCE
+) -> ScaraPath:
     """The arm along a path, its elbow bent one way.
 
     Args:
@@ -81,23 +85,24 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
     s = path.dense(8, 16)
     turn = path.turn(s)
     tilt = np.abs(turn.quaternion[:, 1:3]).max()
-    if tilt > TILT:
+    if tilt > LARGEST_TILT:
         at = s[int(np.abs(turn.quaternion[:, 1:3]).max(axis=1).argmax())]
-        raise ModelError(f"scara: the path tilts its tool at {at:g} m, a SCARA turns it about the vertical only")
+        message = f"scara: the path tilts its tool at {at:g} m, a SCARA turns it about the vertical only"
+        raise ModelError(message, name="path", value=float(tilt), limit=LARGEST_TILT)
 
     def raw(places: Array) -> Array:
         return np.array(rates.map(len(places))(*_poses(path, places))[0]).T
 
     q = raw(s)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_REFINEMENTS):
         change = np.diff(q, axis=0)
-        change[:, [0, 1, 3]] = _wrapped(change[:, [0, 1, 3]])
-        wide = np.flatnonzero((np.abs(change[:, [0, 1, 3]]) > STEP).any(axis=1))
+        change[:, ANGLES] = _wrapped(change[:, ANGLES])
+        wide = np.flatnonzero((np.abs(change[:, ANGLES]) > LARGEST_STEP).any(axis=1))
         if not wide.size:
             break
         middle = (s[wide] + s[wide + 1]) / 2
         s, q = np.insert(s, wide + 1, middle), np.insert(q, wide + 1, raw(middle), axis=0)
-    for joint in (0, 1, 3):
+    for joint in ANGLES:
         q[:, joint] = np.unwrap(q[:, joint])
     along = ScaraPath(scara, path, elbow, rates, (s, q), np.zeros(4))
     return replace(along, turns=_turns(along))
@@ -111,14 +116,14 @@ def _poses(path: SmoothPath, s: Array) -> list[Any]:
 
 
 def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+    return np.asarray((angle + np.pi) % FULL_TURN - np.pi)
 
 
 def _continuous(q: Array, s: Array, table_s: Array, table_q: Array) -> Array:
     """Angles of the turn that the table says."""
-    for joint in (0, 1, 3):
+    for joint in ANGLES:
         near = np.interp(s, table_s, table_q[:, joint])
-        q[:, joint] += 2 * np.pi * np.round((near - q[:, joint]) / (2 * np.pi))
+        q[:, joint] += FULL_TURN * np.round((near - q[:, joint]) / FULL_TURN)
     return q
 
 
@@ -138,17 +143,18 @@ def _turns(along: ScaraPath) -> Array:
         turn = scara.whole_turn(joint, least, most)
         if turn is None:
             at, value = max(ends, key=lambda end: max(low - end[1], end[1] - high))
-            raise ModelError(
+            message = (
                 f"scara: joint {name!r} goes from {least:g} to {most:g} along the path, at {value:g} at "
                 f"{at:g} m, outside its limits {low:g} .. {high:g}; take the other elbow or move the path"
             )
+            raise ModelError(message, name=name, value=value, limit=(low, high))
         turns[joint] = turn
     return turns
 
 
 def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
-    if not isinstance(clearance, int | float) or not (np.isfinite(clearance) and clearance >= 0):
-        raise ModelError(f"scara: clearance {clearance!r} m must not be negative")
+    if checked_number(clearance, "scara", "clearance") < 0:
+        raise ModelError(f"scara: clearance {clearance!r} m is negative", name="clearance", value=clearance, limit=0.0)
     s = path.dense(8, 32)
 
     def radius(places: Array) -> Array:
@@ -161,10 +167,11 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
         scara.check_reach(extreme, where)
         if sign * (bound - extreme) < clearance:
             what = "the singular column about the shoulder axis" if sign < 0 else "its greatest reach"
-            raise ModelError(
+            message = (
                 f"scara: {where} passes {abs(bound - extreme):.3g} m from {what}, where the {arm} arm is singular and "
                 f"joint rates grow without bound; keep {clearance:g} m away or lower the clearance"
             )
+            raise ModelError(message, name="path", value=abs(bound - extreme), limit=clearance)
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:

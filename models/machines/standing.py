@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_number
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
@@ -34,7 +34,8 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
     if external is None:
         return ()
     if not callable(external):
-        raise ModelError(f"external must be a function of time and tip position, not {external!r}")
+        message = f"external must be a function of time and tip position, not {external!r}"
+        raise ModelError(message, name="external", value=external)
     return checked_wrenches(external(time, tip))
 
 
@@ -86,18 +87,16 @@ class Standing(FixedBase):
         super().__post_init__()
         owner = "standing machine"
         if not isinstance(self.support, Support):
-            raise ModelError(f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}")
+            message = f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}"
+            raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
             raise massless("nothing presses its foot on the ground")
-        gravity = checked_array(self.gravity, (), owner, "gravity").item()
-        if gravity <= 0:
-            raise ModelError(f"{owner}: gravity {gravity} m/s^2 is not positive; nothing would hold the foot down")
+        gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")
         object.__setattr__(self, "gravity", gravity)
         for what, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
             value = default if getattr(self, what) is None else getattr(self, what)
-            object.__setattr__(self, what, checked_array(value, (2,), owner, what))
-        if not (self.half_widths > 0).all():
-            raise ModelError(f"{owner}: half_widths {self.half_widths.tolist()} m are not positive")
+            value = checked_array(value, (2,), owner, what, positive=what == "half_widths", unit="m")
+            object.__setattr__(self, what, value)
 
     @property
     def weight(self) -> float:

@@ -10,12 +10,11 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
-from models.errors import ModelError
 from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
 from models.robot.indices import joint_excess, joint_limit_index
 from models.robot.kinematics import center_of_mass
 
-SLACK = 1e-9
+ROUNDING_SLACK = 1e-9
 """How far beyond a limit rounding may carry a motion that stands exactly at it; m, rad, N."""
 
 
@@ -71,12 +70,12 @@ class StandingMotion:
     @property
     def stays_in_foot(self) -> bool:
         """Whether the zero moment point never leaves the support."""
-        return bool((self.foot_margin >= -SLACK).all())
+        return bool((self.foot_margin >= -ROUNDING_SLACK).all())
 
     @property
     def stays_in_limits(self) -> bool:
         """Whether every joint stays within its position limits."""
-        return bool((self.joint_excess <= SLACK).all())
+        return bool((self.joint_excess <= ROUNDING_SLACK).all())
 
     @property
     def stands(self) -> bool:
@@ -110,9 +109,9 @@ class StandingMotion:
         lines = [f"Motion of {self.t[-1]:g} s: {'stands' if self.stands else 'DOES NOT STAND'}"]
         for what, values, wrong in (
             ("vertical ground force, N", self.ground_force[:, 2], ~(self.ground_force[:, 2] > 0)),
-            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -SLACK)),
+            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING_SLACK)),
             ("stability index", self.index.min(axis=1), np.zeros(len(self.t), dtype=bool)),
-            ("room to the joint limits", -self.joint_excess, ~(self.joint_excess <= SLACK)),
+            ("room to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING_SLACK)),
         ):
             k = int(np.argmin(values))
             verdict = f", wrong from {self.t[wrong][0]:.4g} s on" if wrong.any() else ""
@@ -159,15 +158,10 @@ def standing_motion(
     Raises:
         ModelError: No times, shapes that do not match, nan.
     """
-    count = np.size(t)
-    if count == 0:
-        raise ModelError("motion: there are no times")
-    times = checked_array(np.ravel(t), (count,), "motion", "t")
-    names = ("joints", "joint_velocities", "joint_accelerations")
-    parts = [
-        np.asarray(checked_array(part, (count, machine.joint_size), "motion", name, finite=False))
-        for name, part in zip(names, (joints, joint_velocities, joint_accelerations), strict=True)
-    ]
+    times = checked_array(t, ("times",), "motion", "t")
+    given = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
+    shape = (len(times), machine.joint_size)
+    parts = [checked_array(part, shape, "motion", name, finite=False) for name, part in given.items()]
     found = evaluate(motion_function(machine, external, rows), times, *parts)
     return StandingMotion(times, *parts, **found)
 

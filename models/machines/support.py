@@ -9,7 +9,7 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, frozen
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
 from models.spatial import Expression
@@ -33,37 +33,35 @@ class Support:
     vertices: ArrayInput
 
     def __post_init__(self) -> None:
-        try:
-            count = np.shape(self.vertices)[0] if np.ndim(self.vertices) == 2 else 0
-        except ValueError:  # points of different sizes
-            count = 0
-        if count < 3:
-            raise ModelError(f"support: vertices must be at least three points (k, 2), not {self.vertices!r}")
-        corners = np.array(checked_array(self.vertices, (count, 2), "support", "vertices"))
+        corners: Array = checked_array(self.vertices, ("corners", 2), "support", "vertices", least=3, unit="m")
         size = float(np.ptp(corners, axis=0).max())
         area = _area(corners)
         if abs(area) <= FLAT * size**2:
-            raise ModelError(f"support: the polygon {corners.tolist()} has no area; give corners that are not in line")
+            message = f"support: the polygon {corners.tolist()} has no area; give corners that are not in line"
+            raise ModelError(message, name="vertices", value=corners)
         if area < 0:
             corners = corners[::-1]
         edges = np.roll(corners, -1, axis=0) - corners
         lengths = np.linalg.norm(edges, axis=1)
         if lengths.min() <= FLAT * size:
             twice = corners[lengths.argmin()].tolist()
-            raise ModelError(f"support: corner {twice} occurs twice in a row; give it once")
+            raise ModelError(
+                f"support: corner {twice} occurs twice in a row; give it once", name="vertices", value=twice
+            )
         ahead = np.roll(edges, -1, axis=0)
         turns = np.arctan2(_cross(edges, ahead), (edges * ahead).sum(axis=1))
         worst = int(turns.argmin())
         if turns[worst] < -FLAT:
             corner = np.roll(corners, -1, axis=0)[worst]
-            raise ModelError(
+            message = (
                 f"support: the polygon {corners.tolist()} is not convex at {corner.tolist()}; "
                 "the ground carries a foot on the convex hull of its contact points: give that"
             )
+            raise ModelError(message, name="vertices", value=corner)
         if turns.sum() > 3 * np.pi:
-            raise ModelError(f"support: the polygon {corners.tolist()} crosses itself; give its corners in order")
-        kept = np.roll(turns, 1) > FLAT
-        object.__setattr__(self, "vertices", checked_array(corners[kept], (int(kept.sum()), 2), "support", "vertices"))
+            message = f"support: the polygon {corners.tolist()} crosses itself; give its corners in order"
+            raise ModelError(message, name="vertices", value=corners)
+        object.__setattr__(self, "vertices", frozen(corners[np.roll(turns, 1) > FLAT]))
 
     @property
     def area(self) -> float:
@@ -123,7 +121,8 @@ def rectangle(x: ArrayInput, y: ArrayInput) -> Support:
     x, y = checked_array(x, (2,), "rectangle", "x"), checked_array(y, (2,), "rectangle", "y")
     for what, (least, greatest) in (("x", x), ("y", y)):
         if not least < greatest:
-            raise ModelError(f"rectangle: {what} from {least:g} to {greatest:g} m has no length; least first")
+            message = f"rectangle: {what} from {least:g} to {greatest:g} m has no length; least first"
+            raise ModelError(message, name=what, value=(least, greatest))
     return Support([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
 
 

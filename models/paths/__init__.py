@@ -1,6 +1,6 @@
 """Task paths: lines and arcs with tool orientation, rounded at their corners, as functions of the distance."""
 
-from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature
+from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
 from models.paths.path import Path
 from models.paths.rounding import smooth
@@ -24,6 +24,7 @@ __all__ = [
     "path_function",
     "peak_curvature",
     "predictor_corrector",
+    "rest_to_rest",
     "smooth",
     "turn_function",
 ]

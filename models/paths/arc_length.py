@@ -23,7 +23,7 @@ ACCURACY = 1e-13
 """Largest disagreement of the rule on a cell and on its halves, relative to the length of the cell's curve."""
 STEEPEST = 3.0
 """Largest slope du/ds at a cell's ends over its mean: up to it the cubic between them is monotone."""
-DEEPEST = 40
+MOST_HALVINGS = 40
 NEWTON_STEPS = 4
 
 
@@ -84,7 +84,7 @@ def cells(coefficients: Array) -> Cells:
     whole = _lengths(slopes, start, width)
     scale = whole.copy()
     done: list[tuple[NDArray[np.intp], Array, Array, Array]] = []
-    for _ in range(DEEPEST):
+    for _ in range(MOST_HALVINGS):
         if not curve.size:
             break
         half = width / 2
@@ -100,10 +100,9 @@ def cells(coefficients: Array) -> Cells:
         start = np.stack([start[rough], start[rough] + half[rough]], axis=1).ravel()
         whole = np.stack([left[rough], right[rough]], axis=1).ravel()
     else:
-        raise ModelError(
-            f"the blend at vertex {int(curve[0]) + 1} stops at u = {start[0]:.6g}, a cusp; "
-            "take a smaller shape factor or remaining distance"
-        )
+        name = f"vertex {int(curve[0]) + 1}"
+        message = f"the blend at {name} stops at u = {start[0]:.6g}, a cusp"
+        raise ModelError(f"{message}; take a smaller shape factor or remaining distance", name=name, value=start[0])
     found = [np.concatenate(parts) for parts in zip(*done, strict=True)] if done else [np.zeros(0)] * 4
     order = np.lexsort((found[1], found[0]))
     return Cells(found[0][order].astype(np.intp), found[1][order], found[2][order], found[3][order])

@@ -14,8 +14,9 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models.arrays import Array
+from models.arrays import Array, ArrayInput, checked_choice, checked_number, one_for_each
 from models.errors import ModelError
+from models.spatial import Expression
 
 __all__ = [
     "DEFAULT_SHAPE",
@@ -29,6 +30,7 @@ __all__ = [
     "peak_curvature",
     "polynomial",
     "quintic",
+    "rest_to_rest",
 ]
 
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
@@ -43,31 +45,33 @@ MIDDLE: dict[str, tuple[float, float, float, float]] = {
 }
 
 
-def checked_kind(kind: str) -> str:
-    """`kind`; ModelError when there is no such blend."""
-    if kind not in get_args(BlendKind):
-        raise ModelError(f"blend kind {kind!r} is unknown; use one of {list(get_args(BlendKind))}")
-    return kind
+def checked_shape(shape: ArrayInput | None, kind: str, count: int = 1) -> Array:
+    """Shape factors of some vertices, one or one for each given; None takes that of the kind (cubic 3, quintic 1.5).
 
-
-def checked_shape(shape: float | Array | None, kind: str) -> Array:
-    """Shape factors as an array; the default of the kind (cubic 3, quintic 1.5) for None.
+    Shape (count,).
 
     Raises:
         ModelError: A factor that is not above zero and below that of the cusp (cubic 6, quintic 30/7), an unknown kind.
     """
-    checked_kind(kind)
-    try:
-        factors = np.asarray(DEFAULT_SHAPE[kind] if shape is None else shape, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"shape factor {shape!r} is not numeric") from error
-    wrong = ~((factors > 0) & (factors < LARGEST_SHAPE[kind]))
-    if wrong.any():
-        raise ModelError(
-            f"shape factor {float(factors[wrong][0]):g} of a {kind} blend must be above 0 and below "
-            f"{LARGEST_SHAPE[kind]:.6g}, where the curve has a cusp"
-        )
+    checked_choice(kind, get_args(BlendKind), "blend", "kind")
+    given = DEFAULT_SHAPE[kind] if shape is None else shape
+    factors, cusp = (
+        one_for_each(given, count, f"{kind} blend", "shape factor", "vertices", positive=True),
+        LARGEST_SHAPE[kind],
+    )
+    if (factors >= cusp).any():
+        worst = float(factors.max())
+        message = f"shape factor {worst:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"
+        raise ModelError(message, name="shape", value=worst, limit=cusp)
     return factors
+
+
+def rest_to_rest(s: Expression) -> Expression:
+    """Share of a way after the share s of its time, from rest to rest: 10 s^3 - 15 s^4 + 6 s^5, s in [0, 1].
+
+    The polynomial of least degree whose speed and acceleration are zero at both ends. Numbers, arrays and expressions.
+    """
+    return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
@@ -115,14 +119,14 @@ def _falling(order: int) -> list[float]:
 
 
 def _check_corner(shape: float, angle: float, remaining: float = 1.0) -> None:
-    for name, value, least, most in (
-        ("shape factor", shape, 0.0, np.inf),
-        ("angle", angle, 0.0, np.pi),
-        ("remaining distance", remaining, 0.0, np.inf),
-    ):
-        number = isinstance(value, int | float | np.integer | np.floating)
-        if not (number and least < value <= most and np.isfinite(value)):
-            raise ModelError(f"{name} {value!r} of a corner must be above 0 and at most {most:.6g}")
+    for what, value in (("shape factor", shape), ("angle", angle), ("remaining distance", remaining)):
+        checked_number(value, "corner", what, positive=True)
+    if angle > np.pi:
+        raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
+
+
+def _middle(kind: str) -> tuple[float, float, float, float]:
+    return MIDDLE[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
@@ -132,7 +136,7 @@ def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
     which is the nearest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
     _check_corner(shape, angle)
-    a = MIDDLE[checked_kind(kind)][0]
+    a = _middle(kind)[0]
     return float(abs(1 - 2 * a * shape) * np.cos(angle / 2))
 
 
@@ -149,7 +153,7 @@ def middle_curvature(shape: float, angle: float, remaining: float, kind: str = "
     shape 3; a flatter shape bends more at its ends, see `peak_curvature`.
     """
     _check_corner(shape, angle, remaining)
-    _, b, c, d = MIDDLE[checked_kind(kind)]
+    _, b, c, d = _middle(kind)
     half = angle / 2
     return float(d * shape * np.cos(half) / (2 * (b - c * shape) ** 2 * np.sin(half) ** 2 * remaining))
 
@@ -164,7 +168,7 @@ def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cu
     n1, n2 = np.array([1.0, 0.0, 0.0]), np.array([-np.cos(angle), np.sin(angle), 0.0])
     rate, zero = shape * remaining, np.zeros(3)
     start, end = -remaining * n1, remaining * n2
-    if checked_kind(kind) == "cubic":
+    if kind == "cubic":
         curve = cubic(start, rate * n1, end, rate * n2)
     else:
         curve = quintic(start, rate * n1, zero, end, rate * n2, zero)

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_choice
 from models.errors import ModelError
 from models.paths.arc_length import NEWTON_STEPS, NODES, WEIGHTS, speed
 from models.paths.orientation import orientation_function
@@ -80,11 +80,9 @@ def _in_cell() -> Any:
     ]
 
     u = ca.SX.sym("u")
-    derivative = [coefficients]
-    for _ in range(3):
-        last = derivative[-1]
-        derivative.append(ca.horzcat(*[j * last[:, j] for j in range(1, last.shape[1])]))
-    first, second, third = (_horner(c, u) for c in derivative[1:])
+    slopes = _derivative(coefficients)
+    bends = _derivative(slopes)
+    first, second, third = (_horner(columns, u) for columns in (slopes, bends, _derivative(bends)))
     rate = ca.norm_2(first)
     rate_of = ca.Function("rate", [row, u], [rate])
     x = distance / length
@@ -102,6 +100,11 @@ def _in_cell() -> Any:
     on_blend = curve(row, at)
     outputs = [ca.if_else(curved, b, a) for a, b in zip(on_segment, on_blend, strict=True)]
     return ca.Function("in_cell", [row, s], ca.cse(outputs))
+
+
+def _derivative(columns: Any) -> Any:
+    """Coefficients of the derivative, one column less."""
+    return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
 
 
 def _horner(columns: Any, u: Any) -> Any:
@@ -178,7 +181,8 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = QUADRATURE_NODES) -> 
     """
     state, coefficients, steps, rate = _symbols(degree)
     if not nodes or not all(isinstance(n, int) and n > 0 for n in nodes):
-        raise ModelError(f"quadrature nodes {nodes!r} must be positive whole numbers, one for each Newton step")
+        message = f"quadrature nodes {nodes!r} must be positive whole numbers, one for each Newton step"
+        raise ModelError(message, name="nodes", value=nodes)
     u, step = state[1], steps[1]
     guess = _predicted(state, steps, rate(u))
     for number in nodes:
@@ -201,13 +205,11 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
     Raises:
         ModelError: Wrong shapes, nan, distances that do not increase from 0.
     """
-    try:
-        places = np.asarray(distances, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"distances {distances!r} are not numeric") from error
-    given = np.diff(np.atleast_1d(places), prepend=0.0)
-    if places.ndim != 1 or not (np.isfinite(places).all() and (given >= 0).all()):
-        raise ModelError(f"distances of shape {places.shape} must be finite and increase from 0, in one row")
+    places = checked_array(distances, ("samples",), "march", "distances", least=0)
+    given = np.diff(places, prepend=0.0)
+    if (given < 0).any():
+        worst = float(places[int((given < 0).argmax())])
+        raise ModelError(f"march: distances must increase from 0, not to {worst:g} m", name="distances", value=worst)
     curve = checked_array(coefficients, (6, 3), "blend", "coefficients")
     if not places.size:
         return places
@@ -219,23 +221,12 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
-    if degree not in (3, 5):
-        raise ModelError(f"degree {degree} of a blend is unknown; use 3 (cubic) or 5 (quintic)")
-    state, coefficients, steps = (
-        ca.SX.sym("state", 2),
-        ca.SX.sym("coefficients", 3 * (degree + 1)),
-        ca.SX.sym("steps", 2),
-    )
+    checked_choice(degree, (3, 5), "blend", "degree")  # cubic, quintic
+    sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
+    state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
     columns = ca.reshape(coefficients, 3, degree + 1)
-    derivative = [k * columns[:, k] for k in range(1, degree + 1)]
-
-    def rate(u: Any) -> Any:
-        value = derivative[-1]
-        for term in reversed(derivative[:-1]):
-            value = term + u * value
-        return ca.norm_2(value)
-
-    return state, coefficients, steps, rate
+    derivative = _derivative(columns)
+    return state, coefficients, steps, lambda u: ca.norm_2(_horner(derivative, u))
 
 
 def _predicted(state: Any, steps: Any, rate: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, frozen
 from models.errors import ModelError
 from models.paths.blends import polynomial
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
@@ -23,7 +23,7 @@ __all__ = ["along_piece", "exponential", "orientation_function", "rotation_vecto
 
 LARGEST_TURN = np.pi - 1e-3
 """Two orientations further apart (rad) have no shorter way between them that one would guess."""
-TERMS = 18
+SERIES_TERMS = 18
 
 
 def unit_quaternion(value: ArrayInput, what: str) -> Array:
@@ -31,8 +31,9 @@ def unit_quaternion(value: ArrayInput, what: str) -> Array:
     quaternion = checked_array(value, (4,), what, "quaternion")
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-6:
-        raise ModelError(f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion")
-    return checked_array(quaternion / norm, (4,), what, "quaternion")
+        message = f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"
+        raise ModelError(message, name=what, value=quaternion, limit=1.0)
+    return frozen(quaternion / norm)
 
 
 def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
@@ -49,10 +50,11 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
     norm = float(np.linalg.norm(vector))
     angle = 2 * float(np.arctan2(norm, scalar))
     if angle > LARGEST_TURN:
-        raise ModelError(
+        message = (
             f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, whose sense is ambiguous; "
             "split the segment"
         )
+        raise ModelError(message, name=owner, value=angle, limit=LARGEST_TURN)
     return np.asarray(vector * (angle / norm if norm > 0 else 2.0))
 
 
@@ -64,7 +66,7 @@ def exponential(vector: Any) -> Any:
     square = ca.dot(vector, vector) / 4
     cosine: Any = 0
     sinc: Any = 0
-    for k in reversed(range(TERMS)):
+    for k in reversed(range(SERIES_TERMS)):
         cosine = (-1) ** k / factorial(2 * k) + square * cosine
         sinc = (-1) ** k / factorial(2 * k + 1) + square * sinc
     return ca.vertcat(cosine, sinc / 2 * vector)
@@ -118,7 +120,7 @@ def _dot(a: Array, b: Array) -> Array:
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
     # sum of (-x)^k / (2 k + start)! and its two derivatives by x
     value, first, second = (np.zeros_like(square) for _ in range(3))
-    for k in reversed(range(TERMS)):
+    for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first
         first = first * square + value
         value = value * square + (-1) ** k / factorial(2 * k + start)

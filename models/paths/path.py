@@ -53,22 +53,18 @@ class Path:
         try:
             segments = tuple(self.segments)
         except TypeError as error:
-            raise ModelError(f"the path {self.segments!r} is no sequence of segments") from error
+            message = f"the path {self.segments!r} is no sequence of segments"
+            raise ModelError(message, name="segments", value=self.segments) from error
         if not segments:
-            raise ModelError("the path has no segment; give at least one Line or Arc")
+            raise ModelError("the path has no segment; give at least one Line or Arc", name="segments", value=())
         for i, segment in enumerate(segments):
             if not isinstance(segment, Line | Arc):
-                raise ModelError(f"segment {i} is {segment!r}; a path is made of Line and Arc")
-        values: dict[str, Any] = {
-            "segments": segments,
-            "lengths": np.array([segment.length for segment in segments]),
-            "start": np.array([segment.start for segment in segments]),
-            "tangent": np.array([segment.tangent for segment in segments]),
-            "normal": np.array([segment.normal for segment in segments]),
-            "curvature": np.array([segment.curvature for segment in segments]),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+                message = f"segment {i} is {segment!r}; a path is made of Line and Arc"
+                raise ModelError(message, name=f"segment {i}", value=segment)
+        object.__setattr__(self, "segments", segments)
+        object.__setattr__(self, "lengths", np.array([segment.length for segment in segments]))
+        for name in ("start", "tangent", "normal", "curvature"):
+            object.__setattr__(self, name, np.array([getattr(segment, name) for segment in segments]))
         self._check_gaps()
         self._set_orientations()
         self._check_corners()
@@ -81,12 +77,7 @@ class Path:
             points: In world, at least two. Shape (n, 3), m.
             orientations: At the points, unit quaternions; none turns if None. Shape (n, 4).
         """
-        try:
-            corners = np.array(points, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise ModelError(f"path: points {points!r} are not numeric") from error
-        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2:
-            raise ModelError(f"path: points have the shape {corners.shape}; give at least two, of shape (n, 3)")
+        corners = checked_array(points, ("points", 3), "path", "points", least=2)
         if orientations is None:
             return cls(tuple(Line(a, b) for a, b in pairwise(corners)))
         turns = checked_array(orientations, (len(corners), 4), "path", "orientations")
@@ -129,19 +120,21 @@ class Path:
         gaps = np.linalg.norm(ends[:-1] - self.start[1:], axis=1)
         if gaps.size and gaps.max() > LARGEST_GAP:
             i = int(gaps.argmax())
-            raise ModelError(
+            message = (
                 f"segment {i} ends at {ends[i].tolist()} m, segment {i + 1} starts at {self.start[i + 1].tolist()} m: "
                 f"a gap of {gaps[i]:.3g} m; join them by a Line"
             )
+            raise ModelError(message, name=f"segment {i}", value=float(gaps[i]), limit=LARGEST_GAP)
 
     def _check_corners(self) -> None:
         angles = self.corner_angles()
         if angles.size and angles.min() < SMALLEST_ANGLE:
             i = int(angles.argmin())
-            raise ModelError(
+            message = (
                 f"at vertex {i + 1}, {self.start[i + 1].tolist()} m, the path turns by 180 deg (interior angle "
                 f"{np.degrees(angles[i]):.3g} deg): nothing smooth rounds a reversal; make two paths, or give it width"
             )
+            raise ModelError(message, name=f"vertex {i + 1}", value=float(angles[i]), limit=SMALLEST_ANGLE)
 
     def _set_orientations(self) -> None:
         current = NO_ROTATION
@@ -151,10 +144,11 @@ class Path:
             if i and begin is not current:
                 gap = float(np.linalg.norm(rotation_vector(current, begin, f"vertex {i}")))
                 if gap > LARGEST_GAP:
-                    raise ModelError(
+                    message = (
                         f"at vertex {i} the tool orientation jumps by {np.degrees(gap):.4g} deg, from "
                         f"{current.tolist()} to {begin.tolist()}; turn it along a segment"
                     )
+                    raise ModelError(message, name=f"vertex {i}", value=gap, limit=LARGEST_GAP)
             if begin @ current < 0 and i:
                 begin = -begin  # the same orientation: the sign goes on from segment to segment
             starts.append(begin)

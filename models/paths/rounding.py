@@ -1,7 +1,4 @@
-"""How large each blend of a path is: distances given, computed from a tolerance, and kept from overlapping.
-
-Rounding every corner of a path.
-"""
+"""Rounding every corner of a path: how large each blend is, by distances given or by a tolerance, without overlaps."""
 
 from __future__ import annotations
 
@@ -10,20 +7,23 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput
+from models.arrays import Array, ArrayInput, checked_choice, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import cells
-from models.paths.blends import BlendKind, checked_kind, checked_shape, cubic, gamma, polynomial, quintic
+from models.paths.blends import BlendKind, checked_shape, cubic, gamma, polynomial, quintic
 from models.paths.path import Path
 from models.paths.smooth_path import SmoothPath
+from models.spatial import FULL_TURN
 
 __all__ = ["Overlap", "blend_coefficients", "deviations", "remaining_distances", "smooth"]
 
 Overlap: TypeAlias = Literal["shrink", "refuse"]
-SAMPLES, FINER = 33, 33
-SLACK = 1e-3
+SAMPLES, FINER = 33, 33  # of a blend whose deviation is looked for, and of the neighbourhood of the extreme
+KEPT_BACK = 1e-3
 """Share of the tolerance kept back for what lies between the samples of a deviation."""
-TRIALS, SHRINKS = 60, 30
+MOST_TRIALS, MOST_SHRINKS = 60, 30
+SHORTEST_PIECE = 1e-12
+"""Rests of a segment between two blends shorter than this, over the segment, are dropped."""
 
 
 def blend_coefficients(
@@ -48,21 +48,21 @@ def remaining_distances(
     overlap: Overlap,
 ) -> Array:
     """Remaining distance of each vertex, checked. Shape (n - 1,), m. Arguments as of `models.paths.smooth_path`."""
-    if overlap not in get_args(Overlap):
-        raise ModelError(f"overlap {overlap!r} is unknown; use one of {list(get_args(Overlap))}")
+    checked_choice(overlap, get_args(Overlap), "path", "overlap")
     if (remaining is None) == (deviation is None):
         raise ModelError("give either the remaining distance or the deviation, not both and not neither")
+    count = len(path.segments) - 1
     if remaining is not None:
-        wanted = _per_vertex(path, remaining, "remaining")
+        wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
         return _without_overlap(path, wanted, overlap)
-    tolerance = _per_vertex(path, deviation, "deviation")
+    tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
     # never longer than a segment, so that every trial is a curve that exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
     found = _without_overlap(path, _from_deviation(path, tolerance, kind, shape, longest), overlap)
     # next to an arc the vertex need not be the farthest point, nor a smaller blend the nearer one
     bent = np.flatnonzero((path.curvature[:-1] > 0) | (path.curvature[1:] > 0))
-    aim = tolerance * (1 - SLACK)
-    for _ in range(SHRINKS):
+    aim = tolerance * (1 - KEPT_BACK)
+    for _ in range(MOST_SHRINKS):
         strayed = np.maximum(
             _from_blend(path, found[bent], kind, shape[bent], bent),
             deviations(path, found[bent], kind, shape[bent], bent)[1],
@@ -71,23 +71,9 @@ def remaining_distances(
         bent, over = bent[over > 1], over[over > 1]
         if not bent.size:
             break
-        aim[bent] *= (1 - SLACK) / over
+        aim[bent] *= (1 - KEPT_BACK) / over
         found[bent] = _fitted(path, aim[bent], kind, shape[bent], found[bent], bent)
     return found
-
-
-def _per_vertex(path: Path, value: ArrayInput, what: str) -> Array:
-    count = len(path.segments) - 1
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{what} {value!r} is not numeric") from error
-    if array.ndim and array.shape != (count,):
-        raise ModelError(f"{what} has shape {array.shape}; give one number, or one for each of the {count} vertices")
-    wrong = ~(np.isfinite(array) & (array > 0))
-    if wrong.any():
-        raise ModelError(f"{what} {float(array[wrong].flat[0]):g} m must be positive and finite")
-    return np.broadcast_to(array, (count,)).copy()
 
 
 def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
@@ -101,7 +87,10 @@ def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
         i = int(factor.argmin())
         raise ModelError(
             f"segment {i}, {path.lengths[i]:g} m long, has no room for the blends at its ends, which take "
-            f"{demand[i]:g} m; take a smaller remaining distance or overlap='shrink'"
+            f"{demand[i]:g} m; take a smaller remaining distance or overlap='shrink'",
+            name=f"segment {i}",
+            value=float(demand[i]),
+            limit=float(path.lengths[i]),
         )
     return np.asarray(wanted * np.minimum(factor[:-1], factor[1:]))
 
@@ -113,32 +102,32 @@ def _from_deviation(path: Path, tolerance: Array, kind: BlendKind, shape: Array,
     # between two lines the deviation is proportional to the remaining distance: one trial tells the ratio
     lines = np.flatnonzero(straight)
     if lines.size:
-        legs = deviations(path, longest[lines], kind, shape[lines], lines)[1] / longest[lines] * (1 + SLACK)
+        legs = deviations(path, longest[lines], kind, shape[lines], lines)[1] / longest[lines] * (1 + KEPT_BACK)
         corner = np.array([gamma(s, a, kind) for s, a in zip(shape[lines], angles[lines], strict=True)])
         ratio = np.maximum(corner, legs)
         with np.errstate(divide="ignore"):
             found[lines] = np.minimum(longest[lines], tolerance[lines] / ratio)
     arcs = np.flatnonzero(~straight)
     if arcs.size:
-        found[arcs] = _fitted(path, tolerance[arcs] * (1 - SLACK), kind, shape[arcs], longest[arcs], arcs)
+        found[arcs] = _fitted(path, tolerance[arcs] * (1 - KEPT_BACK), kind, shape[arcs], longest[arcs], arcs)
     return found
 
 
 def _fitted(
     path: Path, tolerance: Array, kind: BlendKind, shape: Array, longest: Array, vertices: NDArray[np.intp]
 ) -> Array:
-    """Remaining distances, at most `longest`, whose deviation is the tolerance to `SLACK`, or less at the longest."""
+    """Remaining distances, at most `longest`, whose deviation is the tolerance to KEPT_BACK, or less at the longest."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
-    for number in range(TRIALS):
+    for number in range(MOST_TRIALS):
         found = np.maximum(*deviations(path, trial[todo], kind, shape[todo], vertices[todo]))
         ratio = found / tolerance[todo]
         fits = ratio <= 1
         low[todo] = np.where(fits, trial[todo], low[todo])
         high[todo] = np.where(fits, high[todo], trial[todo])
-        going = (~fits | (ratio < 1 - SLACK)) & (trial[todo] < longest[todo]) | ~fits
+        going = (~fits | (ratio < 1 - KEPT_BACK)) & (trial[todo] < longest[todo]) | ~fits
         # nearly proportional; halving where that leads out of the bracket, or does not settle
-        aim = trial[todo] * (1 - SLACK / 2) / np.maximum(ratio, 1e-12)
+        aim = trial[todo] * (1 - KEPT_BACK / 2) / np.maximum(ratio, 1e-12)
         inside = (aim > low[todo]) & (aim < high[todo]) & (number % 4 != 3)
         trial[todo] = np.where(inside, aim, (low[todo] + high[todo]) / 2)
         todo = todo[going]
@@ -146,7 +135,8 @@ def _fitted(
             break
     if (low <= 0).any():
         i = int(vertices[int((low <= 0).argmax())])
-        raise ModelError(f"vertex {i + 1}: no blend stays within the deviation; take a larger one")
+        message = f"vertex {i + 1}: no blend stays within the deviation; take a larger one"
+        raise ModelError(message, name=f"vertex {i + 1}", limit=float(tolerance[int((low <= 0).argmax())]))
     return low
 
 
@@ -179,10 +169,7 @@ def deviations(
     closest = np.linalg.norm(about(corner.argmin(axis=1)) - tip, axis=-1)
     # there is a kink where the other segment gets nearer
     farthest = _from_segments(path, vertices, about(near.argmax(axis=1)), remaining)
-    return (
-        np.minimum(corner.min(axis=1), closest.min(axis=1)),
-        np.maximum(near.max(axis=1), farthest.max(axis=1)),
-    )
+    return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(near.max(axis=1), farthest.max(axis=1)))
 
 
 def _from_blend(
@@ -241,10 +228,6 @@ def _distance(path: Path, index: NDArray[np.intp], points: Array, first: Array, 
     return np.asarray(np.sqrt(np.einsum("vsi,vsi->vs", offset, offset)))
 
 
-SHORTEST_PIECE = 1e-12
-"""Rests of a segment between two blends shorter than this, over the segment, are dropped."""
-
-
 def smooth(
     path: Path,
     remaining: ArrayInput | None = None,
@@ -271,11 +254,7 @@ def smooth(
     Raises:
         ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
     """
-    checked_kind(kind)
-    factors, count = checked_shape(shape, kind), len(path.segments) - 1
-    if factors.ndim and factors.shape != (count,):
-        raise ModelError(f"shape has shape {factors.shape}; give one number, or one for each of the {count} vertices")
-    factors = np.broadcast_to(factors, (count,))
+    factors = checked_shape(shape, kind, len(path.segments) - 1)
     distances = remaining_distances(path, remaining, deviation, kind, factors, overlap)
     coefficients = blend_coefficients(path, distances, kind, factors)
     curve_cells = cells(coefficients)
@@ -298,12 +277,13 @@ def smooth(
 def _check_turns(smoothed: SmoothPath) -> None:
     theta = smoothed.charts[1]
     largest = np.linalg.norm(theta, axis=2).sum(axis=1)  # bounds |theta| over the whole piece
-    if largest.max() > 2 * np.pi:
-        bounds = smoothed.bounds[:-1][largest > 2 * np.pi]
+    if largest.max() > FULL_TURN:
+        bounds = smoothed.bounds[:-1][largest > FULL_TURN]
         u = np.linspace(0, 1, 33)[:, None] ** np.arange(6)
-        angle = np.linalg.norm(np.einsum("uk,pkc->puc", u, theta[largest > 2 * np.pi]), axis=2).max(axis=1)
-        if angle.max() > 2 * np.pi:
-            raise ModelError(
+        angle = np.linalg.norm(np.einsum("uk,pkc->puc", u, theta[largest > FULL_TURN]), axis=2).max(axis=1)
+        if angle.max() > FULL_TURN:
+            message = (
                 f"the tool turns by {np.degrees(angle.max()):.4g} deg in the blend at "
                 f"{bounds[int(angle.argmax())]:g} m; turn less or take a smaller remaining distance"
             )
+            raise ModelError(message, name="orientation", value=float(angle.max()), limit=FULL_TURN)

@@ -12,13 +12,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_number
 from models.errors import ModelError
 from models.paths.orientation import rotation_vector, unit_quaternion
+from models.spatial import FULL_TURN
 
 __all__ = ["Arc", "Line", "Segment", "constant_curvature"]
 
-SHORTEST = 1e-9
+SHORTEST_SEGMENT = 1e-9
 """Segments below this length (m) count as points."""
 
 
@@ -42,16 +43,15 @@ class Line:
     end_orientation: ArrayInput | None = None
 
     def __post_init__(self) -> None:
-        start = checked_array(self.start, (3,), "line", "start")
-        end = checked_array(self.end, (3,), "line", "end")
-        object.__setattr__(self, "start", start)
-        object.__setattr__(self, "end", end)
+        for what in ("start", "end"):
+            object.__setattr__(self, what, checked_array(getattr(self, what), (3,), "line", what))
         _set_orientations(self, "line")
-        if self.length <= SHORTEST:
-            raise ModelError(
-                f"line from {start.tolist()} to {end.tolist()} m has the length {self.length:g} m; "
+        if self.length <= SHORTEST_SEGMENT:
+            message = (
+                f"line from {self.start.tolist()} to {self.end.tolist()} m has the length {self.length:g} m; "
                 "drop it, or turn the tool along a segment that moves"
             )
+            raise ModelError(message, name="length", value=self.length, limit=SHORTEST_SEGMENT)
 
     @property
     def length(self) -> float:
@@ -99,25 +99,29 @@ class Arc:
     def __post_init__(self) -> None:
         for what in ("start", "center", "axis"):
             object.__setattr__(self, what, checked_array(getattr(self, what), (3,), "arc", what))
-        sweep = checked_array(self.sweep, (), "arc", "sweep").item()
+        sweep = checked_number(self.sweep, "arc", "sweep")
         norm = float(np.linalg.norm(self.axis))
         if norm == 0:
-            raise ModelError("arc: axis [0, 0, 0] has no direction; give the normal of the arc's plane")
+            message = "arc: axis [0, 0, 0] has no direction; give the normal of the arc's plane"
+            raise ModelError(message, name="axis", value=self.axis)
         object.__setattr__(self, "axis", self.axis / norm)
         radius = float(np.linalg.norm(self.start - self.center))
-        if radius <= SHORTEST:
-            raise ModelError(f"arc: start {self.start.tolist()} is its center; its radius {radius:g} m is no circle")
+        if radius <= SHORTEST_SEGMENT:
+            message = f"arc: start {self.start.tolist()} is its center; its radius {radius:g} m is no circle"
+            raise ModelError(message, name="radius", value=radius, limit=SHORTEST_SEGMENT)
         slope = abs(float(self.axis @ (self.start - self.center))) / radius
         if slope > 1e-6:
-            raise ModelError(
+            message = (
                 f"arc: axis {self.axis.tolist()} is not perpendicular to the radius from {self.center.tolist()} to "
                 f"{self.start.tolist()} (cosine {slope:.3g}); move the center along the axis into the arc's plane"
             )
-        if not 0 < sweep <= 2 * np.pi * (1 + 1e-12) or radius * sweep <= SHORTEST:
-            raise ModelError(
+            raise ModelError(message, name="axis", value=slope, limit=1e-6)
+        if not 0 < sweep <= FULL_TURN * (1 + 1e-12) or radius * sweep <= SHORTEST_SEGMENT:
+            message = (
                 f"arc: sweep {sweep:g} rad is outside (0, 2 pi] or its length {radius * sweep:g} m is zero; "
                 "turn the axis round for the other sense, chain arcs for several turns"
             )
+            raise ModelError(message, name="sweep", value=sweep, limit=(0.0, FULL_TURN))
         object.__setattr__(self, "sweep", sweep)
         _set_orientations(self, "arc")
 
@@ -132,7 +136,7 @@ class Arc:
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
         """Arc from `start` round `center` by `sweep` rad about `axis`; a negative sweep turns the other way."""
-        turn = checked_array(sweep, (), "arc", "sweep").item()
+        turn = checked_number(sweep, "arc", "sweep")
         vector = checked_array(axis, (3,), "arc", "axis")
         return cls(start, center, vector if turn >= 0 else -vector, abs(turn), start_orientation, end_orientation)
 
@@ -150,17 +154,14 @@ class Arc:
         Raises:
             ModelError: Points that coincide or lie on a line.
         """
-        a = checked_array(start, (3,), "arc", "start")
-        b = checked_array(via, (3,), "arc", "via")
-        c = checked_array(end, (3,), "arc", "end")
+        points = {"start": start, "via": via, "end": end}
+        a, b, c = (checked_array(point, (3,), "arc", what) for what, point in points.items())
         ab, ac = b - a, c - a
         axis = np.cross(ab, ac)
         area, size = float(np.linalg.norm(axis)), float(np.linalg.norm(ab) * np.linalg.norm(ac))
-        if area <= 1e-9 * size or np.linalg.norm(c - b) <= SHORTEST:
-            raise ModelError(
-                f"arc through {a.tolist()}, {b.tolist()}, {c.tolist()}: the points lie on a line or coincide; "
-                "use a Line, or Arc.about for a full circle"
-            )
+        if area <= 1e-9 * size or np.linalg.norm(c - b) <= SHORTEST_SEGMENT:
+            message = f"arc through {a.tolist()}, {b.tolist()}, {c.tolist()}: the points lie on a line or coincide"
+            raise ModelError(f"{message}; use a Line, or Arc.about for a full circle", name="points", value=(a, b, c))
         # to rounding for flat arcs too, whose center is far away: all is built upon the chord and the angle at `via`
         chord = float(np.linalg.norm(ac))
         along, axis = ac / chord, axis / area

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput
+from models.arrays import Array, ArrayInput, checked_array, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, by_arc_length, quintic
@@ -18,7 +18,7 @@ from models.paths.path import Path
 
 __all__ = ["Blend", "Place", "SmoothPath", "Turn"]
 
-CHUNK = 50_000
+SAMPLES_AT_ONCE = 50_000
 """Samples handled at once, so that memory does not grow with them."""
 
 
@@ -132,7 +132,8 @@ class SmoothPath:
         """The blend at a vertex, 0 being the end of the first segment; ModelError when there is none."""
         count = len(self.remaining)
         if not isinstance(vertex, int | np.integer) or not 0 <= vertex < count:
-            raise ModelError(f"vertex {vertex!r} does not exist; the path has {count}")
+            message = f"vertex {vertex!r} does not exist; the path has {count}"
+            raise ModelError(message, name="vertex", value=vertex, limit=count)
         piece = int(self.blend_starts[vertex])
         return Blend(
             self.path.start[vertex + 1],
@@ -152,8 +153,8 @@ class SmoothPath:
         """
         s = self.checked_distance(distance)
         results = [np.empty((len(s), 3)) for _ in range(4)]
-        for first in range(0, len(s), CHUNK):
-            part = slice(first, first + CHUNK)
+        for first in range(0, len(s), SAMPLES_AT_ONCE):
+            part = slice(first, first + SAMPLES_AT_ONCE)
             for result, values in zip(results, self._at(s[part]), strict=True):
                 result[part] = values
         return Place(*results)
@@ -173,8 +174,8 @@ class SmoothPath:
             return Turn(np.repeat(self.path.orientation[:1], len(s), axis=0), still, still, still)
         reference, theta = self.charts
         results = [np.empty((len(s), width)) for width in (4, 3, 3, 3)]
-        for first in range(0, len(s), CHUNK):
-            part = slice(first, first + CHUNK)
+        for first in range(0, len(s), SAMPLES_AT_ONCE):
+            part = slice(first, first + SAMPLES_AT_ONCE)
             piece = self._piece(s[part])
             length = self.piece_lengths[piece]
             values = along_piece(reference[piece], theta[piece], length, (s[part] - self.bounds[piece]) / length)
@@ -188,8 +189,8 @@ class SmoothPath:
         piece = self._piece(s)
         u = np.full(len(s), np.nan)
         curved = np.flatnonzero(self.piece_blend[piece] >= 0)
-        for first in range(0, len(curved), CHUNK):
-            part = curved[first : first + CHUNK]
+        for first in range(0, len(curved), SAMPLES_AT_ONCE):
+            part = curved[first : first + SAMPLES_AT_ONCE]
             u[part] = self._parameter(s[part])[1]
         return u
 
@@ -218,10 +219,7 @@ class SmoothPath:
             ModelError: A number of values that is not that of the segments.
         """
         count = len(self.path.segments)
-        values = np.asarray(of_segments, dtype=float)
-        if values.ndim and values.shape != (count,):
-            raise ModelError(f"{values.shape} values for {count} segments; give one, or one for each segment")
-        values = np.broadcast_to(values, (count,))
+        values = one_for_each(of_segments, count, "path", "speed", "segments")
         blends = np.minimum(values[self.piece_blend], values[np.minimum(self.piece_blend + 1, count - 1)])
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
@@ -232,16 +230,12 @@ class SmoothPath:
 
     def checked_distance(self, distance: ArrayInput) -> Array:
         """`distance` as an array within the path; ModelError when it is not."""
-        try:
-            s = np.atleast_1d(np.asarray(distance, dtype=float))
-        except (TypeError, ValueError) as error:
-            raise ModelError(f"distance {distance!r} is not numeric") from error
+        s = checked_array(distance, ("distances",), "path", "distance", finite=False, nan=True, least=0)
         slack = 1e-9 * self.length
-        if s.ndim != 1 or not (np.isfinite(s).all() and (s >= -slack).all() and (s <= self.length + slack).all()):
-            wrong = s[~((s >= -slack) & (s <= self.length + slack))] if s.ndim == 1 else s
-            raise ModelError(
-                f"distance {wrong.ravel()[:3].tolist()} m is off the path, which is {self.length:g} m long"
-            )
+        wrong = s[~((s >= -slack) & (s <= self.length + slack))]
+        if wrong.size:
+            message = f"distance {wrong[:3].tolist()} m is off the path, which is {self.length:g} m long"
+            raise ModelError(message, name="distance", value=float(wrong[0]), limit=self.length)
         return np.asarray(np.clip(s, 0.0, self.length))
 
     def _piece(self, s: Array) -> NDArray[np.intp]:

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_rotation, frozenchecked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_rotation, frozen
 from models.errors import ModelError
 from models.spatial import rotation
 
@@ -53,7 +53,7 @@ class Link:
         _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
-        object.__setattr__(self, "inertia", frozenchecked_array((inertia + inertia.T) / 2))
+        object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Joint:
         length = float(np.linalg.norm(axis))
         if not length > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction")
-        object.__setattr__(self, "axis", frozenchecked_array(axis / length))
+        object.__setattr__(self, "axis", frozen(axis / length))
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
         for what in ("lower", "upper", "velocity", "effort"):

@@ -8,26 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import ArrayInput, checked_array, checked_rotation
+from models.arrays import ArrayInput, checked_array, checked_number, checked_rotation
 from models.errors import ModelError
 from models.spatial import Expression, expression
 
 SEARCH_STEPS = 40
 GOLDEN = (5**0.5 - 1) / 2
-ROUND = 1e-12  # m; rounds off the kink of a distance at zero
+KINK = 1e-12  # m; rounds off the kink of a distance at zero
 
 
 class Capsule(NamedTuple):
-    """All points within `radius` (m) of the segment from `a` to `b`, in world. Shapes (3, 1), m."""
+    """All points within `radius` (m) of the segment from `start` to `end`, in world. Shapes (3, 1), m."""
 
-    a: Expression
-    b: Expression
     radius: Expression
+    start: Expression
+    end: Expression
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,45 +36,42 @@ class Box:
     """A solid box in world.
 
     Attributes:
-        center: Shape (3,), m.
-        half: Half of its edges. Shape (3,), m; inf for a box without ends along an axis.
+        size: Full length of its edges. Shape (3,), m; inf for a box without ends along an axis.
+        position: Its centre. Shape (3,), m.
         rotation: Its axes as columns, in world. Shape (3, 3).
 
     Raises:
-        ModelError: A half edge that is not positive, or a rotation that is none.
+        ModelError: An edge that is not positive, no finite edge, or a rotation that is none.
     """
 
-    center: ArrayInput
-    half: ArrayInput
+    size: ArrayInput
+    position: ArrayInput = (0.0, 0.0, 0.0)
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", checked_array(self.center, (3,), "box", "center"))
-        object.__setattr__(self, "half", checked_array(self.half, (3,), "box", "half", finite=False))
+        size = checked_array(self.size, (3,), "box", "size", finite=False, positive=True, unit="m")
+        object.__setattr__(self, "size", size)
+        object.__setattr__(self, "position", checked_array(self.position, (3,), "box", "position"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, "box", "rotation"))
-        if not (self.half > 0).all():
-            raise ModelError(f"box: half edges {self.half.tolist()} m must be positive")
-        if np.isinf(self.half).all():
-            raise ModelError("box: every half edge is infinite; there is no outside")
+        if np.isinf(size).all():
+            raise ModelError("box: every edge is infinite; there is no outside", name="size", value=size)
 
     def local(self, point: Expression) -> Expression:
         """Coordinates of a world point in the axes of the box, of its finite axes only."""
-        inside = ca.mtimes(ca.DM(self.rotation).T, expression(point) - ca.DM(self.center))
-        return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(self.half[k])])
+        inside = ca.mtimes(ca.DM(self.rotation).T, expression(point) - ca.DM(self.position))
+        return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(self.size[k])])
 
     def reach(self) -> Expression:
-        """Finite half edges, m."""
-        return ca.DM([h for h in self.half if np.isfinite(h)])
+        """Half of the finite edges, m."""
+        return ca.DM(self.size[np.isfinite(self.size)] / 2)
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
     """Distance of a point to a box, negative inside: there minus the way to the nearest face. Convex. Shape (1, 1)."""
     over = ca.fabs(box.local(point)) - box.reach()
     outside = ca.fmax(over, 0)
-    deepest = over[0]
-    for k in range(1, over.numel()):
-        deepest = ca.fmax(deepest, over[k])
-    return ca.sqrt(ca.dot(outside, outside) + ROUND**2) - ROUND + ca.fmin(deepest, 0)
+    deepest = reduce(ca.fmax, ca.vertsplit(over))
+    return _length(outside) + ca.fmin(deepest, 0)
 
 
 def capsule_to_box(capsule: Capsule, box: Box) -> Expression:
@@ -83,7 +81,7 @@ def capsule_to_box(capsule: Capsule, box: Box) -> Expression:
     point, good to 1e-8 of the segment. Its place is piecewise constant to differentiation, as the theorem of the
     envelope wants it.
     """
-    a, b, radius = expression(capsule.a), expression(capsule.b), capsule.radius
+    a, b, radius = expression(capsule.start), expression(capsule.end), capsule.radius
 
     def at(s: Expression) -> Expression:
         return box_distance(a + s * (b - a), box)
@@ -108,12 +106,8 @@ def capsule_to_box(capsule: Capsule, box: Box) -> Expression:
 
 def capsule_in_box(capsule: Capsule, walls: Box) -> Expression:
     """Distance of a capsule inside a hollow box to its nearest wall, negative beyond it. Shape (1, 1), m."""
-    gaps = [walls.reach() - ca.fabs(walls.local(end)) for end in (capsule.a, capsule.b)]
-    both = ca.vertcat(*gaps)
-    least = both[0]
-    for k in range(1, both.numel()):
-        least = ca.fmin(least, both[k])
-    return least - capsule.radius
+    gaps = [walls.reach() - ca.fabs(walls.local(end)) for end in (capsule.start, capsule.end)]
+    return reduce(ca.fmin, ca.vertsplit(ca.vertcat(*gaps))) - capsule.radius
 
 
 def capsule_to_capsule(one: Capsule, other: Capsule) -> Expression:
@@ -121,17 +115,22 @@ def capsule_to_capsule(one: Capsule, other: Capsule) -> Expression:
 
     Nearest points of two segments in closed form (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
     """
-    p, q = expression(one.a), expression(other.a)
-    u, v = expression(one.b) - p, expression(other.b) - q
+    p, q = expression(one.start), expression(other.start)
+    u, v = expression(one.end) - p, expression(other.end) - q
     gap = p - q
-    a, e, b = ca.dot(u, u) + ROUND**2, ca.dot(v, v) + ROUND**2, ca.dot(u, v)
+    a, e, b = ca.dot(u, u) + KINK**2, ca.dot(v, v) + KINK**2, ca.dot(u, v)
     c, f = ca.dot(u, gap), ca.dot(v, gap)
     slack = a * e - b * b
     s = _clip(ca.if_else(slack > 1e-12 * a * e, (b * f - c * e) / (slack + 1e-300), 0.0))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
     apart = gap + s * u - t * v
-    return ca.sqrt(ca.dot(apart, apart) + ROUND**2) - ROUND - one.radius - other.radius
+    return _length(apart) - one.radius - other.radius
+
+
+def _length(vector: Expression) -> Expression:
+    """Euclidean norm, its kink at zero rounded off."""
+    return ca.sqrt(ca.dot(vector, vector) + KINK**2) - KINK
 
 
 def _clip(x: Expression) -> Expression:
@@ -146,10 +145,6 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     """
     if not values:
         raise ModelError("soft_minimum of no values")
-    if not (np.isfinite(width) and width > 0):
-        raise ModelError(f"soft_minimum: width {width} must be positive")
-    stacked = ca.vertcat(*values)
-    least = values[0]
-    for value in values[1:]:
-        least = ca.fmin(least, value)
+    checked_number(width, "soft_minimum", "width", positive=True)
+    stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))

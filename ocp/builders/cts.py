@@ -196,13 +196,7 @@ def _beyond(value: Any, lower: Any, upper: Any) -> Any:
 
 
 def _guess(
-    rig: Rig,
-    tunnel: Tunnel,
-    branch: Branch,
-    curve: Any,
-    cost: Any,
-    t: Array,
-    **options: Any,
+    rig: Rig, tunnel: Tunnel, branch: Branch, curve: Any, cost: Any, t: Array, **options: Any
 ) -> tuple[Samples, Samples]:
     """Roll and rate over time by dynamic programming on a grid; see cts_guess."""
     rows = np.array(curve.map(len(t))(t[None]))

@@ -67,9 +67,7 @@ def test_rotation_agrees_with_scipy(seed: int, angle: float) -> None:
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)])
-def test_rotation_about_a_coordinate_axis_has_five_entries_and_an_exact_one(
-    axis: tuple[int, int, int],
-) -> None:
+def test_rotation_about_a_coordinate_axis_has_five_entries_and_an_exact_one(axis: tuple[int, int, int]) -> None:
     angle = ca.SX.sym("angle")
     turn = rotation(axis, angle)
     along = int(np.flatnonzero(axis)[0])
@@ -96,9 +94,7 @@ def test_quaternion_product_composes_and_the_conjugate_inverts(seed: int) -> Non
     a, b = unit(rng, 4), unit(rng, 4)
     product = numeric(quaternion_product(a, b)).ravel()
     np.testing.assert_allclose(
-        numeric(rotation_from_quaternion(product)),
-        (scipy_rotation(a) * scipy_rotation(b)).as_matrix(),
-        atol=1e-14,
+        numeric(rotation_from_quaternion(product)), (scipy_rotation(a) * scipy_rotation(b)).as_matrix(), atol=1e-14
     )
     np.testing.assert_allclose(
         numeric(quaternion_product(a, quaternion_conjugate(a))).ravel(), [1.0, 0, 0, 0], atol=1e-15

@@ -25,7 +25,7 @@ def skeleton(rig: Rig, joints: Array) -> Array:
     """Points along the rig for every row of joints. Shape (samples, 7, 3), in."""
     q = ca.SX.sym("q", 6)
     links = list(rig_capsules(rig, q).values())
-    points = ca.horzcat(links[0].a, *[link.b for link in links])
+    points = ca.horzcat(links[0].start, *[link.end for link in links])
     function = ca.Function("skeleton", [q], [points])
     return np.array([np.array(function(row)).T for row in joints]) / INCH
 
@@ -144,12 +144,12 @@ def _animate(path: Path, results: Results) -> None:
     with sheet(None, columns=2, size=(8.0, 3.6)) as (figure, axes):
         drawn: list[tuple[Any, Any, Any, Any, int, int]] = []
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
-            half = around.walls.half / INCH
+            half = around.walls.size / (2 * INCH)
             for side in (-1, 1):
                 ax.axhline(side * half[2], color=COLORS["grey"], lw=2)
                 if i == 1:
                     ax.axvline(side * half[1], color=COLORS["grey"], lw=2)
-            c, h = wing.center / INCH, wing.half / INCH
+            c, h = wing.position / INCH, wing.size / (2 * INCH)
             ax.fill_between([c[i] - h[i], c[i] + h[i]], c[k] - h[k], c[k] + h[k], color=COLORS["sky"])
             (rig,) = ax.plot([], [], "-o", color=COLORS["black"], ms=3.5)
             (store,) = ax.plot([], [], "-", color=COLORS["orange"], lw=6, solid_capstyle="round")

@@ -63,7 +63,7 @@ def targets(t: Any) -> list[Any]:
 
 def obstacle() -> Surroundings:
     """A block beside the path of the goose-neck; chosen."""
-    return Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 3.0]), INCH * np.array([3.0, 2.0, 2.0])),))
+    return Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
 
 def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:

@@ -244,8 +244,8 @@ def store_release(rig: Rig, tunnel: Tunnel) -> Release:
 
 def surroundings() -> Surroundings:
     """Walls of the tunnel, open along x, and the parent's wing above the store; chosen."""
-    walls = Box((0, 0, 0), (np.inf, 0.9, 0.75))
-    wing = Box(INCH * np.array([102.0, 3.0, 19.0]), INCH * np.array([8.0, 20.0, 1.0]))
+    walls = Box((np.inf, 1.8, 1.5))
+    wing = Box(INCH * np.array([16.0, 40.0, 2.0]), INCH * np.array([102.0, 3.0, 19.0]))
     return Surroundings(walls, (wing,))
 
 

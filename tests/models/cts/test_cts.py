@@ -27,13 +27,7 @@ from models.cts.rig import (
 from models.cts.roll import index_harmonics
 from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
-from tests.models.cts.cts_oracle import (
-    Array,
-    corner_by_rotation,
-    index_by_geometry,
-    joints_by_geometry,
-    random_targets,
-)
+from tests.models.cts.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
 
 lengths = st.lists(st.floats(0.02, 3.0), min_size=6, max_size=6)
 seeds = st.integers(0, 2**32 - 1)
@@ -216,12 +210,7 @@ def test_equation_15_has_wrong_entries(sample: list[Any]) -> None:
     wrong = []
     for _, pose, turn in sample:
         (cy, cp, cr), (sy, sp, sr) = np.cos(pose[3:]), np.sin(pose[3:])
-        right = [
-            -sy * cr + cy * sp * sr,
-            sy * sr + cy * sp * cr,
-            cy * cr + sy * sp * sr,
-            -cy * sr + sy * sp * cr,
-        ]
+        right = [-sy * cr + cy * sp * sr, sy * sr + cy * sp * cr, cy * cr + sy * sp * sr, -cy * sr + sy * sp * cr]
         printed = [
             -sy * cp + cy * sp * sr,
             sy * sp * cr + cy * sp * cr,

@@ -19,14 +19,8 @@ from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
-LIMITS: dict[str, Any] = {
-    "lower": (0.2, -3.0, -2.0, -1.2, 0.3, -2.0),
-    "upper": (1.6, -0.2, 2.2, 1.1, 2.6, 2.5),
-}
-WIDE: dict[str, Any] = {
-    "lower": (-np.inf, -3.0, -2.0, -1.2, 0.3, -4.0),
-    "upper": (np.inf, 2.9, 2.2, 1.1, 2.6, 4.5),
-}
+LIMITS: dict[str, Any] = {"lower": (0.2, -3.0, -2.0, -1.2, 0.3, -2.0), "upper": (1.6, -0.2, 2.2, 1.1, 2.6, 2.5)}
+WIDE: dict[str, Any] = {"lower": (-np.inf, -3.0, -2.0, -1.2, 0.3, -4.0), "upper": (np.inf, 2.9, 2.2, 1.1, 2.6, 4.5)}
 REFERENCE = {-15: 0.331364, -7.5: 0.682290, 0: np.pi / 2, 7.5: 2.459303, 15: 2.810229}
 seeds = st.integers(0, 2**32 - 1)
 RIG, LIMITED, TUNNEL = reference_rig(), reference_rig(**LIMITS), reference_tunnel()

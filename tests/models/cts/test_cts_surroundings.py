@@ -107,12 +107,12 @@ def test_a_release_that_cannot_be_is_named() -> None:
 
 
 def random_capsule(rng: np.random.Generator) -> Capsule:
-    return Capsule(rng.normal(size=3), rng.normal(size=3), float(rng.uniform(0.01, 0.2)))
+    return Capsule(float(rng.uniform(0.01, 0.2)), *rng.normal(size=(2, 3)))
 
 
 def along(capsule: Capsule, count: int = 2001) -> Any:
     s = np.linspace(0, 1, count)[:, None]
-    return capsule.a + s * (capsule.b - capsule.a)
+    return capsule.start + s * (capsule.end - capsule.start)
 
 
 @settings(max_examples=50)
@@ -121,7 +121,7 @@ def test_distance_of_capsules_is_that_of_their_points(seed: int) -> None:
     rng = np.random.default_rng(seed)
     one, other = random_capsule(rng), random_capsule(rng)
     if seed % 5 == 0:
-        other = Capsule(other.a, other.a + 0.5 * (one.b - one.a), other.radius)  # parallel
+        other = Capsule(other.radius, other.start, other.start + 0.5 * (one.end - one.start))  # parallel
     found = number(capsule_to_capsule(one, other)) + one.radius + other.radius
     p, q = along(one, 400), along(other, 400)
     sampled = np.linalg.norm(p[:, None] - q[None], axis=2).min()
@@ -134,9 +134,9 @@ def test_distance_of_capsules_is_that_of_their_points(seed: int) -> None:
 def test_distance_of_a_capsule_to_a_box_is_that_of_its_points(seed: int) -> None:
     rng = np.random.default_rng(seed)
     turn = turns((lambda q: q / np.linalg.norm(q))(rng.normal(size=(1, 4))))[0]
-    box, capsule = Box(rng.normal(size=3), rng.uniform(0.1, 1, 3), turn), random_capsule(rng)
+    box, capsule = Box(rng.uniform(0.2, 2, 3), rng.normal(size=3), turn), random_capsule(rng)
     found = number(capsule_to_box(capsule, box)) + capsule.radius
-    over = np.abs((along(capsule) - box.center) @ turn) - box.half
+    over = np.abs((along(capsule) - box.position) @ turn) - box.size / 2
     sampled = (np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)).min()
     assert found == pytest.approx(sampled, abs=2e-3)
     assert found <= sampled + 1e-7
@@ -144,10 +144,10 @@ def test_distance_of_a_capsule_to_a_box_is_that_of_its_points(seed: int) -> None
 
 def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
     rng = np.random.default_rng(3)
-    box, shift = Box((0, 0, 0), (0.4, 0.3, 0.2)), ca.SX.sym("shift", 3)
+    box, shift = Box((0.8, 0.6, 0.4)), ca.SX.sym("shift", 3)
     for _ in range(20):
         capsule = random_capsule(rng)
-        moved = capsule_to_box(Capsule(ca.DM(capsule.a) + shift, ca.DM(capsule.b) + shift, capsule.radius), box)
+        moved = capsule_to_box(Capsule(capsule.radius, ca.DM(capsule.start) + shift, ca.DM(capsule.end) + shift), box)
         value = ca.Function("d", [shift], [moved, ca.gradient(moved, shift)])
         slope = np.array(value(np.zeros(3))[1]).ravel()
         if number(value(np.zeros(3))[0]) < 0.02:
@@ -158,8 +158,8 @@ def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
 
 
 def test_a_box_without_ends_has_walls_only() -> None:
-    walls = Box((0, 0, 0), (np.inf, 1.0, 2.0))
-    capsule = Capsule((-50, 0.3, 0), (50, 0, -1.5), 0.1)
+    walls = Box((np.inf, 2.0, 4.0))
+    capsule = Capsule(0.1, (-50, 0.3, 0), (50, 0, -1.5))
     assert number(capsule_in_box(capsule, walls)) == pytest.approx(0.4)
     assert number(box_distance((100, 3.0, 0), walls)) == pytest.approx(2.0)
     assert number(box_distance((100, 0.0, 0), walls)) == pytest.approx(-1.0)
@@ -177,23 +177,21 @@ def test_the_capsules_join_the_frames_of_the_rig() -> None:
     links, frames = rig_capsules(rig, q), dh_frames(rig, q)
     chain = list(links.values())
     for one, other in pairwise(chain):
-        np.testing.assert_allclose(np.array(one.b), np.array(other.a), atol=1e-12)
-    np.testing.assert_allclose(np.array(chain[-1].b), np.array(frames[-1].position), atol=1e-12)
-    lengths = [float(ca.norm_2(link.b - link.a)) for link in chain]
+        np.testing.assert_allclose(np.array(one.end), np.array(other.start), atol=1e-12)
+    np.testing.assert_allclose(np.array(chain[-1].end), np.array(frames[-1].position), atol=1e-12)
+    lengths = [float(ca.norm_2(link.end - link.start)) for link in chain]
     known = [rig.yaw_link_1, rig.yaw_link_2, rig.yaw_offset, rig.pitch_link, rig.goose_neck, rig.sting]
     assert lengths == pytest.approx(known, abs=1e-12)
 
 
 def test_every_link_is_held_against_everything_around() -> None:
-    around = Surroundings(
-        Box((0, 0, 0), (np.inf, 1, 1)), (Box((2, 0, 1), (1, 1, 0.1)),), (Capsule((0, 0, 2), (3, 0, 2), 0.2),)
-    )
+    around = Surroundings(Box((np.inf, 2, 2)), (Box((2, 2, 0.2), (2, 0, 1)),), (Capsule(0.2, (0, 0, 2), (3, 0, 2)),))
     found = clearances(reference_rig(), ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9]), around)
     assert len(found) == 6 * 3
     assert all(np.isfinite(number(gap)) for gap in found.values())
     with pytest.raises(ModelError, match="empty"):
         clearances(reference_rig(), ca.DM.zeros(6), Surroundings())
-    with pytest.raises(ModelError, match="half"):
-        Box((0, 0, 0), (1, 0, 1))
+    with pytest.raises(ModelError, match="size"):
+        Box((1, 0, 1))
     with pytest.raises(ModelError, match="width"):
         soft_minimum([ca.DM(1)], 0.0)

@@ -8,17 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import (
-    FixedBase,
-    FreeFloating,
-    Joint,
-    Link,
-    Machine,
-    ModelError,
-    Robot,
-    paper_example,
-    planar_chain,
-)
+from models import FixedBase, FreeFloating, Joint, Link, Machine, ModelError, Robot, paper_example, planar_chain
 from models.machines.machine import jacobian_manipulability
 from tests.models.robot.trees import (
     Base,
@@ -114,11 +104,7 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any, kind: str) 
             ]
         return results
 
-    variables = [
-        symbols.sym("base", machine.base_size),
-        symbols.sym("q", robot.dof),
-        symbols.sym("rates", robot.dof),
-    ]
+    variables = [symbols.sym("base", machine.base_size), symbols.sym("q", robot.dof), symbols.sym("rates", robot.dof)]
     found = ca.Function("f", variables, everything(*variables))(*numbers)
     for one, other in zip(found, everything(*numbers), strict=True):
         assert one.shape == other.shape

@@ -127,7 +127,7 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Scara(0.0, 1.0), "upper_arm 0 m"),
+        (lambda: Scara(0.0, 1.0), "upper_arm 0.0 m is not positive"),
         (lambda: Scara(1.0, NAN), "forearm nan"),
         (lambda: Scara(1.0, 1.0, lower=(1, 0, 0, 0), upper=(0, 0, 0, 0)), "'shoulder'"),
         (lambda: Scara(1.0, 1.0, names=("a", "a", "b", "c")), "four that differ"),
@@ -145,11 +145,7 @@ NAN = float("nan")
         (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), elbow="up"), "elbow 'up'"),
         (
             lambda: scara_along(
-                EVEN,
-                smooth(
-                    Path.through([(0.5, 0, 0), (0.5, 0.2, 0)], [turned((0, 0, 0)), turned((0.1, 0, 0))]),
-                    0.1,
-                ),
+                EVEN, smooth(Path.through([(0.5, 0, 0), (0.5, 0.2, 0)], [turned((0, 0, 0)), turned((0.1, 0, 0))]), 0.1)
             ),
             "tilts its tool",
         ),

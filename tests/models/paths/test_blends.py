@@ -14,17 +14,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from models import ModelError
-from models.paths import (
-    Arc,
-    Line,
-    Path,
-    SmoothPath,
-    end_curvature,
-    gamma,
-    middle_curvature,
-    peak_curvature,
-    smooth,
-)
+from models.paths import Arc, Line, Path, SmoothPath, end_curvature, gamma, middle_curvature, peak_curvature, smooth
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
 from tests.models.paths.task_paths import random_path, seeds
@@ -187,14 +177,14 @@ CORNER = Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)])
     [
         ({}, "either"),
         ({"remaining": 0.1, "deviation": 0.1}, "either"),
-        ({"remaining": 0.0}, "remaining 0 m"),
+        ({"remaining": 0.0}, "remaining 0.0 m is not positive"),
         ({"remaining": float("nan")}, "remaining nan"),
         ({"remaining": [0.1, 0.1]}, "each of the 1 vertices"),
         ({"remaining": "wide"}, "not numeric"),
-        ({"deviation": -1.0}, "deviation -1 m"),
+        ({"deviation": -1.0}, "deviation -1.0 m is not positive"),
         ({"remaining": 0.1, "kind": "septic"}, "septic"),
         ({"remaining": 0.1, "overlap": "cross"}, "cross"),
-        ({"remaining": 0.1, "shape": 0.0}, "shape factor 0"),
+        ({"remaining": 0.1, "shape": 0.0}, "shape factor 0.0 is not positive"),
         ({"remaining": 0.1, "shape": 6.0, "kind": "cubic"}, "cusp"),
         ({"remaining": 0.1, "shape": float("nan")}, "shape factor nan"),
         ({"remaining": 0.1, "shape": "round"}, "not numeric"),
@@ -209,7 +199,7 @@ def test_a_blend_that_cannot_be_is_a_named_error(asked: dict[str, Any], message:
 @pytest.mark.parametrize("bad", [(0.0, 1.0, 1.0), (3.0, 0.0, 1.0), (3.0, 4.0, 1.0), (3.0, 1.0, float("nan"))])
 def test_closed_forms_refuse_what_is_no_corner(bad: tuple[float, float, float]) -> None:
     for form in (end_curvature, middle_curvature, peak_curvature):
-        with pytest.raises(ModelError, match="must be above 0"):
+        with pytest.raises(ModelError, match=r"corner: .* is (not positive|not finite|above pi)"):
             form(*bad)
 
 

@@ -26,10 +26,7 @@ def test_the_lengths_of_the_example_are_those_checked() -> None:
     assert path.length / MM == pytest.approx(1668.82501, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("shape", "angle", "value"),
-    [(1.0, 90, 0.530), (1.0, 45, 0.693), (1.5, 90, 0.4419)],
-)
+@pytest.mark.parametrize(("shape", "angle", "value"), [(1.0, 90, 0.530), (1.0, 45, 0.693), (1.5, 90, 0.4419)])
 def test_the_distance_of_a_blend_from_its_corner(shape: float, angle: float, value: float) -> None:
     assert gamma(shape, np.radians(angle)) == pytest.approx(value, abs=5e-4)
 

@@ -67,7 +67,7 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
 
 
 def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
-    around = Surroundings(solids=(Box(INCH * np.array([80.0, -4.0, 0.0]), INCH * np.array([3.0, 2.0, 3.0])),))
+    around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
     q = ca.SX.sym("q", 6)
     gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
     t = np.linspace(0, HORIZON, 101)
@@ -111,7 +111,7 @@ def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must
 
 
 def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
-    around = Surroundings(solids=(Box(INCH * np.array([80.0, -9.0, 3.0]), INCH * np.array([3.0, 2.0, 2.0])),))
+    around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
     q = ca.SX.sym("q", 6)
     gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
     x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
