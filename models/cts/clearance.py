@@ -14,150 +14,20 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.cts.best_roll import checked_gain, optimal_inverse, unrolled
+from models.arrays import checked_number
+from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, dh_frames, joints_of, posture_at
 from models.cts.roll import ACTIVE, STATUS, index_harmonics, verdict
+from models.cts.roll_change import checked_gain, unrolled
 from models.errors import ModelError
 from models.shapes.capsules import Box, Capsule, capsule_in_box, capsule_to_box, capsule_to_capsule, soft_minimum
-from models.spatial import Expression
+from models.spatial import FULL_TURN, Expression
 
-TURN = 2 * np.pi
-STEPS, SHRINK = 44, 0.62
+PATTERN_STEPS, PATTERN_SHRINK = 44, 0.62
 BASINS = 4  # minima of the grid that are refined
-DEAR = 1e3  # 1/m; of a clearance that falls short, in what the search compares
-INSET = 1e-10  # m; how far inside the least clearance the search aims
+SHORTFALL_PRICE = 1e3  # 1/m; of a clearance that falls short, in what the search compares
+CLEARANCE_INSET = 1e-10  # m; how far inside the least clearance the search aims
 AT_LIMIT = 1e-6  # m; nearer to the least clearance than this counts as held by it
-
-
-def nearness(gap: Expression, weight: float, width: float) -> Expression:
-    """Term of the index that grows as the rig comes near: weight exp(-gap / width), gap and width in m.
-
-    Raises:
-        ModelError: A weight that is negative or not finite, a width that is not positive.
-    """
-    if not (np.isfinite(weight) and weight >= 0):
-        raise ModelError(f"clearance weight {weight} must be finite and not negative")
-    if not (np.isfinite(width) and width > 0):
-        raise ModelError(f"clearance width {width} m must be positive and finite")
-    return weight * ca.exp(-gap / width)
-
-
-def clear_inverse(
-    rig: Rig,
-    tunnel: Tunnel,
-    surroundings: Surroundings,
-    branch: Branch = HOME,
-    *,
-    clearance: float = -np.inf,
-    weight: float = 0.0,
-    width: float = 0.05,
-    rate_weight: float = 0.0,
-    samples: int = 72,
-    softness: float = 2e-3,
-    radii: Radii | None = None,
-) -> Any:
-    """Function (target, previous) -> (joints, cost, active, status, gap): optimal_inverse among obstacles.
-
-    Args:
-        clearance: Least distance of the rig from its surroundings, m; -inf for no constraint.
-        weight, width: Of the term weight exp(-gap / width) of the index.
-        rate_weight: w4 of I2; 0 for I1.
-        samples: Rolls of the grid, at least 8.
-        softness: Width of the smooth minimum of all distances, m; see clearance.soft_minimum.
-        radii: Of the rig's capsules.
-
-    Returns:
-        A casadi Function as cts_optimal.optimal_inverse, and the smooth least distance, m. `active` is "clearance"
-        where it holds the roll; where the closed form has the best roll it is that of the closed form, else "free".
-        The status "clearance" says that the target is reached within limits, but by no roll clear of everything.
-
-    Raises:
-        ModelError: A weight, width, clearance or number of samples that cannot be.
-    """
-    gain = checked_gain(rate_weight)
-    if np.isnan(clearance) or clearance == np.inf:
-        raise ModelError(f"clearance {clearance} m must be a finite distance or -inf for none")
-    if samples < 8:
-        raise ModelError(f"samples {samples} must be 8 or more")
-    target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
-    c, s = ca.cos(angle), ca.sin(angle)
-    posture = posture_at(rig, target, c, s, branch)
-    roll = unrolled(rig, c, s, previous)
-    joints = joints_of(rig, target, roll, posture)
-    gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
-    cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
-    cost += nearness(gap, weight, width)
-    meets = verdict(rig, target, posture, c, s)
-    held = ca.logic_and(meets.relaxed(), meets.slide())
-    fine = ca.logic_and(held, gap >= clearance)
-    given = [target, previous, angle]
-    value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))
-    short: Any = ca.fmax(clearance + INSET - gap, 0) if np.isfinite(clearance) else 0.0
-    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + DEAR * short, ca.inf)]))
-    place = ca.Function("place", given, ca.cse([joints, gap]))
-
-    x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
-    closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
-    reached = closed_status == 0
-    free = ca.if_else(reached, closed[5], 0.0)
-    grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
-    starts = ca.Function("starts", *_starts(samples))(merit.map(samples)(x, before, grid))
-    states = ca.horzcat(starts, ca.vertcat(free, merit(x, before, free), TURN / samples))
-    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, BASINS + 1))
-    angles = ca.horzcat(free, refined[0, :])
-    values = value.map(BASINS + 2)(x, before, angles)
-    best, least, from_closed = ca.Function("choice", *_choice(BASINS + 2))(angles, values)
-    q, distance = place(x, before, best)
-    status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
-    spoilt = ca.if_else(status == 0, 0, np.nan)
-    active = ca.if_else(from_closed, closed_active, 0)
-    active = ca.if_else(distance - clearance < AT_LIMIT, ACTIVE.index("clearance"), active)
-    outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
-    labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
-    return ca.Function("clear_inverse", [x, before], outputs, *labels)
-
-
-def _starts(samples: int) -> tuple[list[Any], list[Any]]:
-    """Inputs and outputs of the function (merits of the grid) -> columns (angle, merit, step) of its least minima."""
-    merits = ca.SX.sym("merits", 1, samples)
-    angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
-    left = []
-    for k in range(samples):
-        low = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
-        left.append(ca.if_else(low, merits[k], ca.inf))
-    columns = []
-    for _ in range(BASINS):
-        at, least = ca.SX(0), ca.SX(ca.inf)
-        for angle, merit in zip(angles, left, strict=True):
-            at, least = ca.if_else(merit < least, angle, at), ca.fmin(merit, least)
-        left = [ca.if_else(at == angle, ca.inf, merit) for angle, merit in zip(angles, left, strict=True)]
-        columns.append(ca.vertcat(at, least, TURN / samples))
-    return [merits], [ca.horzcat(*columns)]
-
-
-def _choice(count: int) -> tuple[list[Any], list[Any]]:
-    """Inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
-    angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
-    at, least, first = angles[0], values[0], ca.SX(1)
-    for k in range(1, count):
-        better = values[k] < least
-        at, least = ca.if_else(better, angles[k], at), ca.fmin(values[k], least)
-        first = ca.if_else(better, 0, first)
-    return [angles, values], [at, least, first]
-
-
-def _pattern(merit: Any) -> Any:
-    """Function (states, given) -> states: a search about each state (angle, merit, step); given target, previous."""
-    state, given = ca.MX.sym("state", 3), ca.MX.sym("given", 6)
-    angle, least, step = ca.vertsplit(state)
-    for side in (-0.5, 0.5):
-        at = state[0] + side * step
-        found = merit(given[:5], given[5], at)
-        better = found < least
-        angle, least = ca.if_else(better, at, angle), ca.if_else(better, found, least)
-    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * SHRINK)])
-    all_steps = once.mapaccum(STEPS)(state, ca.repmat(given, 1, STEPS))[:, -1]
-    return ca.Function("pattern", [state, given], [all_steps]).map(BASINS + 1)
 
 
 @dataclass(frozen=True)
@@ -219,5 +89,143 @@ def clearances(
         for k, other in enumerate(surroundings.capsules):
             found[name, f"capsule {k}"] = capsule_to_capsule(capsule, other)
     if not found:
-        raise ModelError("clearances: the surroundings are empty; give walls, solids or capsules")
+        message = "clearances: the surroundings are empty; give walls, solids or capsules"
+        raise ModelError(message, name="surroundings", value=surroundings)
     return found
+
+
+def nearness(gap: Expression, weight: float, width: float) -> Expression:
+    """Term of the index that grows as the rig comes near: weight exp(-gap / width), gap and width in m.
+
+    Raises:
+        ModelError: A weight that is negative or not finite, a width that is not positive.
+    """
+    if checked_number(weight, "clearance", "weight") < 0:
+        raise ModelError(f"clearance: weight {weight} is negative", name="weight", value=weight, limit=0.0)
+    checked_number(width, "clearance", "width", positive=True, unit="m")
+    return weight * ca.exp(-gap / width)
+
+
+def checked_clearance(clearance: float) -> float:
+    """`clearance` itself, m; ModelError unless it is a finite distance or -inf for none."""
+    if np.isnan(clearance) or clearance == np.inf:
+        message = f"clearance {clearance} m must be a finite distance or -inf for none"
+        raise ModelError(message, name="clearance", value=clearance)
+    return clearance
+
+
+def clear_inverse(
+    rig: Rig,
+    tunnel: Tunnel,
+    surroundings: Surroundings,
+    branch: Branch = HOME,
+    *,
+    clearance: float = -np.inf,
+    weight: float = 0.0,
+    width: float = 0.05,
+    rate_weight: float = 0.0,
+    samples: int = 72,
+    softness: float = 2e-3,
+    radii: Radii | None = None,
+) -> Any:
+    """Function (target, previous) -> (joints, cost, active, status, gap): optimal_inverse among obstacles.
+
+    Args:
+        clearance: Least distance of the rig from its surroundings, m; -inf for no constraint.
+        weight, width: Of the term weight exp(-gap / width) of the index.
+        rate_weight: w4 of I2; 0 for I1.
+        samples: Rolls of the grid, at least 8.
+        softness: Width of the smooth minimum of all distances, m; see soft_minimum.
+        radii: Of the rig's capsules.
+
+    Returns:
+        A casadi Function as optimal_inverse, and the smooth least distance, m. `active` is "clearance"
+        where it holds the roll; where the closed form has the best roll it is that of the closed form, else "free".
+        The status "clearance" says that the target is reached within limits, but by no roll clear of everything.
+
+    Raises:
+        ModelError: A weight, width, clearance or number of samples that cannot be.
+    """
+    gain = checked_gain(rate_weight)
+    checked_clearance(clearance)
+    if samples < 8:
+        raise ModelError(f"samples {samples} must be 8 or more", name="samples", value=samples, limit=8)
+    target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
+    c, s = ca.cos(angle), ca.sin(angle)
+    posture = posture_at(rig, target, c, s, branch)
+    roll = unrolled(rig, c, s, previous)
+    joints = joints_of(rig, target, roll, posture)
+    gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
+    cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
+    cost += nearness(gap, weight, width)
+    meets = verdict(rig, target, posture, c, s)
+    held = ca.logic_and(meets.relaxed(), meets.slide())
+    fine = ca.logic_and(held, gap >= clearance)
+    given = [target, previous, angle]
+    value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))
+    short: Any = ca.fmax(clearance + CLEARANCE_INSET - gap, 0) if np.isfinite(clearance) else 0.0
+    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + SHORTFALL_PRICE * short, ca.inf)]))
+    place = ca.Function("place", given, ca.cse([joints, gap]))
+
+    x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
+    reached = closed_status == 0
+    free = ca.if_else(reached, closed[5], 0.0)
+    grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
+    starts = ca.Function("starts", *_starts(samples))(merit.map(samples)(x, before, grid))
+    states = ca.horzcat(starts, ca.vertcat(free, merit(x, before, free), FULL_TURN / samples))
+    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, BASINS + 1))
+    angles = ca.horzcat(free, refined[0, :])
+    values = value.map(BASINS + 2)(x, before, angles)
+    best, least, from_closed = ca.Function("choice", *_choice(BASINS + 2))(angles, values)
+    q, distance = place(x, before, best)
+    status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
+    spoilt = ca.if_else(status == 0, 0, np.nan)
+    active = ca.if_else(from_closed, closed_active, 0)
+    active = ca.if_else(distance - clearance < AT_LIMIT, ACTIVE.index("clearance"), active)
+    outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
+    labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
+    return ca.Function("clear_inverse", [x, before], outputs, *labels)
+
+
+def _starts(samples: int) -> tuple[list[Any], list[Any]]:
+    """Inputs and outputs of the function (merits of the grid) -> columns (angle, merit, step) of its least minima."""
+    merits = ca.SX.sym("merits", 1, samples)
+    angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
+    left = []
+    for k in range(samples):
+        low = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
+        left.append(ca.if_else(low, merits[k], ca.inf))
+    columns = []
+    for _ in range(BASINS):
+        at, least = ca.SX(0), ca.SX(ca.inf)
+        for angle, merit in zip(angles, left, strict=True):
+            at, least = ca.if_else(merit < least, angle, at), ca.fmin(merit, least)
+        left = [ca.if_else(at == angle, ca.inf, merit) for angle, merit in zip(angles, left, strict=True)]
+        columns.append(ca.vertcat(at, least, FULL_TURN / samples))
+    return [merits], [ca.horzcat(*columns)]
+
+
+def _choice(count: int) -> tuple[list[Any], list[Any]]:
+    """Inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
+    angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
+    at, least, first = angles[0], values[0], ca.SX(1)
+    for k in range(1, count):
+        better = values[k] < least
+        at, least = ca.if_else(better, angles[k], at), ca.fmin(values[k], least)
+        first = ca.if_else(better, 0, first)
+    return [angles, values], [at, least, first]
+
+
+def _pattern(merit: Any) -> Any:
+    """Function (states, given) -> states: a search about each state (angle, merit, step); given target, previous."""
+    state, given = ca.MX.sym("state", 3), ca.MX.sym("given", 6)
+    angle, least, step = ca.vertsplit(state)
+    for side in (-0.5, 0.5):
+        at = state[0] + side * step
+        found = merit(given[:5], given[5], at)
+        better = found < least
+        angle, least = ca.if_else(better, at, angle), ca.if_else(better, found, least)
+    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * PATTERN_SHRINK)])
+    all_steps = once.mapaccum(PATTERN_STEPS)(state, ca.repmat(given, 1, PATTERN_STEPS))[:, -1]
+    return ca.Function("pattern", [state, given], [all_steps]).map(BASINS + 1)

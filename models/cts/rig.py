@@ -16,14 +16,14 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_number
 from models.errors import ModelError
-from models.spatial import Expression, Frame, expression, rotation
+from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
 INCH = 0.0254
 LENGTHS = ("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck")
 HALF_PI = np.pi / 2
-FLOOR = 1e-32  # under square roots: keeps derivatives finite where an arm is stretched
+LEAST_SQUARE = 1e-32  # under square roots: keeps derivatives finite where an arm is stretched
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,21 +55,30 @@ class Rig:
 
     def __post_init__(self) -> None:
         for name in LENGTHS:
-            length = checked_array(getattr(self, name), (), "rig", name).item()
-            if length <= 0:
-                raise ModelError(f"rig: {name} is {length} m; every length must be positive")
+            length = checked_number(getattr(self, name), "rig", name, positive=True, unit="m")
             object.__setattr__(self, name, length)
         for name in ("lower", "upper"):
             object.__setattr__(self, name, checked_array(getattr(self, name), (6,), "rig", name, finite=False))
         for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
             if not low < high:
-                raise ModelError(f"rig: joint {joint} has lower limit {low} not below its upper limit {high}")
+                message = f"rig: joint {joint} has lower limit {low} not below its upper limit {high}"
+                raise ModelError(message, name=f"joint {joint}", value=low, limit=high)
             if joint > 1 and np.isfinite(low) != np.isfinite(high):
-                raise ModelError(f"rig: joint {joint} has limits {low} .. {high}; give a revolute joint both or none")
+                message = f"rig: joint {joint} has limits {low} .. {high}; give a revolute joint both or none"
+                raise ModelError(message, name=f"joint {joint}", limit=(low, high))
 
     def limited(self, joint: int) -> bool:
         """Whether revolute joint 2..6 (counted from 1) has limits less than a full turn apart."""
-        return bool(self.upper[joint - 1] - self.lower[joint - 1] < 2 * np.pi)
+        return bool(self.upper[joint - 1] - self.lower[joint - 1] < FULL_TURN)
+
+    def limit(self, joint: int, upper: bool) -> float:
+        """One limit of joint 1..6, m or rad; infinite where there is none."""
+        return float((self.upper if upper else self.lower)[joint - 1])
+
+    def middle_and_half(self, joint: int) -> tuple[float, float]:
+        """Middle and half width of the limits of a joint that has them."""
+        low, high = self.limit(joint, False), self.limit(joint, True)
+        return (low + high) / 2, (high - low) / 2
 
     def unlimited(self) -> Rig:
         """The same lengths without joint limits."""
@@ -95,11 +104,12 @@ class Tunnel:
 
     def __post_init__(self) -> None:
         for name in ("center", "ranges", "weights"):
-            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "tunnel", name))
-        if not (self.ranges > 0).all():
-            raise ModelError(f"tunnel: ranges {self.ranges.tolist()} m must be positive")
+            positive = name == "ranges"
+            value = checked_array(getattr(self, name), (3,), "tunnel", name, positive=positive, unit="m")
+            object.__setattr__(self, name, value)
         if not (self.weights >= 0).all():
-            raise ModelError(f"tunnel: weights {self.weights.tolist()} must not be negative")
+            message = f"tunnel: weights {self.weights.tolist()} must not be negative"
+            raise ModelError(message, name="weights", value=self.weights, limit=0.0)
 
     @property
     def scale(self) -> Array:
@@ -123,7 +133,7 @@ BRANCHES = (Branch(-1, 1), Branch(-1, -1), Branch(1, 1), Branch(1, -1))
 HOME = BRANCHES[0]
 
 
-class Posture(NamedTuple):
+class RigPosture(NamedTuple):
     """What a target, a roll and a branch make of the rig; scalar expressions unless said otherwise.
 
     Attributes:
@@ -235,17 +245,17 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
     return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
 
 
-def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> Posture:
+def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigPosture:
     """Joint angles but for their arcs, for a roll given by its cosine and sine: (23), (25), (27)."""
     corner = corner_at(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
-    cos4 = branch.pitch * ca.sqrt(ca.fmax((1 - sin4) * (1 + sin4), FLOOR))
+    cos4 = branch.pitch * ca.sqrt(ca.fmax((1 - sin4) * (1 + sin4), LEAST_SQUARE))
     along = rig.yaw_link_2 + rig.pitch_link * cos4
     cos2 = (corner[1] - along * s_yaw - rig.yaw_offset * c_yaw) / rig.yaw_link_1
-    sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), FLOOR))
+    sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), LEAST_SQUARE))
     q1 = corner[0] - along * c_yaw + rig.yaw_offset * s_yaw + rig.yaw_link_1 * sin2
-    return Posture(corner, sin4, cos4, sin2, cos2, q1)
+    return RigPosture(corner, sin4, cos4, sin2, cos2, q1)
 
 
 def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOME) -> tuple[Expression, Expression]:
@@ -266,18 +276,27 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
     return joints_of(rig, target, roll, posture), reach_of(posture)
 
 
-def reach_of(posture: Posture) -> Expression:
+def reach_of(posture: RigPosture) -> Expression:
     """1 - |sin q4| and 1 - |cos q2|, negative out of reach. Shape (2, 1)."""
     return ca.vertcat(1 - ca.fabs(posture.sin4), 1 - ca.fabs(posture.cos2))
 
 
-def joints_of(rig: Rig, target: Expression, roll: Expression, posture: Posture) -> Expression:
+def joints_of(rig: Rig, target: Expression, roll: Expression, posture: RigPosture) -> Expression:
     """Joint positions of a posture, each in the turn nearest to the middle of its limits. Shape (6, 1)."""
     q2 = ca.atan2(posture.sin2, posture.cos2)
     q4 = ca.atan2(posture.sin4, posture.cos4)
     angles = [q2, target[3] - q2 - HALF_PI, q4, target[4] - q4 + HALF_PI]
-    for k, angle in enumerate(angles, 1):
-        if np.isfinite(rig.lower[k]):
-            middle = (rig.lower[k] + rig.upper[k]) / 2
-            angles[k - 1] = angle - 2 * np.pi * ca.floor((angle - middle) / (2 * np.pi) + 0.5)
+    for k, angle in enumerate(angles):
+        if np.isfinite(rig.limit(k + 2, False)):
+            angles[k] = in_nearest_turn(angle, rig.middle_and_half(k + 2)[0])
     return ca.vertcat(posture.q1, *angles, roll)
+
+
+def in_nearest_turn(angle: Expression, middle: Expression) -> Expression:
+    """The angle plus the whole turns that bring it nearest to `middle`, rad."""
+    return angle - FULL_TURN * ca.floor((angle - middle) / FULL_TURN + 0.5)
+
+
+def in_turn_after(angle: Expression, start: Expression) -> Expression:
+    """The angle plus the least number of whole turns that bring it to `start` or beyond, rad."""
+    return angle + FULL_TURN * ca.ceil((start - angle) / FULL_TURN)

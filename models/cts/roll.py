@@ -3,8 +3,6 @@
 Roll enters as a point (cosine, sine) of the unit circle. The set of rolls that reach, within reach of both links and
 within the joint limits, is a set of arcs; every end of an arc is a root of a trigonometric polynomial of degree 1
 (joints 4 and 5 and the reach of the pitch link), 2 (joints 2 and 3 and the reach of the yaw link) or 4 (joint 1).
-
-Ends of the reachable arcs of roll by the limits of joint 1: roots of a trigonometric polynomial of degree 4.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.cts.rig import HALF_PI, Branch, Posture, Rig, Tunnel, corner_circle, posture_at
+from models.cts.rig import HALF_PI, Branch, Rig, RigPosture, Tunnel, corner_circle, posture_at
 from models.cts.trigonometric import (
     Harmonics,
     Point,
@@ -42,8 +40,8 @@ ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
 """How far inside its limit an end is placed, so that the strict check of the limits that follows accepts it."""
 
-SQUARED_REACH = 1e-5
-ROUNDING = 2e-15  # of sin q4 and what depends on it
+SQUARED_POLISH_REACH = 1e-5
+SINE_ROUNDING = 2e-15  # of sin q4 and what depends on it
 LIMIT_SLACK = 1e-7  # in a cosine, where it is only asked whether an end can matter
 
 
@@ -120,7 +118,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
     )
 
 
-def verdict(rig: Rig, target: Expression, posture: Posture, c: Expression, s: Expression) -> Verdict:
+def verdict(rig: Rig, target: Expression, posture: RigPosture, c: Expression, s: Expression) -> Verdict:
     """Whether a posture is within reach and limits. Angles are compared by their cosine from the middle."""
     p = posture
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
@@ -129,13 +127,11 @@ def verdict(rig: Rig, target: Expression, posture: Posture, c: Expression, s: Ex
     angles: dict[bool, Expression] = {False: 1, True: 1}
     for joint, (sine, cosine) in pairs.items():
         if rig.limited(joint):
-            low, high = rig.lower[joint - 1], rig.upper[joint - 1]
-            middle, half = (low + high) / 2, (high - low) / 2
-            inside = np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half)
+            inside = _within(rig, joint, sine, cosine, 0.0)
             angles[joint > 3] = ca.logic_and(angles[joint > 3], inside)
-    slide_lower = p.q1 >= rig.lower[0] if np.isfinite(rig.lower[0]) else 1
-    slide_upper = p.q1 <= rig.upper[0] if np.isfinite(rig.upper[0]) else 1
-    return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], slide_lower, slide_upper)
+    low, high = rig.limit(1, False), rig.limit(1, True)
+    slide = p.q1 >= low if np.isfinite(low) else 1, p.q1 <= high if np.isfinite(high) else 1
+    return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], *slide)
 
 
 def angle_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
@@ -160,7 +156,7 @@ def simple_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]
         ends += [Candidate(c, s, code), Candidate(c, -s, code)]
     for upper in (False, True):
         if rig.limited(6):
-            angle = _inside(rig, 6, upper)
+            angle = inside_limit(rig, 6, upper)
             ends.append(Candidate(np.cos(angle), np.sin(angle), limit_code(6, upper)))
     return ends
 
@@ -182,11 +178,11 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[Level]:
             add(0.0, sign * (1 - REACH_INSET), 2, sign < 0, 1)
     for upper in (False, True):
         if rig.limited(2):
-            angle = _inside(rig, 2, upper)
+            angle = inside_limit(rig, 2, upper)
             if branch.yaw * np.sin(angle) > 0:
                 add(np.sin(angle), np.cos(angle), limit_code(2, upper), (branch.yaw < 0) != upper, 1)
         if rig.limited(3):
-            angle = _inside(rig, 3, upper)
+            angle = inside_limit(rig, 3, upper)
             cosine = s_yaw * np.cos(angle) - c_yaw * np.sin(angle)  # of q2 = yaw - pi/2 - q3
             sine = -c_yaw * np.cos(angle) - s_yaw * np.sin(angle)
             within = ca.logic_and(branch.yaw * sine > -LIMIT_SLACK, _within(rig, 2, sine, cosine))
@@ -209,7 +205,9 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
     f = minus(square, scaled(stretched, s_yaw * s_yaw))
     slope = f.derivative()
     # a double root leaves Newton nothing but rounding to go by: hence the short reach
-    return [polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_REACH) for p in roots(f, steps=0)]
+    return [
+        polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_POLISH_REACH) for p in roots(f, steps=0)
+    ]
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
@@ -220,33 +218,33 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
             found.append((sign * (1 - REACH_INSET), 1))
     for upper in (False, True):
         if rig.limited(4):
-            angle = _inside(rig, 4, upper)
+            angle = inside_limit(rig, 4, upper)
             if branch.pitch * np.cos(angle) > 0:
                 found.append((np.sin(angle), limit_code(4, upper)))
         if rig.limited(5):
-            found.append((ca.cos(target[4] - _inside(rig, 5, upper)), limit_code(5, upper)))
+            found.append((ca.cos(target[4] - inside_limit(rig, 5, upper)), limit_code(5, upper)))
     return found
 
 
-def _inside(rig: Rig, joint: int, upper: bool) -> float:
-    return float(rig.upper[joint - 1] - ANGLE_INSET if upper else rig.lower[joint - 1] + ANGLE_INSET)
+def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
+    """Position of a joint just inside one of its limits, m or rad."""
+    return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
-def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression) -> Expression:
+def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = LIMIT_SLACK) -> Expression:
     """Whether an angle given by its sine and cosine is within the limits of a joint, or as good as."""
     if not rig.limited(joint):
         return 1
-    low, high = rig.lower[joint - 1], rig.upper[joint - 1]
-    middle, half = (low + high) / 2, (high - low) / 2
-    return np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half) - LIMIT_SLACK
+    middle, half = rig.middle_and_half(joint)
+    return np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half) - slack
 
 
 def _allows(rig: Rig, joint: int, angle: float) -> bool:
     """Whether the limits of a joint allow an angle, in whatever turn."""
     if not rig.limited(joint):
         return True
-    low, high = rig.lower[joint - 1], rig.upper[joint - 1]
-    return bool(np.cos(angle - (low + high) / 2) >= np.cos((high - low) / 2) - 1e-9)
+    middle, half = rig.middle_and_half(joint)
+    return bool(np.cos(angle - middle) >= np.cos(half) - 1e-9)
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
@@ -271,7 +269,7 @@ def sharp_level(rig: Rig, chart: Any, target: Expression, value: Expression, abo
     """
     c, s = sharp_point(chart, target, 0, value, point)
     cos4 = ca.fabs(chart(target, c, s)[4])
-    margin = ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
+    margin = SINE_ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
     return polish((c, s), sharper(chart, target, 0, value + above * margin), 1)
 
 
@@ -300,7 +298,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     Output shape (2, 8): rows cosine and sine of the roll.
     """
     t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-    slope = sharper(yaw_chart(rig, branch), t, 2, slide_limit(rig, upper))
+    slope = sharper(yaw_chart(rig, branch), t, 2, inside_limit(rig, 1, upper))
     sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), slope)) for k in range(8)]
     polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
     target = ca.MX.sym("target", 5)
@@ -308,14 +306,9 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
 
 
-def slide_limit(rig: Rig, upper: bool) -> float:
-    """Position of joint 1 just inside one of its limits, m."""
-    return float((rig.upper if upper else rig.lower)[0] + (-1 if upper else 1) * ANGLE_INSET)
-
-
 def slide_points(rig: Rig, upper: bool) -> Any:
     """Function of the target -> points near the ends of arcs by one limit of joint 1. Output shape (2, 8)."""
-    limit = slide_limit(rig, upper)
+    limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
     s_yaw, c_yaw = ca.sin(t[3]), ca.cos(t[3])

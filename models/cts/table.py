@@ -10,15 +10,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number, one_for_each
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clear_inverse
 from models.cts.rig import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
 from models.cts.roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
 from models.errors import ModelError
-
-TURN = 2 * np.pi
-TOLERANCE = 1e-9
+from models.spatial import FULL_TURN
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +27,8 @@ class Table:
         targets: Shape (samples, 5), m and rad.
         joints: Shape (samples, 6), m and rad; nan in the rows that are not ok.
         cost: Index of the roll, nan in the rows that are not ok. Shape (samples,).
-        status: One of cts_roll.STATUS for each row: "ok", or why there are no joints.
-        active: One of cts_roll.ACTIVE for each row: the constraint that holds the roll, "free" where none does, ""
+        status: One of roll.STATUS for each row: "ok", or why there are no joints.
+        active: One of roll.ACTIVE for each row: the constraint that holds the roll, "free" where none does, ""
             where the row is not ok.
         branch: The branch of each row, None where the row is not ok.
     """
@@ -73,7 +71,7 @@ def solve_table(
             passed over.
         rate_weight: w4 of I2; 0 for I1.
         surroundings: What to keep clear of, None for nothing, by at least `clearance`, m, or by a term
-            clearance_weight exp(-distance / clearance_width) of the index; see cts_clearance.clear_inverse.
+            clearance_weight exp(-distance / clearance_width) of the index; see clear_inverse.
 
     Raises:
         ModelError: An empty table, another shape, no branch, an unknown branch, a previous roll that is not finite.
@@ -81,30 +79,15 @@ def solve_table(
     rows = checked_targets(targets, finite=False)
     chosen = [checked_branch(branch) for branch in branches]
     if not chosen:
-        raise ModelError("branches is empty; give at least one, for example (HOME,)")
+        raise ModelError("branches is empty; give at least one, for example (HOME,)", name="branches", value=branches)
     count = len(rows)
-    try:
-        before = np.broadcast_to(np.asarray(previous, dtype=float), (count,))
-    except ValueError as error:
-        raise ModelError(f"previous has shape {np.shape(previous)}, expected () or ({count},)") from error
-    if not np.isfinite(before).all():
-        raise ModelError("previous holds a roll that is not finite")
+    before = one_for_each(previous, count, "table", "previous", "targets")
     if surroundings is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
     else:
-        functions = [
-            clear_inverse(
-                rig,
-                tunnel,
-                surroundings,
-                branch,
-                clearance=clearance,
-                weight=clearance_weight,
-                width=clearance_width,
-                rate_weight=rate_weight,
-            )
-            for branch in chosen
-        ]
+        term = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
+        inputs = rig, tunnel, surroundings
+        functions = [clear_inverse(*inputs, branch, rate_weight=rate_weight, **term) for branch in chosen]
     if in_sequence:
         roll, steps = float(before[0]), []
         for row in rows:
@@ -141,18 +124,16 @@ def _best(results: list[Any]) -> Array:
 
 def checked_branch(branch: Branch) -> Branch:
     """The branch itself; ModelError unless it is one of the four."""
-    if tuple(branch) not in [tuple(known) for known in BRANCHES]:
-        raise ModelError(f"branch {branch!r} is not one of {BRANCHES}")
-    return Branch(*branch)
+    return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
 
 
 @dataclass(frozen=True)
-class Arc:
+class RollInterval:
     """A range of rolls that reach within all limits.
 
     Attributes:
         start, end: rad, end >= start; a whole turn is -pi .. pi.
-        holds: Constraints (of cts_roll.ACTIVE) at start and end; ("free", "free") for a whole turn.
+        holds: Constraints (of roll.ACTIVE) at start and end; ("free", "free") for a whole turn.
     """
 
     start: float
@@ -160,7 +141,7 @@ class Arc:
     holds: tuple[str, str]
 
 
-def reachable_arcs(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[Arc]:
+def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
     """All rolls, modulo a turn, that hold a target within reach and joint limits, start in [-pi, pi).
 
     Args:
@@ -170,38 +151,38 @@ def reachable_arcs(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[
         ModelError: A target of another shape or not finite.
     """
     row = checked_targets([target])[0]
-    ends, feasible = arc_functions(rig, checked_branch(branch))
+    ends, feasible = roll_interval_functions(rig, checked_branch(branch))
     points = np.array(ends(row))
     turns = np.arctan2(points[1], points[0])
     order = np.argsort(turns)
     turns, codes = turns[order], points[2][order].astype(int)
     if not len(turns):
         turns, codes = np.array([-np.pi]), np.array([0])
-    middles = (turns + np.append(turns[1:], turns[0] + TURN)) / 2
+    middles = (turns + np.append(turns[1:], turns[0] + FULL_TURN)) / 2
     inside = np.array(feasible.map(len(middles))(row, middles[None])).ravel() > 0
     if inside.all():
-        return [Arc(-np.pi, np.pi, ("free", "free"))]
-    arcs = []
+        return [RollInterval(-np.pi, np.pi, ("free", "free"))]
+    found = []
     count = len(turns)
     for k in np.flatnonzero(inside & ~np.roll(inside, 1)):
         last = int(k)
         while inside[(last + 1) % count]:
             last += 1
         stop = (last + 1) % count
-        end = float(turns[stop] + (TURN if turns[stop] <= turns[k] else 0.0))
-        arcs.append(Arc(float(turns[k]), end, (ACTIVE[codes[k]], ACTIVE[codes[stop]])))
-    return arcs
+        end = float(turns[stop] + (FULL_TURN if turns[stop] <= turns[k] else 0.0))
+        found.append(RollInterval(float(turns[k]), end, (ACTIVE[codes[k]], ACTIVE[codes[stop]])))
+    return found
 
 
 @lru_cache(maxsize=16)  # a rig is frozen; one asked again is the same
-def arc_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
+def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     """Functions (target) -> points that hold all ends of arcs, rows cosine, sine, code; (target, roll) -> 1 or 0."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
     angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in angle_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
     parts = [ca.Function("angle_ends", [target], [angle])(x)]
     for upper in (False, True):
-        if np.isfinite((rig.upper if upper else rig.lower)[0]):
+        if np.isfinite(rig.limit(1, upper)):
             found = slide_ends(rig, branch, upper)(x)
             parts.append(ca.vertcat(found, ca.DM.ones(1, 8) * limit_code(1, upper)))
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
@@ -218,8 +199,7 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
         ModelError: A target or roll that is not finite; a pose that no branch reaches, naming the link.
     """
     row = checked_targets([target])[0]
-    if not np.isfinite(roll):
-        raise ModelError(f"roll {roll} is not finite")
+    checked_number(roll, "rig", "roll")
     found, short = [], []
     for branch in BRANCHES:
         joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
@@ -230,21 +210,11 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
     if not found:
         pitch, yaw = np.max(short, axis=0)
         link, by = ("pitch", pitch * rig.pitch_link) if pitch < 0 else ("yaw", yaw * rig.yaw_link_1)
-        raise ModelError(f"target {row.tolist()} with roll {roll} rad: the {link} link is {-by:.4g} m too short")
+        message = f"target {row.tolist()} with roll {roll} rad: the {link} link is {-by:.4g} m too short"
+        raise ModelError(message, name=f"{link} link", value=-by, limit=0.0)
     return found
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Targets as an array of shape (samples, 5), samples >= 1; ModelError naming the first row that is wrong."""
-    try:
-        rows = np.array(targets, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError("targets are not an array of numbers of shape (samples, 5)") from error
-    if rows.size == 0:
-        raise ModelError("targets: the table is empty; give at least one row (x, y, z, yaw, pitch)")
-    if rows.ndim != 2 or rows.shape[1] != 5:
-        raise ModelError(f"targets have shape {rows.shape}, expected (samples, 5): x, y, z, yaw, pitch")
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if finite and bad.size:
-        raise ModelError(f"targets: row {bad[0]} is {rows[bad[0]].tolist()}, not finite")
-    return rows
+    """Targets (x, y, z, yaw, pitch), at least one, shape (samples, 5); ModelError naming the first wrong row."""
+    return checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)

@@ -1,8 +1,8 @@
-"""Where a trigonometric polynomial of one angle vanishes, in a fixed number of operations and without branches.
+"""Where a trigonometric polynomial of one angle vanishes or is least, in a bounded number of operations.
 
 Points of the unit circle are pairs (cosine, sine), so that nothing here calls a trigonometric function of the angle.
-
-Roots of a trigonometric polynomial of any degree, all at once, in a bounded number of operations.
+Polynomials of two harmonics are solved in closed form and without branches, those of any degree by a simultaneous
+iteration on all their roots.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 
 SMALLEST_SECOND = 1e-6
 """Least second harmonic, relative, that the pencil of conics is given; the polish takes the difference out again."""
-TINY = 1e-300
+SMALLEST_DIVISOR = 1e-300
 SMALLEST_SQUARED = 1e-100  # a second harmonic whose square is still a number
 CUBIC_STEPS, POLISH_STEPS, POLISH_REACH, LEAST_STEPS = 2, 3, 0.05, 4
 
@@ -82,7 +82,7 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS)
         sharper: Function to polish with in place of f: one that shares the roots that matter and has them simple.
         steps: Newton steps of the polish; with none, simple roots are good to about 1e-6.
     """
-    size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + TINY
+    size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + SMALLEST_DIVISOR
     f = Harmonics(f.a0 / size, f.a1 / size, f.b1 / size, f.a2 / size, f.b2 / size)
     a0 = ca.fmin(ca.fmax(f.a0, -3.0), 3.0)  # beyond there is no root, only lost digits
     plain = f.a2 * f.a2 + f.b2 * f.b2 < SMALLEST_SECOND**2
@@ -90,12 +90,12 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS)
 
     t = _pencil(a0, p, q, r)
     wide, narrow = ca.sqrt(r * (1 + t)), ca.sqrt(r * (1 - t))
-    p_direct, q_direct = ca.fabs(p) / (2 * wide + TINY), ca.fabs(q) / (2 * narrow + TINY)
+    p_direct, q_direct = ca.fabs(p) / (2 * wide + SMALLEST_DIVISOR), ca.fabs(q) / (2 * narrow + SMALLEST_DIVISOR)
     direct = t >= 0  # divide by the larger of the two square roots, take the other part from the pencil
     p_part = ca.if_else(direct, p_direct, ca.sqrt(ca.fmax(0.0, a0 - r * t + q_direct * q_direct)))
     q_part = ca.if_else(direct, ca.sqrt(ca.fmax(0.0, r * t - a0 + p_direct * p_direct)), q_direct)
     outer = p_part + q_part
-    inner = (r * t - a0) / ca.fmax(outer, TINY)  # q_part - p_part without its cancellation
+    inner = (r * t - a0) / ca.fmax(outer, SMALLEST_DIVISOR)  # q_part - p_part without its cancellation
     sign = _sign(p)
     alike = _sign(p) * _sign(q) > 0
     first = ca.if_else(alike, -sign * outer, sign * inner)
@@ -142,7 +142,7 @@ def least_point(f: Harmonics) -> Point:
     big_p, big_q = ca.fabs(p), ca.fabs(q)
     scale = 1 / (big_p + big_q + 4 * r)
     big_p, big_q, big_r = big_p * scale, big_q * scale, 4 * r * scale
-    hypot = ca.sqrt(big_p * big_p + big_q * big_q) + TINY
+    hypot = ca.sqrt(big_p * big_p + big_q * big_q) + SMALLEST_DIVISOR
     widest = ca.fmax(big_p, big_r)
     c = big_p / ca.fmax(hypot, big_r)
     s_cusp = ca.fmin(1.0, 2 * big_q / widest) ** (1 / 3)
@@ -172,7 +172,7 @@ def polish(point: Point, function: Slope, steps: int = POLISH_STEPS, reach: floa
     c, s = point
     for _ in range(steps):
         value, slope = function(c, s)
-        step = -value * slope / (slope * slope + TINY)
+        step = -value * slope / (slope * slope + SMALLEST_DIVISOR)
         step = ca.fmin(ca.fmax(step, -reach), reach)
         c, s = c - step * s, s + step * c
         shrink = 1.5 - 0.5 * (c * c + s * s)  # 1 / norm to first order
@@ -193,10 +193,10 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
     big_q = (b2 * b2 - 3 * b1) / 9
     big_r = (2 * b2 * b2 * b2 - 9 * b2 * b1 + 27 * b0) / 54
     excess = big_r * big_r - big_q * big_q * big_q
-    grow = (ca.fabs(big_r) + ca.sqrt(ca.fmax(excess, 0.0)) + TINY) ** (1 / 3)
+    grow = (ca.fabs(big_r) + ca.sqrt(ca.fmax(excess, 0.0)) + SMALLEST_DIVISOR) ** (1 / 3)
     lone = -_sign(big_r) * (grow + big_q / grow) - b2 / 3
     root_q = ca.sqrt(ca.fmax(big_q, 0.0))
-    third = ca.acos(ca.fmin(ca.fmax(big_r / (root_q * root_q * root_q + TINY), -1.0), 1.0)) / 3
+    third = ca.acos(ca.fmin(ca.fmax(big_r / (root_q * root_q * root_q + SMALLEST_DIVISOR), -1.0), 1.0)) / 3
     least = -2 * root_q * ca.cos(third) - b2 / 3
     greatest = root_q * (ca.cos(third) + 3**0.5 * ca.sin(third)) - b2 / 3
     # of three real roots an odd number lies in [-1, 1]: the least does, or else the greatest
@@ -205,7 +205,7 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
     for _ in range(CUBIC_STEPS):
         value = ((t + b2) * t + b1) * t + b0
         slope = (3 * t + 2 * b2) * t + b1
-        step = -value * slope / (slope * slope + TINY)
+        step = -value * slope / (slope * slope + SMALLEST_DIVISOR)
         t = ca.fmin(ca.fmax(t + ca.fmin(ca.fmax(step, -1e-2), 1e-2), -1.0), 1.0)
     return t
 
@@ -284,7 +284,7 @@ def series_roots(degree: int) -> Any:
     step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*moved), longest])
 
     symbol = ca.MX.sym("coefficients", 2, degree + 1)
-    norm = ca.Function("norm", [given], [given / (ca.norm_1(ca.vec(given)) + TINY)])(symbol)
+    norm = ca.Function("norm", [given], [given / (ca.norm_1(ca.vec(given)) + SMALLEST_DIVISOR)])(symbol)
     angles = [0.37 + 2 * ca.pi * i / n for i in range(n)]
     # off the circle the roots are in pairs z, 1 / conj z: one half starts inside, the other outside
     radii = [3.0 if i % 2 else 1 / 3.0 for i in range(n)]
@@ -298,7 +298,7 @@ def series_roots(degree: int) -> Any:
             continue
         keep = ca.Function("keep", [z, unit], [z, 0])
         found, moving = ca.Function.if_else("aberth", stage, keep)(moving > 0, found, norm)
-    circle = ca.Function("circle", [z], [z / ca.repmat(ca.sqrt(ca.sum1(z * z) + TINY), 2, 1)])
+    circle = ca.Function("circle", [z], [z / ca.repmat(ca.sqrt(ca.sum1(z * z) + SMALLEST_DIVISOR), 2, 1)])
     return ca.Function("series_roots", [symbol], [circle(found)], ["coefficients"], ["points"])
 
 
@@ -316,5 +316,5 @@ def _times(a: Point, b: Point) -> Point:
 
 
 def _over(a: Point, b: Point) -> Point:
-    scale = 1 / (b[0] * b[0] + b[1] * b[1] + TINY)
+    scale = 1 / (b[0] * b[0] + b[1] * b[1] + SMALLEST_DIVISOR)
     return (a[0] * b[0] + a[1] * b[1]) * scale, (a[1] * b[0] - a[0] * b[1]) * scale

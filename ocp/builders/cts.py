@@ -3,11 +3,10 @@
 The paper resolves each target by itself, with the change of roll since the last one in the index (38): the plan lags
 behind what is to come. Here the integral of I1 and of the squared roll rate is least over all targets at once.
 
-First guess of the roll plan: dynamic programming over a grid of rolls and times, which finds the way round.
-
-The roll of least index of each target by itself may lie inside an obstacle, or jump from one side of it to the other;
-near such a guess there is no plan. Here the whole course of least cost on a grid is found, with penalties for what is
-out of reach, beyond limits or too near, and is then refined within a tube about itself that grows thinner.
+The first guess finds the way round. The roll of least index of each target by itself may lie inside an obstacle, or
+jump from one side of it to the other; near such a guess there is no plan. So the whole course of least cost is found
+by dynamic programming over a grid of rolls and times, with penalties for what is out of reach, beyond limits or too
+near, and is then refined within a tube about itself that grows thinner.
 """
 
 from __future__ import annotations
@@ -22,11 +21,12 @@ import numpy as np
 from models import ModelError
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import Radii, Surroundings, clearances, nearness
+from models.cts.clearance import Radii, Surroundings, checked_clearance, clearances, nearness
 from models.cts.rig import HOME, Branch, Rig, Tunnel, joints_of, posture_at
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.capsules import soft_minimum
+from models.spatial import FULL_TURN
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem
@@ -34,10 +34,15 @@ from ocp.problem.problem import Problem
 __all__ = ["ROLLS", "least_course", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
-REACH = 1 - 1e-9
+LARGEST_SINE = 1 - 1e-9  # of q4, and cosine of q2: short of the end of the reach
 GUESS_TIMES = 65
-DEAR = 1e3  # of a violation in the guess: per m, rad or unit of a sine
+VIOLATION_PRICE = 1e3  # of a violation in the guess: per m, rad or unit of a sine
 GUESS_MARGIN = 2.0  # widths of the smooth minimum that the guess keeps beyond the clearance asked for
+ROLLS = 120
+"""Rolls of the grid to a turn."""
+TUBE_SIDE, TUBE_FINER, TUBE_LEVELS = 8, 4, 3  # rolls of the tube to each side, how much finer each level is, levels
+LARGEST_WAY = 2 * FULL_TURN  # how far from its start a roll with limits is looked for, rad
+STEPS_BY_RATE = 2.0  # grid steps that the rate limit should allow from one time to the next
 
 
 def spline_targets(times: Any, targets: Any) -> Targets:
@@ -99,30 +104,28 @@ def roll_problem(
         surroundings: What to keep away from; None for nothing.
         clearance: Least distance from it, m; -inf for no constraint.
         clearance_weight, clearance_width: Of the term weight exp(-distance / width) of the index; width in m.
-        softness: Width of the smooth minimum of all distances, m, see clearance.soft_minimum.
+        softness: Width of the smooth minimum of all distances, m, see soft_minimum.
         radii: Of the rig's capsules.
         symbols: casadi.MX, or casadi.SX where the targets are plain expressions.
 
     Returns:
-        The problem; its guess is the course of least cost on a grid of rolls and times, see cts_guess.
+        The problem; its guess is the course of least cost on a grid of rolls and times, see least_course.
 
     Raises:
         ProblemError: Weights or limits that are negative, a horizon that is not positive, a target on the way that
             no roll reaches, a start outside the limits.
     """
-    for name, value in (
-        ("rate_weight", rate_weight),
-        ("acceleration_weight", acceleration_weight),
-        ("rate_limit", rate_limit),
-        ("acceleration_limit", acceleration_limit),
-        ("clearance_weight", clearance_weight),
-    ):
+    weights = {"rate_weight": rate_weight, "acceleration_weight": acceleration_weight, "rate_limit": rate_limit}
+    weights |= {"acceleration_limit": acceleration_limit, "clearance_weight": clearance_weight}
+    for name, value in weights.items():
         if not value >= 0:
             raise ProblemError(f"roll_problem: {name} {value} must not be negative")
     if not clearance_width > 0:
         raise ProblemError(f"roll_problem: clearance_width {clearance_width} m must be positive")
-    if np.isnan(clearance) or clearance == np.inf:
-        raise ProblemError(f"roll_problem: clearance {clearance} m must be a finite distance or -inf for none")
+    try:
+        checked_clearance(clearance)
+    except ModelError as error:
+        raise ProblemError(f"roll_problem: {error}") from error
     if not (np.isfinite(horizon) and horizon > 0):
         raise ProblemError(f"roll_problem: horizon {horizon} s must be positive and finite")
     if start_roll is not None and not np.isfinite(start_roll):
@@ -136,26 +139,30 @@ def roll_problem(
     reached = ca.vertcat(posture.sin4, posture.cos2)
     index = index_harmonics(rig, tunnel, x).value(c, s)
     near: Any = 0.0
-    short = _beyond(reached, -REACH, REACH) + _beyond(limited, rig.lower[held], rig.upper[held])
+    short = _beyond(reached, -LARGEST_SINE, LARGEST_SINE) + _beyond(limited, rig.lower[held], rig.upper[held])
     if surroundings is not None:
         gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
         near = nearness(gap, clearance_weight, clearance_width)
         if np.isfinite(clearance):
             short += ca.fmax(clearance + GUESS_MARGIN * softness - gap, 0)
-    curve = _curve(targets, symbols)
-    price = index + ca.fmin(near, DEAR) + DEAR * short
-    start, speed = _guess(
-        rig,
-        tunnel,
-        branch,
-        curve,
-        ca.Function("price", [x, phi], [ca.cse(price)]),
-        np.linspace(0, horizon, GUESS_TIMES),
+    t = np.linspace(0, horizon, GUESS_TIMES)
+    rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
+    status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
+    if status.any():
+        at = t[int(np.flatnonzero(status)[0])]
+        raise ProblemError(f"roll_problem: no roll reaches the target at {at:.4g} s; see solve_table")
+    price = ca.Function("price", [x, phi], [ca.cse(index + ca.fmin(near, VIOLATION_PRICE) + VIOLATION_PRICE * short)])
+    first = least_course(
+        lambda times, rolls: np.asarray(np.array(price.map(len(rolls))(rows[:, times], rolls[None]))[0]),
+        t,
+        lower=rig.limit(6, False),
+        upper=rig.limit(6, True),
         start=start_roll,
         rate_weight=rate_weight,
         acceleration_weight=acceleration_weight,
         rate_limit=rate_limit,
     )
+    start, speed = Samples(t, first[:, None]), Samples(t, np.gradient(first, t)[:, None])
 
     problem = Problem("roll plan", symbols=symbols)
     roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=start)
@@ -170,7 +177,7 @@ def roll_problem(
         """The value on the way."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
-    problem.path("reach", along("reach", reached), -REACH, REACH)
+    problem.path("reach", along("reach", reached), -LARGEST_SINE, LARGEST_SINE)
     if held:
         problem.path("limits", along("joints", limited), rig.lower[held], rig.upper[held])
     if surroundings is not None and np.isfinite(clearance):
@@ -193,31 +200,6 @@ def _curve(targets: Targets, symbols: Any) -> Any:
 def _beyond(value: Any, lower: Any, upper: Any) -> Any:
     """By how much the entries are outside their bounds, in total."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
-
-
-def _guess(
-    rig: Rig, tunnel: Tunnel, branch: Branch, curve: Any, cost: Any, t: Array, **options: Any
-) -> tuple[Samples, Samples]:
-    """Roll and rate over time by dynamic programming on a grid; see cts_guess."""
-    rows = np.array(curve.map(len(t))(t[None]))
-    status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
-    if status.any():
-        at = t[int(np.flatnonzero(status)[0])]
-        raise ProblemError(f"roll_problem: no roll reaches the target at {at:.4g} s; see cts_table.solve_table")
-
-    def costs(times: Any, rolls: Any) -> Array:
-        return np.asarray(np.array(cost.map(len(rolls))(rows[:, times], rolls[None]))[0])
-
-    roll = least_course(costs, t, lower=float(rig.lower[5]), upper=float(rig.upper[5]), **options)
-    return Samples(t, roll[:, None]), Samples(t, np.gradient(roll, t)[:, None])
-
-
-TURN = 2 * np.pi
-ROLLS = 120
-"""Rolls of the grid to a turn."""
-SIDE, FINER, LEVELS = 8, 4, 3  # rolls of the tube to each side, how much finer each level is, levels
-WINDOW = 2 * TURN  # how far from its start a roll with limits is looked for, rad
-SLOW = 2.0  # grid steps that the rate limit should allow from one time to the next
 
 
 def least_course(
@@ -244,12 +226,12 @@ def least_course(
         rate_limit: rad/s; the first grid may exceed it by one step.
     """
     count, about = len(t), float(np.clip(0.0, lower, upper)) if start is None else start
-    step = TURN / ROLLS
+    step = FULL_TURN / ROLLS
     circle = not np.isfinite([lower, upper]).any()
     if circle:
         rolls = about + step * np.arange(ROLLS) - np.pi
     else:
-        first, last = max(lower, about - WINDOW), min(upper, about + WINDOW)
+        first, last = max(lower, about - LARGEST_WAY), min(upper, about + LARGEST_WAY)
         rolls = np.linspace(first, last, int(np.ceil((last - first) / step)) + 1) if first < last else np.array([about])
     table = cost(np.repeat(np.arange(count), len(rolls)), np.tile(rolls, count)).reshape(count, -1)
     gain = float(np.median(np.median(table, axis=1) - table.min(axis=1)))  # of the best roll over any
@@ -259,19 +241,19 @@ def least_course(
     if start is not None:
         table[0, np.arange(len(rolls)) != int(np.abs(rolls - about).argmin())] = np.inf
     # a slow roll needs a coarse grid of times: else a step of the grid is faster than it may move
-    ticks = int(np.clip((t[-1] - t[0]) * min(rate_limit, 1e6) / (SLOW * step), 8, count))
+    ticks = int(np.clip((t[-1] - t[0]) * min(rate_limit, 1e6) / (STEPS_BY_RATE * step), 8, count))
     groups = np.array_split(np.arange(count), ticks)
     stage = np.array([table[group].mean(axis=0) for group in groups])
     at = np.array([t[group].mean() for group in groups])
     away = rolls[None, :] - rolls[:, None]
     if circle:
-        away = (away + np.pi) % TURN - np.pi
+        away = (away + np.pi) % FULL_TURN - np.pi
     path = _cheapest(stage, [away] * (ticks - 1), np.diff(at), rate_weight, rate_limit, step)
     moves = [away[i, k] for i, k in pairwise(path)]
     roll = np.interp(t, at, rolls[path[0]] + np.concatenate([[0.0], np.cumsum(moves)]))
-    for _ in range(LEVELS):
-        step /= FINER
-        offsets = step * np.arange(-SIDE, SIDE + 1)
+    for _ in range(TUBE_LEVELS):
+        step /= TUBE_FINER
+        offsets = step * np.arange(-TUBE_SIDE, TUBE_SIDE + 1)
         tube = np.clip(roll[:, None] + offsets, lower, upper)
         if start is not None:
             tube[0] = start

@@ -13,6 +13,7 @@ from models.spatial import (
     Frame,
     angular_velocity_from_quaternion,
     cross,
+    determinant,
     expression,
     force_cross,
     force_transform,
@@ -26,6 +27,7 @@ from models.spatial import (
     rotation_from_quaternion,
     rotation_from_rpy,
     skew,
+    solve_spd,
     spatial_inertia,
 )
 from tests.models.robot.trees import (
@@ -51,19 +53,23 @@ def scipy_rotation(quaternion: Array) -> Rotation:
     return Rotation.from_quat(quaternion[[1, 2, 3, 0]])
 
 
+def close(found: Any, expected: Any, tolerance: float = 1e-14) -> None:
+    """Vectors are compared as vectors, whether they are columns or not."""
+    known = np.asarray(expected)
+    np.testing.assert_allclose(numeric(found).reshape(known.shape), known, atol=tolerance)
+
+
 @given(seeds)
 def test_skew_and_cross_are_the_vector_product(seed: int) -> None:
     a, b = np.random.default_rng(seed).normal(size=(2, 3))
-    np.testing.assert_allclose(numeric(skew(a)) @ b, np.cross(a, b), atol=1e-14)
-    np.testing.assert_allclose(numeric(cross(a, b)).ravel(), np.cross(a, b), atol=1e-14)
+    close(ca.mtimes(skew(a), b), np.cross(a, b))
+    close(cross(a, b), np.cross(a, b))
 
 
 @given(seeds, angles)
 def test_rotation_agrees_with_scipy(seed: int, angle: float) -> None:
     axis = unit(np.random.default_rng(seed), 3)
-    np.testing.assert_allclose(
-        numeric(rotation(axis, angle)), Rotation.from_rotvec(axis * angle).as_matrix(), atol=1e-14
-    )
+    close(rotation(axis, angle), Rotation.from_rotvec(axis * angle).as_matrix())
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)])
@@ -77,35 +83,28 @@ def test_rotation_about_a_coordinate_axis_has_five_entries_and_an_exact_one(axis
 
 @given(angles, angles, angles)
 def test_rpy_turns_about_fixed_axes_as_scipy(roll: float, pitch: float, yaw: float) -> None:
-    expected = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    np.testing.assert_allclose(numeric(rotation_from_rpy(roll, pitch, yaw)), expected, atol=1e-14)
+    close(rotation_from_rpy(roll, pitch, yaw), Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix())
 
 
 @given(seeds, st.floats(0.01, 100.0))
 def test_quaternion_of_any_norm_gives_the_rotation_of_its_direction(seed: int, norm: float) -> None:
     quaternion = unit(np.random.default_rng(seed), 4)
-    expected = scipy_rotation(quaternion).as_matrix()
-    np.testing.assert_allclose(numeric(rotation_from_quaternion(norm * quaternion)), expected, atol=1e-13)
+    close(rotation_from_quaternion(norm * quaternion), scipy_rotation(quaternion).as_matrix(), 1e-13)
 
 
 @given(seeds)
 def test_quaternion_product_composes_and_the_conjugate_inverts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = unit(rng, 4), unit(rng, 4)
-    product = numeric(quaternion_product(a, b)).ravel()
-    np.testing.assert_allclose(
-        numeric(rotation_from_quaternion(product)), (scipy_rotation(a) * scipy_rotation(b)).as_matrix(), atol=1e-14
-    )
-    np.testing.assert_allclose(
-        numeric(quaternion_product(a, quaternion_conjugate(a))).ravel(), [1.0, 0, 0, 0], atol=1e-15
-    )
+    both = scipy_rotation(a) * scipy_rotation(b)
+    close(rotation_from_quaternion(quaternion_product(a, b)), both.as_matrix())
+    close(quaternion_product(a, quaternion_conjugate(a)), [1.0, 0, 0, 0], 1e-15)
 
 
 @given(seeds, angles)
 def test_quaternion_about_an_axis_is_the_rotation_about_it(seed: int, angle: float) -> None:
     axis = unit(np.random.default_rng(seed), 3)
-    turn = rotation_from_quaternion(quaternion_about(axis, angle))
-    np.testing.assert_allclose(numeric(turn), numeric(rotation(axis, angle)), atol=1e-14)
+    close(rotation_from_quaternion(quaternion_about(axis, angle)), numeric(rotation(axis, angle)))
 
 
 @given(seeds)
@@ -114,27 +113,23 @@ def test_quaternion_rate_gives_the_angular_velocity_of_the_rotation_and_keeps_th
     quaternion, omega = unit(rng, 4), rng.normal(size=3)
     symbol, rate = ca.SX.sym("quaternion", 4), quaternion_rate(quaternion, omega)
     twist = twist_by_differentiation(rotation_from_quaternion(symbol), ca.SX(3, 1), symbol, rate)
-    found = numeric(ca.Function("f", [symbol], [twist])(quaternion)).ravel()
-    np.testing.assert_allclose(found[0:3], omega, atol=1e-13)
+    close(ca.Function("f", [symbol], [twist])(quaternion)[0:3], omega, 1e-13)
     assert abs(float(ca.dot(rate, quaternion))) < 1e-15 * (1 + np.linalg.norm(omega))
-    np.testing.assert_allclose(numeric(angular_velocity_from_quaternion(quaternion, rate)).ravel(), omega, atol=1e-14)
+    close(angular_velocity_from_quaternion(quaternion, rate), omega)
 
 
 @given(seeds)
 def test_force_transform_is_the_inverse_transpose_of_the_motion_transform(seed: int) -> None:
     frame = random_frame(np.random.default_rng(seed))
-    product = numeric(force_transform(frame)).T @ numeric(motion_transform(frame))
-    np.testing.assert_allclose(product, np.eye(6), atol=1e-13)
+    close(ca.mtimes(force_transform(frame).T, motion_transform(frame)), np.eye(6), 1e-13)
 
 
 @given(seeds)
 def test_motion_transforms_compose_as_frames_do(seed: int) -> None:
     rng = np.random.default_rng(seed)
     (r1, p1), (r2, p2) = random_frame(rng), random_frame(rng)
-    both = numeric(motion_transform((r1 @ r2, p1 + r1 @ p2)))
-    np.testing.assert_allclose(
-        numeric(motion_transform((r1, p1))) @ numeric(motion_transform((r2, p2))), both, atol=1e-13
-    )
+    product = ca.mtimes(motion_transform((r1, p1)), motion_transform((r2, p2)))
+    close(product, numeric(motion_transform((r1 @ r2, p1 + r1 @ p2))), 1e-13)
 
 
 @given(seeds)
@@ -158,7 +153,7 @@ def test_force_cross_keeps_power_constant(seed: int) -> None:
     velocity, motion, force = np.random.default_rng(seed).normal(size=(3, 6))
     power_rate = (numeric(motion_cross(velocity)) @ motion) @ force + motion @ (numeric(force_cross(velocity)) @ force)
     assert abs(power_rate) < 1e-12
-    np.testing.assert_allclose(numeric(motion_cross(velocity)) @ velocity, 0, atol=1e-14)
+    close(ca.mtimes(motion_cross(velocity), velocity), np.zeros(6))
 
 
 @given(seeds)
@@ -169,8 +164,7 @@ def test_spatial_inertia_gives_the_momentum_of_point_masses(seed: int) -> None:
     inertia = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, points - center, strict=True))
     speeds = velocity[3:] + np.cross(velocity[:3], points)
     expected = np.concatenate([(masses[:, None] * np.cross(points, speeds)).sum(axis=0), masses @ speeds])
-    found = numeric(spatial_inertia(masses.sum(), center, inertia)) @ velocity
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    close(ca.mtimes(spatial_inertia(masses.sum(), center, inertia), velocity), expected, 1e-12)
 
 
 @given(seeds)
@@ -178,10 +172,9 @@ def test_spatial_inertia_transforms_as_a_map_from_motions_to_momenta(seed: int) 
     rng = np.random.default_rng(seed)
     frame = Frame(*random_frame(rng))
     mass, center, inertia = 1.7, rng.normal(size=3), random_inertia(rng, 1.7)
-    there = numeric(spatial_inertia(mass, center, inertia))
     here = spatial_inertia(mass, frame.point(center), frame.rotation @ inertia @ frame.rotation.T)
-    to_here = numeric(force_transform(frame))
-    np.testing.assert_allclose(numeric(here), to_here @ there @ to_here.T, atol=1e-12)
+    to_here = force_transform(frame)
+    close(ca.mtimes([to_here, spatial_inertia(mass, center, inertia), to_here.T]), numeric(here), 1e-12)
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
@@ -214,7 +207,7 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any) -> None:
     x, y = symbols.sym("x", 6), symbols.sym("y", 6)
     found = ca.Function("f", [x, y], everything(x, y))(a, b)
     for one, other in zip(found, everything(ca.DM(a), ca.DM(b)), strict=True):
-        np.testing.assert_allclose(numeric(one), numeric(other), atol=1e-14)
+        close(one, numeric(other))
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
@@ -235,3 +228,73 @@ def test_lists_with_symbols_are_stacked_and_not_read_as_numbers(symbols: Any) ->
 
 def test_a_list_of_casadi_numbers_is_a_matrix_of_them() -> None:
     assert numeric(expression([ca.DM(1), 2, ca.DM(3)])).ravel().tolist() == [1, 2, 3]
+
+
+# ---- small matrices ---------------------------------------------------------------------------------------------
+
+
+def random_spd(rng: np.random.Generator, size: int) -> Array:
+    square = rng.normal(size=(size, size))
+    return square @ square.T + 0.1 * np.eye(size)
+
+
+@given(seeds, st.integers(1, 7), st.integers(1, 7))
+def test_solve_spd_agrees_with_numpy(seed: int, size: int, columns: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix, right = random_spd(rng, size), rng.normal(size=(size, columns))
+    expected = np.linalg.solve(matrix, right)
+    np.testing.assert_allclose(numeric(solve_spd(matrix, right)), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+@pytest.mark.parametrize("size", range(1, 8))
+def test_solve_spd_and_determinant_take_symbols(symbols: Any, size: int) -> None:
+    rng = np.random.default_rng(size)
+    matrix, right = random_spd(rng, size), rng.normal(size=(size, 3))
+    a, b = symbols.sym("a", size, size), symbols.sym("b", size, 3)
+    x, d = ca.Function("f", [a, b], [solve_spd(a, b), determinant(a)])(matrix, right)
+    np.testing.assert_allclose(numeric(x), np.linalg.solve(matrix, right), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(float(d), np.linalg.det(matrix), rtol=1e-10)
+
+
+def test_solve_spd_derivative_is_minus_inverse_times_change_times_solution() -> None:
+    rng = np.random.default_rng(3)
+    matrix, right, change = random_spd(rng, 5), rng.normal(size=5), random_spd(rng, 5)
+    step = ca.SX.sym("step")
+    moved = solve_spd(ca.DM(matrix) + step * ca.DM(change), ca.DM(right))
+    slope = numeric(ca.Function("f", [step], [ca.jacobian(moved, step)])(0)).ravel()
+    solution = np.linalg.solve(matrix, right)
+    np.testing.assert_allclose(slope, -np.linalg.solve(matrix, change @ solution), rtol=1e-9)
+
+
+def test_structural_zeros_stay_zero_and_cost_nothing() -> None:
+    a, b = ca.SX.sym("a", ca.Sparsity.diag(4)), ca.SX.sym("b", 4)
+    x = solve_spd(a, b)
+    assert ca.Function("f", [a, b], [x]).n_instructions() <= 4 * 5
+    found = ca.Function("f", [a, b], [x])(ca.DM(np.diag([1.0, 2, 4, 8])).sparsity(), [1, 1, 1, 1])
+    np.testing.assert_allclose(numeric(found).ravel(), 1.0)
+
+
+@pytest.mark.parametrize("size", range(3, 8))
+def test_solve_spd_takes_less_than_half_or_so_of_the_instructions_of_casadi(size: int) -> None:
+    lower, right = ca.SX.sym("a", ca.Sparsity.lower(size)), ca.SX.sym("b", size)
+    matrix = ca.tril2symm(lower)
+    ours, theirs = (
+        ca.Function("f", [lower, right], [x]).n_instructions()
+        for x in (solve_spd(matrix, right), ca.solve(matrix, right))
+    )
+    assert ours < 0.5 * theirs
+
+
+@given(seeds, st.integers(1, 7))
+def test_determinant_agrees_with_numpy(seed: int, size: int) -> None:
+    matrix = np.random.default_rng(seed).normal(size=(size, size))
+    np.testing.assert_allclose(float(determinant(matrix)), np.linalg.det(matrix), rtol=1e-9, atol=1e-9)
+
+
+@given(seeds, st.integers(2, 7))
+def test_determinant_of_a_singular_matrix_is_finite_and_zero(seed: int, size: int) -> None:
+    matrix = np.round(4 * np.random.default_rng(seed).normal(size=(size, size)))
+    matrix[-1] = matrix[0]
+    assert float(determinant(matrix)) == 0.0
+    assert float(determinant(np.zeros((size, size)))) == 0.0

@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
-from models.cts.best_roll import checked_gain
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, forward, inverse, task_jacobian
 from models.cts.roll import index_harmonics
+from models.cts.roll_change import checked_gain
 from models.cts.table import checked_targets
 from models.errors import ModelError
 from models.spatial import Expression, solve_spd

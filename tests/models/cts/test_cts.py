@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -14,6 +15,7 @@ from models.cts.rig import (
     BRANCHES,
     HOME,
     INCH,
+    LENGTHS,
     Branch,
     Rig,
     Tunnel,
@@ -29,6 +31,7 @@ from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
 
+RIG = reference_rig()
 lengths = st.lists(st.floats(0.02, 3.0), min_size=6, max_size=6)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -151,115 +154,91 @@ def test_limits_choose_the_turn_of_an_angle() -> None:
     np.testing.assert_allclose(pose_of(rig, turned)[:3], pose_of(rig, free)[:3], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck"])
+@pytest.mark.parametrize("name", LENGTHS)
 @pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
 def test_a_length_that_is_not_positive_is_named(name: str, value: float) -> None:
-    sizes = {"yaw_link_1": 1, "yaw_link_2": 1, "yaw_offset": 1, "pitch_link": 1, "sting": 1, "goose_neck": 1}
     with pytest.raises(ModelError, match=name):
-        Rig(**{**sizes, name: value})
+        Rig(**{**dict.fromkeys(LENGTHS, 1.0), name: value})
 
 
-def test_limits_that_cannot_be_are_named() -> None:
-    with pytest.raises(ModelError, match="joint 3"):
-        reference_rig(lower=(0, 0, 1, 0, 0, 0), upper=(1, 1, 0, 1, 1, 1))
-    with pytest.raises(ModelError, match="joint 2"):
-        reference_rig(lower=(0, -np.inf, 0, 0, 0, 0), upper=(1,) * 6)
-    with pytest.raises(ModelError, match="ranges"):
-        Tunnel((0, 0, 0), (1, 0, 1))
-    with pytest.raises(ModelError, match="weights"):
-        Tunnel((0, 0, 0), (1, 1, 1), (1, -1, 1))
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: reference_rig(lower=(0, 0, 1, 0, 0, 0), upper=(1, 1, 0, 1, 1, 1)), "joint 3"),
+        (lambda: reference_rig(lower=(0, -np.inf, 0, 0, 0, 0), upper=(1,) * 6), "joint 2"),
+        (lambda: Tunnel((0, 0, 0), (1, 0, 1)), "ranges"),
+        (lambda: Tunnel((0, 0, 0), (1, 1, 1), (1, -1, 1)), "weights"),
+    ],
+)
+def test_limits_and_ranges_that_cannot_be_are_named(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        make()
 
 
 # ---- the paper's misprints: each printed form fails, the corrected one holds -----------------------------------------
 
 
+OFFSET = np.array([0, -np.pi / 2, 0, 0, np.pi / 2, 0])
+
+
 @pytest.fixture(scope="module")
-def sample() -> list[tuple[Array, Array, Array]]:
-    """Joints, pose and tool rotation of random configurations."""
-    rig, rng = reference_rig(), np.random.default_rng(17)
-    home = np.array([0, -np.pi / 2, 0, 0, np.pi / 2, 0])
-    made = []
-    for _ in range(200):
-        q = home + rng.uniform(-1.0, 1.0, 6)
-        made.append((q, pose_of(rig, q), numeric(dh_frames(rig, q)[-1].rotation)))
-    return made
+def sample() -> tuple[Array, Array, Any]:
+    """Joints (6, n) and poses (6, n) of random configurations, and entry (i, k) of their tool rotations, (n,)."""
+    q, symbol = OFFSET[:, None] + np.random.default_rng(17).uniform(-1.0, 1.0, (6, 200)), ca.SX.sym("q", 6)
+    tool = dh_frames(RIG, symbol)[-1].rotation
+    poses, turns = ca.Function("f", [symbol], [forward(RIG, symbol), ca.densify(ca.vec(tool.T))]).map(200)(q)
+    return q, np.array(poses), lambda i, k: np.array(turns)[3 * i + k]
 
 
-def test_home_values_of_table_1_are_not_offsets(sample: list[Any]) -> None:
-    rig = reference_rig()
-    offset = np.array([0, -np.pi / 2, 0, 0, np.pi / 2, 0])
-    for q, pose, _ in sample[:20]:
-        taken = numeric(dh_frames(rig, q)[-1].position).ravel()
-        added = numeric(dh_frames(rig, q + offset)[-1].position).ravel()
+def misprint(right: Any, printed: Any, known: Any, least: float = 0.1) -> None:
+    """The corrected form is the known value, the printed one far from it."""
+    np.testing.assert_allclose(right, known, atol=1e-12)
+    assert np.median(np.abs(printed - known)) > least
+
+
+def test_home_values_of_table_1_are_not_offsets(sample: Any) -> None:
+    for q, pose in zip(sample[0].T[:20], sample[1].T[:20], strict=True):
+        taken, added = (numeric(dh_frames(RIG, joints)[-1].position).ravel() for joints in (q, q + OFFSET))
         np.testing.assert_allclose(taken, pose[:3], atol=1e-12)
         assert np.abs(added - pose[:3]).max() > 1e-2
 
 
-def test_equation_8_lacks_a_cosine(sample: list[Any]) -> None:
-    wrong = []
-    for q, _, turn in sample:
-        q23, c45 = q[1] + q[2], np.cos(q[3] + q[4])
-        right = np.cos(q23) * np.sin(q[5]) + c45 * np.sin(q23) * np.cos(q[5])
-        printed = q23 * np.sin(q[5]) + c45 * np.sin(q23) * np.cos(q[5])
-        assert right == pytest.approx(turn[0, 2], abs=1e-12)
-        wrong.append(abs(printed - turn[0, 2]))
-    assert np.median(wrong) > 0.1
+def test_equation_8_lacks_a_cosine(sample: Any) -> None:
+    q, _, turn = sample
+    q23, rest = q[1] + q[2], np.cos(q[3] + q[4]) * np.sin(q[1] + q[2]) * np.cos(q[5])
+    misprint(np.cos(q23) * np.sin(q[5]) + rest, q23 * np.sin(q[5]) + rest, turn(0, 2))
 
 
-def test_equation_15_has_wrong_entries(sample: list[Any]) -> None:
-    wrong = []
-    for _, pose, turn in sample:
-        (cy, cp, cr), (sy, sp, sr) = np.cos(pose[3:]), np.sin(pose[3:])
-        right = [-sy * cr + cy * sp * sr, sy * sr + cy * sp * cr, cy * cr + sy * sp * sr, -cy * sr + sy * sp * cr]
-        printed = [
-            -sy * cp + cy * sp * sr,
-            sy * sp * cr + cy * sp * cr,
-            cy * cp + sy * sp * sr,
-            -cy * sp * cr + sy * sp * cr,
-        ]
-        found = turn[[0, 0, 1, 1], [1, 2, 1, 2]]
-        np.testing.assert_allclose(right, found, atol=1e-12)
-        wrong.append(np.abs(np.array(printed) - found))
-    assert (np.median(wrong, axis=0) > 0.01).all()
+def test_equation_15_has_wrong_entries(sample: Any) -> None:
+    _, pose, turn = sample
+    (cy, cp, cr), (sy, sp, sr) = np.cos(pose[3:]), np.sin(pose[3:])
+    misprint(-sy * cr + cy * sp * sr, -sy * cp + cy * sp * sr, turn(0, 1), 0.01)
+    misprint(sy * sr + cy * sp * cr, sy * sp * cr + cy * sp * cr, turn(0, 2), 0.01)
+    misprint(cy * cr + sy * sp * sr, cy * cp + sy * sp * sr, turn(1, 1), 0.01)
+    misprint(-cy * sr + sy * sp * cr, -cy * sp * cr + sy * sp * cr, turn(1, 2), 0.01)
 
 
-def test_equation_25_has_two_wrong_signs(sample: list[Any]) -> None:
-    rig, wrong = reference_rig(), []
-    for q, pose, _ in sample:
-        cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
-        c4, c6, s6 = np.cos(q[3]), np.cos(q[5]), np.sin(q[5])
-        common = pose[1] - rig.yaw_link_2 * sy - rig.sting * sy * cp - rig.pitch_link * sy * c4
-        common += rig.goose_neck * sy * sp * c6
-        odd = rig.yaw_offset * cy + rig.goose_neck * cy * s6
-        assert (common - odd) / rig.yaw_link_1 == pytest.approx(np.cos(q[1]), abs=1e-12)
-        wrong.append(abs((common + odd) / rig.yaw_link_1 - np.cos(q[1])))
-    assert np.median(wrong) > 0.1
+def test_equation_25_has_two_wrong_signs_and_equation_27_misses_the_tool_by_26_inches(sample: Any) -> None:
+    q, pose, _ = sample
+    (cy, cp), (sy, sp) = np.cos(pose[3:5]), np.sin(pose[3:5])
+    c4, c6, s6 = np.cos(q[3]), np.cos(q[5]), np.sin(q[5])
+    along = RIG.yaw_link_2 + RIG.sting * cp + RIG.pitch_link * c4 - RIG.goose_neck * sp * c6
+    common, odd = pose[1] - sy * along, RIG.yaw_offset * cy + RIG.goose_neck * cy * s6
+    misprint((common - odd) / RIG.yaw_link_1, (common + odd) / RIG.yaw_link_1, np.cos(q[1]))
+    base = pose[0] + RIG.yaw_offset * sy + RIG.yaw_link_1 * np.sin(q[1]) + RIG.goose_neck * sy * s6
+    misprint(base - cy * along, base + cy * along, q[0], 20 * INCH)
 
 
 def test_equation_25_needs_the_branch_of_the_home_position() -> None:
-    rig = reference_rig()
-    home = np.array([2.0, -np.pi / 2, 0, 0, np.pi / 2, 0])
-    pose = pose_of(rig, home)
-    minus = numeric(inverse(rig, ca.DM(pose[:5]), ca.DM(0), HOME)[0]).ravel()
-    plus = numeric(inverse(rig, ca.DM(pose[:5]), ca.DM(0), Branch(1, 1))[0]).ravel()
+    home = np.array([2.0, *OFFSET[1:]])
+    target = ca.DM(pose_of(RIG, home)[:5])
+    minus, plus = (numeric(inverse(RIG, target, ca.DM(0), branch)[0]).ravel() for branch in (HOME, Branch(1, 1)))
     np.testing.assert_allclose(minus, home, atol=1e-12)
     assert plus[1] == pytest.approx(np.pi / 2, abs=1e-12)
 
 
-def test_equation_27_misses_the_tool_by_26_inches(sample: list[Any]) -> None:
-    rig, wrong = reference_rig(), []
-    for q, pose, _ in sample:
-        cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
-        c4, c6, s6 = np.cos(q[3]), np.cos(q[5]), np.sin(q[5])
-        base = pose[0] + rig.yaw_offset * sy + rig.yaw_link_1 * np.sin(q[1]) + rig.goose_neck * sy * s6
-        odd = rig.yaw_link_2 * cy + rig.sting * cy * cp + rig.pitch_link * cy * c4 - rig.goose_neck * sp * cy * c6
-        assert base - odd == pytest.approx(q[0], abs=1e-12)
-        wrong.append(abs(base + odd - q[0]) / INCH)
-    assert np.median(wrong) > 20
-
-
 def test_equation_35_as_printed_does_not_depend_on_the_roll() -> None:
-    rig, tunnel = reference_rig(), reference_tunnel()
+    rig, tunnel = RIG, reference_tunnel()
     roll = ca.SX.sym("roll")
     target = ca.DM([100 * INCH, 6 * INCH, 3 * INCH, 0.1, 0.1])
     corner = goose_neck_corner(rig, target, roll)

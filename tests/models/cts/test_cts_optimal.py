@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import BRANCHES, HOME, INCH, Branch, Rig, Tunnel, forward
 from models.cts.roll import ACTIVE, STATUS
-from models.cts.table import Table, all_joint_sets, reachable_arcs, solve_table
+from models.cts.table import all_joint_sets, reachable_rolls, solve_table
 from models.cts.trigonometric import Harmonics, least_point, roots, series_roots
 from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
@@ -136,9 +136,8 @@ def test_several_arcs_and_special_yaws(yaw: float | None, limits: dict[str, Any]
 def test_closed_form_without_limits_is_the_least_index_of_all_rolls() -> None:
     rng = np.random.default_rng(2)
     targets = random_targets(rng, 2000)
-    rig, tunnel = RIG, TUNNEL
-    _, cost, active, status = run(optimal_inverse(rig, tunnel, limits=False), targets, np.zeros(2000))
-    best = np.min([index_by_geometry(rig, tunnel, targets, roll) for roll in np.linspace(-np.pi, np.pi, 720)], axis=0)
+    _, cost, active, status = run(optimal_inverse(RIG, TUNNEL, limits=False), targets, np.zeros(2000))
+    best = np.min([index_by_geometry(RIG, TUNNEL, targets, roll) for roll in np.linspace(-np.pi, np.pi, 720)], axis=0)
     assert (cost[status == 0] <= best[status == 0] + 1e-12).all()
     assert (active == 0).all()
     assert 0.05 < np.mean(status != 0) < 0.9
@@ -175,7 +174,7 @@ def test_arcs_are_the_rolls_that_reach(seed: int, branch: Branch, limited: bool)
     rng = np.random.default_rng(seed)
     rig = LIMITED if limited else RIG
     target = random_targets(rng, 1)
-    arcs = reachable_arcs(rig, target[:, 0], branch)
+    arcs = reachable_rolls(rig, target[:, 0], branch)
     rolls = rng.uniform(-np.pi, np.pi, 300)
     joints, inside = joints_by_geometry(rig, np.repeat(target, 300, axis=1), rolls, branch)
     if limited:
@@ -189,13 +188,12 @@ def test_arcs_are_the_rolls_that_reach(seed: int, branch: Branch, limited: bool)
 
 
 def test_ends_of_an_arc_sit_on_the_constraint_they_name() -> None:
-    rig = RIG
     targets = random_targets(np.random.default_rng(11), 60)
-    pairs = [(target, arc) for target in targets.T for arc in reachable_arcs(rig, target) if arc.holds[0] != "free"]
+    pairs = [(target, arc) for target in targets.T for arc in reachable_rolls(RIG, target) if arc.holds[0] != "free"]
     assert len(pairs) > 10
     for target, arc in pairs:
         for roll, name in ((arc.start, arc.holds[0]), (arc.end, arc.holds[1])):
-            (joints, _) = joints_by_geometry(rig, target[:, None], roll, HOME)
+            joints, _ = joints_by_geometry(RIG, target[:, None], roll, HOME)
             stretched = {"pitch reach": abs(np.sin(joints[3, 0])), "yaw reach": abs(np.cos(joints[1, 0]))}
             assert stretched[name] == pytest.approx(1, abs=1e-9)
 
@@ -242,52 +240,47 @@ def test_the_best_of_several_branches_is_taken() -> None:
 
 
 def test_a_sequence_passes_its_rolls_on() -> None:
-    rig, tunnel, rows = RIG, TUNNEL, sweep()
+    rows = sweep()
     rows[4] = np.nan
-    table = solve_table(rig, tunnel, rows, previous=0.1, in_sequence=True, rate_weight=5.0)
-    function, roll = optimal_inverse(rig, tunnel, rate_weight=5.0), 0.1
+    table = solve_table(RIG, TUNNEL, rows, previous=0.1, in_sequence=True, rate_weight=5.0)
+    function, roll = optimal_inverse(RIG, TUNNEL, rate_weight=5.0), 0.1
     for k in (0, 1, 2, 3, 5, 6, 7, 8):
         roll = float(function(rows[k], roll)[0][5])
         assert table.joints[k, 5] == pytest.approx(roll, abs=1e-15)
 
 
-def table_of(targets: Any, **options: Any) -> Table:
-    return solve_table(RIG, TUNNEL, targets, **options)
-
-
 @pytest.mark.parametrize(
     ("targets", "options", "reason"),
     [
-        ([], {}, "empty"),
-        (np.zeros((0, 5)), {}, "empty"),
+        ([], {}, r"\(0,\), expected \(samples, 5\)"),
+        (np.zeros((0, 5)), {}, r"\(0, 5\), expected \(samples, 5\), 1 at least"),
         (np.zeros((3, 6)), {}, r"\(3, 6\)"),
-        ("poses", {}, "numbers"),
+        ("poses", {}, "not numeric"),
         (np.zeros((2, 5)), {"branches": []}, "branches"),
         (np.zeros((2, 5)), {"branches": [Branch(0, 1)]}, "yaw=0"),
         (np.zeros((2, 5)), {"previous": np.nan}, "previous"),
         (np.zeros((2, 5)), {"previous": [0.0, 1.0, 2.0]}, "previous"),
-        (np.zeros((2, 5)), {"rate_weight": -1.0}, "rate_weight -1"),
+        (np.zeros((2, 5)), {"rate_weight": -1.0}, "rate_weight -1.0 is negative"),
     ],
 )
 def test_what_cannot_be_asked_is_named(targets: Any, options: dict[str, Any], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
-        table_of(targets, **options)
+        solve_table(RIG, TUNNEL, targets, **options)
 
 
-def test_a_pose_that_no_branch_reaches_is_an_error_that_names_the_link() -> None:
-    rig = reference_rig()
-    with pytest.raises(ModelError, match=r"pitch link is .* too short"):
-        all_joint_sets(rig, [2.5, 0.1, 3.0, 0, 0], 0.0)
-    with pytest.raises(ModelError, match=r"yaw link is .* too short"):
-        all_joint_sets(rig, [2.5, 3.0, 0.0, 0, 0], 0.0)
-    with pytest.raises(ModelError, match="roll nan"):
-        all_joint_sets(rig, [2.5, 0.1, 0.0, 0, 0], np.nan)
-    assert len(all_joint_sets(rig, [2.54, 0.15, 0.0, 0, 0], 1.0)) == 4
-
-
-def test_limits_false_is_refused_with_a_rate_weight() -> None:
-    with pytest.raises(ModelError, match="limits=False"):
-        optimal_inverse(reference_rig(), reference_tunnel(), rate_weight=1.0, limits=False)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: all_joint_sets(RIG, [2.5, 0.1, 3.0, 0, 0], 0.0), r"pitch link is .* too short"),
+        (lambda: all_joint_sets(RIG, [2.5, 3.0, 0.0, 0, 0], 0.0), r"yaw link is .* too short"),
+        (lambda: all_joint_sets(RIG, [2.5, 0.1, 0.0, 0, 0], np.nan), "roll nan"),
+        (lambda: optimal_inverse(RIG, TUNNEL, rate_weight=1.0, limits=False), "limits=False"),
+    ],
+)
+def test_a_pose_that_no_branch_reaches_and_a_closed_form_that_is_none_are_named(make: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        make()
+    assert len(all_joint_sets(RIG, [2.54, 0.15, 0.0, 0, 0], 1.0)) == 4
 
 
 # ---- roots of trigonometric polynomials --------------------------------------------------------------------------
