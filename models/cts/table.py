@@ -85,9 +85,9 @@ def solve_table(
     if surroundings is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
     else:
-        term = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
-        inputs = rig, tunnel, surroundings
-        functions = [clear_inverse(*inputs, branch, rate_weight=rate_weight, **term) for branch in chosen]
+        asked: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
+        asked["rate_weight"] = rate_weight
+        functions = [clear_inverse(rig, tunnel, surroundings, branch, **asked) for branch in chosen]
     if in_sequence:
         roll, steps = float(before[0]), []
         for row in rows:

@@ -48,10 +48,6 @@ class Harmonics(NamedTuple):
         """Upper bound of |f''|: hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
-    def swing_bound(self) -> Expression:
-        """Upper bound of |f - a0|: hypot(a1, b1) + hypot(a2, b2)."""
-        return ca.sqrt(self.a1**2 + self.b1**2) + ca.sqrt(self.a2**2 + self.b2**2)
-
 
 def first_square(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
     """(a0 + a1 cos + b1 sin)^2."""

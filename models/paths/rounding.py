@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,64 +15,72 @@ from models.paths.path import Path
 from models.paths.smooth_path import SmoothPath
 from models.spatial import FULL_TURN
 
-__all__ = ["Overlap", "blend_coefficients", "deviations", "remaining_distances", "smooth"]
+__all__ = ["Overlap", "smooth"]
 
 Overlap: TypeAlias = Literal["shrink", "refuse"]
 SAMPLES, FINER = 33, 33  # of a blend whose deviation is looked for, and of the neighbourhood of the extreme
 KEPT_BACK = 1e-3
 """Share of the tolerance kept back for what lies between the samples of a deviation."""
 MOST_TRIALS, MOST_SHRINKS = 60, 30
+CORNERS_AT_ONCE = 500  # so that memory does not grow with them
 SHORTEST_PIECE = 1e-12
 """Rests of a segment between two blends shorter than this, over the segment, are dropped."""
 
 
-def blend_coefficients(
-    path: Path, remaining: Array, kind: BlendKind, shape: Array, vertices: NDArray[np.intp] | None = None
-) -> Array:
-    """Polynomials of the blends about the vertices 1..n-1 (all, or those of index `vertices`). Shape (V, 6, 3)."""
-    before = np.arange(len(path.segments) - 1) if vertices is None else vertices
-    p0, n0, k0, _ = path.at(before, path.lengths[before] - remaining)
-    p1, n1, k1, _ = path.at(before + 1, remaining)
-    rate = (shape * remaining)[:, None]
-    if kind == "cubic":
-        return cubic(p0, rate * n0, p1, rate * n1)
-    return quintic(p0, rate * n0, rate**2 * k0, p1, rate * n1, rate**2 * k1)
+class _Corners(NamedTuple):
+    """Some vertices of a path, and what kind of blends are to round them.
+
+    Attributes:
+        shape: Shape factors. Shape (V,).
+        vertices: 0 being the end of the first segment. Shape (V,).
+    """
+
+    path: Path
+    kind: BlendKind
+    shape: Array
+    vertices: NDArray[np.intp]
+
+    def some(self, chosen: NDArray[np.intp] | slice) -> _Corners:
+        """Those of some indices."""
+        return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
+
+    def blends(self, remaining: Array) -> Array:
+        """Polynomials of the blends with some remaining distances, (V,). Shape (V, 6, 3)."""
+        before = self.vertices
+        p0, n0, k0, _ = self.path.at(before, self.path.lengths[before] - remaining)
+        p1, n1, k1, _ = self.path.at(before + 1, remaining)
+        rate = (self.shape * remaining)[:, None]
+        if self.kind == "cubic":
+            return cubic(p0, rate * n0, p1, rate * n1)
+        return quintic(p0, rate * n0, rate**2 * k0, p1, rate * n1, rate**2 * k1)
 
 
-def remaining_distances(
-    path: Path,
-    remaining: ArrayInput | None,
-    deviation: ArrayInput | None,
-    kind: BlendKind,
-    shape: Array,
-    overlap: Overlap,
+def _remaining_distances(
+    corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap
 ) -> Array:
-    """Remaining distance of each vertex, checked. Shape (n - 1,), m. Arguments as of `models.paths.smooth_path`."""
+    """Remaining distance of each vertex, checked. Shape (n - 1,), m. Arguments as of `smooth`."""
     checked_choice(overlap, get_args(Overlap), "path", "overlap")
     if (remaining is None) == (deviation is None):
         raise ModelError("give either the remaining distance or the deviation, not both and not neither")
-    count = len(path.segments) - 1
+    path, count = corners.path, len(corners.vertices)
     if remaining is not None:
         wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
         return _without_overlap(path, wanted, overlap)
     tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
     # never longer than a segment, so that every trial is a curve that exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
-    found = _without_overlap(path, _from_deviation(path, tolerance, kind, shape, longest), overlap)
+    found = _without_overlap(path, _from_deviation(corners, tolerance, longest), overlap)
     # next to an arc the vertex need not be the farthest point, nor a smaller blend the nearer one
     bent = np.flatnonzero((path.curvature[:-1] > 0) | (path.curvature[1:] > 0))
     aim = tolerance * (1 - KEPT_BACK)
     for _ in range(MOST_SHRINKS):
-        strayed = np.maximum(
-            _from_blend(path, found[bent], kind, shape[bent], bent),
-            deviations(path, found[bent], kind, shape[bent], bent)[1],
-        )
-        over = strayed / tolerance[bent]
+        some = corners.some(bent)
+        over = np.maximum(_from_blend(some, found[bent]), _deviations(some, found[bent])[1]) / tolerance[bent]
         bent, over = bent[over > 1], over[over > 1]
         if not bent.size:
             break
         aim[bent] *= (1 - KEPT_BACK) / over
-        found[bent] = _fitted(path, aim[bent], kind, shape[bent], found[bent], bent)
+        found[bent] = _fitted(corners.some(bent), aim[bent], found[bent])
     return found
 
 
@@ -95,32 +103,30 @@ def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
     return np.asarray(wanted * np.minimum(factor[:-1], factor[1:]))
 
 
-def _from_deviation(path: Path, tolerance: Array, kind: BlendKind, shape: Array, longest: Array) -> Array:
-    found = longest.copy()
+def _from_deviation(corners: _Corners, tolerance: Array, longest: Array) -> Array:
+    found, path = longest.copy(), corners.path
     angles = path.corner_angles()
     straight = (path.curvature[:-1] == 0) & (path.curvature[1:] == 0)
     # between two lines the deviation is proportional to the remaining distance: one trial tells the ratio
     lines = np.flatnonzero(straight)
     if lines.size:
-        legs = deviations(path, longest[lines], kind, shape[lines], lines)[1] / longest[lines] * (1 + KEPT_BACK)
-        corner = np.array([gamma(s, a, kind) for s, a in zip(shape[lines], angles[lines], strict=True)])
-        ratio = np.maximum(corner, legs)
+        some = corners.some(lines)
+        legs = _deviations(some, longest[lines])[1] / longest[lines] * (1 + KEPT_BACK)
+        ratio = np.maximum([gamma(s, a, corners.kind) for s, a in zip(some.shape, angles[lines], strict=True)], legs)
         with np.errstate(divide="ignore"):
             found[lines] = np.minimum(longest[lines], tolerance[lines] / ratio)
     arcs = np.flatnonzero(~straight)
     if arcs.size:
-        found[arcs] = _fitted(path, tolerance[arcs] * (1 - KEPT_BACK), kind, shape[arcs], longest[arcs], arcs)
+        found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - KEPT_BACK), longest[arcs])
     return found
 
 
-def _fitted(
-    path: Path, tolerance: Array, kind: BlendKind, shape: Array, longest: Array, vertices: NDArray[np.intp]
-) -> Array:
+def _fitted(corners: _Corners, tolerance: Array, longest: Array) -> Array:
     """Remaining distances, at most `longest`, whose deviation is the tolerance to KEPT_BACK, or less at the longest."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
     for number in range(MOST_TRIALS):
-        found = np.maximum(*deviations(path, trial[todo], kind, shape[todo], vertices[todo]))
+        found = np.maximum(*_deviations(corners.some(todo), trial[todo]))
         ratio = found / tolerance[todo]
         fits = ratio <= 1
         low[todo] = np.where(fits, trial[todo], low[todo])
@@ -134,28 +140,20 @@ def _fitted(
         if not todo.size:
             break
     if (low <= 0).any():
-        i = int(vertices[int((low <= 0).argmax())])
-        message = f"vertex {i + 1}: no blend stays within the deviation; take a larger one"
-        raise ModelError(message, name=f"vertex {i + 1}", limit=float(tolerance[int((low <= 0).argmax())]))
+        i = int((low <= 0).argmax())
+        name = f"vertex {corners.vertices[i] + 1}"
+        message = f"{name}: no blend stays within the deviation; take a larger one"
+        raise ModelError(message, name=name, limit=float(tolerance[i]))
     return low
 
 
-def deviations(
-    path: Path, remaining: Array, kind: BlendKind, shape: Array, vertices: NDArray[np.intp]
-) -> tuple[Array, Array]:
+def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     """Distance of the vertex from its blend, and largest distance of the blend from the two segments.
 
     Between them they bound how far the smooth path strays from the task and the task from the smooth path. Sampled
-    evenly and again about the extreme: the first is never below the truth, the second by at most 0.1 %.
-
-    Args:
-        remaining, shape: Shape (V,).
-        vertices: Vertices, 0 being the end of the first segment. Shape (V,).
-
-    Returns:
-        Shape (V,) each, m.
+    evenly and again about the extreme: the first is never below the truth, the second by at most 0.1 %. Shape (V,), m.
     """
-    curves = blend_coefficients(path, remaining, kind, shape, vertices)
+    path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
     u = np.linspace(0, 1, SAMPLES)
     points = polynomial(curves[:, None], u[None, :])
     tip = path.start[vertices + 1][:, None]
@@ -172,17 +170,16 @@ def deviations(
     return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(near.max(axis=1), farthest.max(axis=1)))
 
 
-def _from_blend(
-    path: Path, remaining: Array, kind: BlendKind, shape: Array, vertices: NDArray[np.intp], chunk: int = 500
-) -> Array:
-    """Largest distance of the two stretches that each blend replaces from the blend. Shapes as of deviations, (V,)."""
-    result = np.empty(len(vertices))
+def _from_blend(corners: _Corners, remaining: Array) -> Array:
+    """Largest distance of the two stretches that each blend replaces from the blend. Shape (V,), m."""
+    path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SAMPLES), np.linspace(0, 1, SAMPLES)
-    for first in range(0, len(vertices), chunk):
-        part = slice(first, first + chunk)
-        index, away = vertices[part], remaining[part]
+    for first in range(0, len(remaining), CORNERS_AT_ONCE):
+        part = slice(first, first + CORNERS_AT_ONCE)
+        some, away = corners.some(part), remaining[part]
+        index = some.vertices
         tip = path.start[index + 1][:, None]
-        points = polynomial(blend_coefficients(path, away, kind, shape[part], index)[:, None], u) - tip
+        points = polynomial(some.blends(away)[:, None], u) - tip
         flat, along = np.repeat(index, len(v)), away[:, None] * v
         before = path.at(flat, (path.lengths[index][:, None] - along).ravel())[0]
         after = path.at(flat + 1, along.ravel())[0]
@@ -254,21 +251,22 @@ def smooth(
     Raises:
         ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
     """
-    factors = checked_shape(shape, kind, len(path.segments) - 1)
-    distances = remaining_distances(path, remaining, deviation, kind, factors, overlap)
-    coefficients = blend_coefficients(path, distances, kind, factors)
+    count = len(path.segments)
+    corners = _Corners(path, kind, checked_shape(shape, kind, count - 1), np.arange(count - 1))
+    distances = _remaining_distances(corners, remaining, deviation, overlap)
+    coefficients = corners.blends(distances)
     curve_cells = cells(coefficients)
     blend_lengths = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(distances))
     padded = np.concatenate([[0.0], distances, [0.0]])
     rests = path.lengths - padded[:-1] - padded[1:]
-    count = len(path.segments)
     lengths, segment, blend = np.empty(2 * count - 1), np.full(2 * count - 1, -1), np.full(2 * count - 1, -1)
     lengths[::2], lengths[1::2] = rests, blend_lengths
     segment[::2], blend[1::2] = np.arange(count), np.arange(count - 1)
     kept = np.ones(2 * count - 1, dtype=bool)
     kept[::2] = rests > SHORTEST_PIECE * path.lengths
     bounds = np.concatenate([[0.0], np.cumsum(lengths[kept])])
-    smoothed = SmoothPath(path, kind, distances, factors, coefficients, bounds, segment[kept], blend[kept], curve_cells)
+    made = path, kind, distances, corners.shape, coefficients, bounds, segment[kept], blend[kept], curve_cells
+    smoothed = SmoothPath(*made)
     if path.turns:
         _check_turns(smoothed)
     return smoothed

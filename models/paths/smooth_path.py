@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -151,13 +152,7 @@ class SmoothPath:
         Raises:
             ModelError: nan, or a distance off the path by more than rounding.
         """
-        s = self.checked_distance(distance)
-        results = [np.empty((len(s), 3)) for _ in range(4)]
-        for first in range(0, len(s), SAMPLES_AT_ONCE):
-            part = slice(first, first + SAMPLES_AT_ONCE)
-            for result, values in zip(results, self._at(s[part]), strict=True):
-                result[part] = values
-        return Place(*results)
+        return Place(*_in_parts(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
 
     def curvature(self, distance: ArrayInput) -> Array:
         """Curvature at distances from the start. Shape (M,), 1/m."""
@@ -172,26 +167,13 @@ class SmoothPath:
         if not self.path.turns:
             still = np.zeros((len(s), 3))
             return Turn(np.repeat(self.path.orientation[:1], len(s), axis=0), still, still, still)
-        reference, theta = self.charts
-        results = [np.empty((len(s), width)) for width in (4, 3, 3, 3)]
-        for first in range(0, len(s), SAMPLES_AT_ONCE):
-            part = slice(first, first + SAMPLES_AT_ONCE)
-            piece = self._piece(s[part])
-            length = self.piece_lengths[piece]
-            values = along_piece(reference[piece], theta[piece], length, (s[part] - self.bounds[piece]) / length)
-            for result, value in zip(results, values, strict=True):
-                result[part] = value
-        return Turn(*results)
+        return Turn(*_in_parts(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
         """u of the blend at distances from the start; nan on segments. Shape (M,)."""
         s = self.checked_distance(distance)
-        piece = self._piece(s)
-        u = np.full(len(s), np.nan)
-        curved = np.flatnonzero(self.piece_blend[piece] >= 0)
-        for first in range(0, len(curved), SAMPLES_AT_ONCE):
-            part = curved[first : first + SAMPLES_AT_ONCE]
-            u[part] = self._parameter(s[part])[1]
+        u, curved = np.full(len(s), np.nan), self.piece_blend[self._piece(s)] >= 0
+        u[curved] = _in_parts(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
     def dense(self, per_cell: int = 16, per_segment: int = 2) -> Array:
@@ -265,6 +247,11 @@ class SmoothPath:
                 result[curved] = value
         return results
 
+    def _turn(self, s: Array) -> tuple[Array, ...]:
+        piece, (reference, theta) = self._piece(s), self.charts
+        length = self.piece_lengths[piece]
+        return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
+
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
         # distance from where the blend before it has ended
         skipped = np.concatenate([[0.0], self.remaining])[segment]
@@ -299,3 +286,13 @@ class SmoothPath:
         none = np.zeros_like(before)
         theta[blends] = quintic(-before * away, before * length, none, after * away, after * length, none)
         return reference, theta
+
+
+def _in_parts(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
+    """Rows of a function of distances, which is given some of them at a time. Shapes (M,) to (M, width) each."""
+    results = [np.empty((len(s), width)) for width in widths]
+    for first in range(0, len(s), SAMPLES_AT_ONCE):
+        part = slice(first, first + SAMPLES_AT_ONCE)
+        for result, values in zip(results, function(s[part]), strict=True):
+            result[part] = values
+    return results

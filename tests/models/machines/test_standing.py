@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,70 +21,90 @@ from tests.models.robot.trees import Array, few, numeric, random_robot, random_r
 from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
-sizes = st.integers(1, 6)
+EXAMPLE = standing_example()
 
 
 def hand(rng: np.random.Generator, machine: Standing) -> Wrench:
     return machine.tip_wrench(rng.normal(scale=5, size=3), rng.normal(size=3))
 
 
+class Case(NamedTuple):
+    """A random machine, a motion of it at one instant, and a wrench at its hand."""
+
+    rng: np.random.Generator
+    machine: Standing
+    motion: tuple[Array, Array, Array]
+    wrench: Wrench
+
+
+def case(seed: int, size: int) -> Case:
+    rng = np.random.default_rng(seed)
+    machine = random_standing(rng, size)
+    return Case(rng, machine, random_motion(rng, machine), hand(rng, machine))
+
+
+cases = st.builds(case, seeds, st.integers(1, 6))
+
+
+def flat(value: Any) -> Array:
+    """The entries of an expression without symbols."""
+    return numeric(value).ravel()
+
+
+def close(found: Any, expected: Any, relative: float = 1e-9, absolute: float = 1e-9) -> None:
+    np.testing.assert_allclose(flat(found), expected, rtol=relative, atol=absolute)
+
+
+def pressure_point(reaction: Array) -> Array:
+    """Where a ground reaction (moment, force) has no horizontal moment."""
+    return np.asarray([-reaction[1], reaction[0]] / reaction[5])
+
+
 @pytest.mark.parametrize(("table", "ahead"), [(1, 0.0073), (2, 0.0090)])
 def test_the_papers_machine_starts_with_its_centre_of_mass_over_the_foot(table: int, ahead: float) -> None:
-    machine, q = standing_example(), STANDING_STARTS[table]
-    center = numeric(center_of_mass(machine.robot, q, machine.world_from_base())).ravel()
+    q, robot = STANDING_STARTS[table], EXAMPLE.robot
+    center = flat(center_of_mass(robot, q, EXAMPLE.world_from_base()))
     assert center[0] == 0
     assert center[1] == pytest.approx(ahead, abs=5e-5)
-    assert machine.robot.total_mass == pytest.approx(61.32)
-    assert ((machine.robot.lower < q) & (q < machine.robot.upper)).all()
-    assert machine.moving_axes == (1,)
+    assert robot.total_mass == pytest.approx(61.32)
+    assert ((robot.lower < q) & (q < robot.upper)).all()
+    assert EXAMPLE.moving_axes == (1,)
 
 
 def test_the_papers_machine_moves_in_its_plane_counter_clockwise_from_y() -> None:
-    machine = standing_example()
-    frames = link_frames(machine.robot, STANDING_STARTS[1], machine.world_from_base())
-    angle = 0.0
-    for i, joint in enumerate(STANDING_STARTS[1]):
-        angle += joint
-        heading = numeric(frames[f"link{i + 1}"].rotation)[:, 0]
-        np.testing.assert_allclose(heading, [0, np.cos(angle), np.sin(angle)], atol=1e-12)
+    frames = link_frames(EXAMPLE.robot, STANDING_STARTS[1], EXAMPLE.world_from_base())
+    for i, angle in enumerate(np.cumsum(STANDING_STARTS[1])):
+        close(frames[f"link{i + 1}"].rotation[:, 0], [0, np.cos(angle), np.sin(angle)], 0, 1e-12)
 
 
-@given(seeds, sizes)
+@given(cases)
 @few
-def test_a_machine_at_rest_presses_below_its_centre_of_mass(seed: int, size: int) -> None:
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
-    q, rest = rng.normal(size=machine.joint_size), np.zeros(machine.joint_size)
-    center = numeric(center_of_mass(machine.robot, q, machine.world_from_base())).ravel()
-    np.testing.assert_allclose(numeric(machine.zero_moment_point(q, rest, rest)).ravel(), center[:2], atol=1e-10)
-    force = numeric(machine.ground_reaction(q, rest, rest)).ravel()[3:]
-    np.testing.assert_allclose(force, [0, 0, machine.weight], atol=1e-9)
+def test_a_machine_at_rest_presses_below_its_centre_of_mass(case: Case) -> None:
+    machine, q, rest = case.machine, case.motion[0], np.zeros(case.machine.joint_size)
+    center = flat(center_of_mass(machine.robot, q, machine.world_from_base()))
+    close(machine.zero_moment_point(q, rest, rest), center[:2], 1e-7, 1e-10)
+    close(machine.ground_reaction(q, rest, rest)[3:], [0, 0, machine.weight], 1e-7)
 
 
-@given(seeds, sizes)
+@given(cases)
 @few
-def test_the_zero_moment_point_is_that_of_the_sums_over_links(seed: int, size: int) -> None:
+def test_the_zero_moment_point_is_that_of_the_sums_over_links(case: Case) -> None:
     """(2)-(3), with the force of (35)-(36) corrected: it enters as a moment, and the vertical one below the line."""
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
-    q, qd, qdd = random_motion(rng, machine)
-    wrench = hand(rng, machine)
-    motions = link_motions(machine.robot, q, qd, qdd, machine.world_from_base())
+    _, machine, motion, wrench = case
+    motions = link_motions(machine.robot, *motion, machine.world_from_base())
+    frames = link_frames(machine.robot, motion[0], machine.world_from_base())
     numerator, denominator = np.zeros(2), 0.0
     for link in machine.robot.links:
-        center, _, acceleration, spin, turning = (numeric(part).ravel() for part in motions[link.name])
-        turn = numeric(link_frames(machine.robot, q, machine.world_from_base())[link.name].rotation)
+        center, _, acceleration, spin, turning = map(flat, motions[link.name])
+        turn = numeric(frames[link.name].rotation)
         inertia = turn @ link.inertia @ turn.T
         moment = inertia @ turning + np.cross(spin, inertia @ spin)
         push = link.mass * (acceleration[2] + machine.gravity)
         numerator += push * center[:2] - link.mass * acceleration[:2] * center[2] + [-moment[1], moment[0]]
         denominator += push
-    (x, y, z), force = numeric(machine.tip_pose((), q).position).ravel(), numeric(wrench.force).ravel()
-    moment = numeric(wrench.moment).ravel()
+    (x, y, z), force, moment = map(flat, (machine.tip_pose((), motion[0]).position, wrench.force, wrench.moment))
     numerator += [z * force[0] - x * force[2] + moment[1], z * force[1] - y * force[2] - moment[0]]
-    expected = numerator / (denominator - force[2])
-    found = numeric(machine.zero_moment_point(q, qd, qdd, [wrench])).ravel()
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    close(machine.zero_moment_point(*motion, [wrench]), numerator / (denominator - force[2]))
 
 
 @pytest.mark.parametrize("library", [pinocchio_dynamics, mujoco_dynamics])
@@ -106,11 +126,9 @@ def test_zmp_ground_force_and_torque_equal_an_independent_library(
     torques, own = library(robot, q, qd, qdd, given, turn.T @ machine.gravity_in_world)
     force = turn @ own[3:]
     reaction = np.concatenate([turn @ own[:3] + np.cross(place, force), force])
-    expected = np.array([-reaction[1], reaction[0]]) / reaction[5]
-    motion = (q, qd, qdd, wrenches)
-    np.testing.assert_allclose(numeric(machine.zero_moment_point(*motion)).ravel(), expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(numeric(machine.ground_reaction(*motion)).ravel(), reaction, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(numeric(machine.joint_torques(*motion)).ravel(), torques, rtol=0, atol=1e-9)
+    close(machine.zero_moment_point(q, qd, qdd, wrenches), pressure_point(reaction))
+    close(machine.ground_reaction(q, qd, qdd, wrenches), reaction, 0)
+    close(machine.joint_torques(q, qd, qdd, wrenches), torques, 0)
 
 
 @pytest.mark.parametrize("library", [pinocchio_dynamics, mujoco_dynamics])
@@ -130,22 +148,17 @@ def test_slides_are_weighed_as_an_independent_library_does(library: Any) -> None
         q, qd, qdd = rng.normal(size=(3, 4))
         wrenches = [hand(rng, machine)]
         torques, reaction = library(machine.robot, q, qd, qdd, wrenches, machine.gravity_in_world)
-        found = numeric(machine.ground_reaction(q, qd, qdd, wrenches)).ravel()
-        np.testing.assert_allclose(found, reaction, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(numeric(machine.joint_torques(q, qd, qdd, wrenches)).ravel(), torques, atol=1e-9)
-        expected = np.array([-reaction[1], reaction[0]]) / reaction[5]
-        point = numeric(machine.zero_moment_point(q, qd, qdd, wrenches)).ravel()
-        np.testing.assert_allclose(point, expected, rtol=1e-9, atol=1e-9)
+        close(machine.ground_reaction(q, qd, qdd, wrenches), reaction, 0)
+        close(machine.joint_torques(q, qd, qdd, wrenches), torques, 1e-7)
+        close(machine.zero_moment_point(q, qd, qdd, wrenches), pressure_point(reaction))
 
 
-@given(seeds, sizes)
+@given(cases)
 @few
-def test_the_reaction_has_no_horizontal_moment_about_the_zero_moment_point(seed: int, size: int) -> None:
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
-    motion, wrench = random_motion(rng, machine), hand(rng, machine)
-    reaction = numeric(machine.ground_reaction(*motion, [wrench])).ravel()
-    point = np.append(numeric(machine.zero_moment_point(*motion, [wrench])).ravel(), 0.0)
+def test_the_reaction_has_no_horizontal_moment_about_the_zero_moment_point(case: Case) -> None:
+    _, machine, motion, wrench = case
+    reaction = flat(machine.ground_reaction(*motion, [wrench]))
+    point = np.append(flat(machine.zero_moment_point(*motion, [wrench])), 0.0)
     moment = reaction[:3] - np.cross(point, reaction[3:])
     np.testing.assert_allclose(moment[:2], 0, atol=1e-9 * np.abs(reaction).max())
 
@@ -184,72 +197,62 @@ def hand_form(machine: Standing, q: Array, qd: Array, point: Array) -> tuple[Arr
 @given(seeds, st.integers(1, 4))
 @few
 def test_the_rows_of_the_zmp_equation_equal_the_hand_form(seed: int, size: int) -> None:
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
-    (q, qd, _), point = random_motion(rng, machine), rng.normal(size=2)
+    rng, machine, (q, qd, _), _ = case(seed, size)
+    point = rng.normal(size=2)
     J_m, H_m, C = hand_form(machine, q, qd, point)
     rows = machine.zmp_rows(q, qd, point)
-    np.testing.assert_allclose(numeric(rows.jacobian), J_m, atol=1e-9)
-    np.testing.assert_allclose(numeric(rows.right).ravel(), C, atol=1e-9)
+    close(rows.jacobian, J_m.ravel(), 1e-7)
+    close(rows.right, C, 1e-7)
     for found, plane in zip(rows.hessians, H_m, strict=True):
-        np.testing.assert_allclose(numeric(found), (plane + plane.T) / 2, atol=1e-9)
+        close(found, ((plane + plane.T) / 2).ravel(), 1e-7)
 
 
-@given(seeds, sizes)
+@given(cases)
 @few
-def test_accelerations_that_meet_the_rows_put_the_zero_moment_point_there(seed: int, size: int) -> None:
+def test_accelerations_that_meet_the_rows_put_the_zero_moment_point_there(case: Case) -> None:
     """J_m q'' - (C - q' H_m q') = F_z (zmp - point), for any acceleration and wrench."""
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
-    (q, qd, qdd), point = random_motion(rng, machine), rng.normal(size=2)
-    wrench = hand(rng, machine)
+    rng, machine, (q, qd, qdd), wrench = case
+    point = rng.normal(size=2)
     rows = machine.zmp_rows(q, qd, point, [wrench])
-    left = numeric(rows.jacobian).dot(qdd) - numeric(rows.needed(qd)).ravel()
-    vertical = numeric(machine.ground_reaction(q, qd, qdd, [wrench])).ravel()[5]
-    off = numeric(machine.zero_moment_point(q, qd, qdd, [wrench])).ravel() - point
-    np.testing.assert_allclose(left, vertical * off, rtol=1e-8, atol=1e-8)
+    vertical = flat(machine.ground_reaction(q, qd, qdd, [wrench]))[5]
+    off = flat(machine.zero_moment_point(q, qd, qdd, [wrench])) - point
+    close(ca.mtimes(rows.jacobian, qdd) - rows.needed(qd), vertical * off, 1e-8, 1e-8)
 
 
 def test_the_index_is_1_at_the_most_stable_point_and_0_at_the_half_widths() -> None:
-    machine = standing_example()
     for point, index in (((0, 0), (1, 1)), ((0.05, -0.1), (0, 0)), ((0, 0.05), (1, 0.75)), ((0, 0.2), (1, -3))):
-        np.testing.assert_allclose(numeric(machine.stability_index(point)).ravel(), index, atol=1e-12)
-    arm = standing_arm()  # by default that of the bounding box: positive exactly inside a rectangle
-    np.testing.assert_allclose(numeric(arm.stability_index((0.15, -0.2))).ravel(), 0, atol=1e-12)
+        close(EXAMPLE.stability_index(point), index, 1e-7, 1e-12)
+    # by default that of the bounding box: positive exactly inside a rectangle
+    close(standing_arm().stability_index((0.15, -0.2)), 0, 0, 1e-12)
 
 
 def test_a_spring_pulls_back_to_its_rest() -> None:
-    machine = standing_example()
-    (wrench,) = tip_spring(machine, (0, 150, 0), (0, 0.3, 1.0))(0.0, ca.DM([0.1, 0.5, 0.9]))
-    np.testing.assert_allclose(numeric(wrench.force).ravel(), [0, -30, 0])
-    assert wrench.link == machine.robot.tip
+    (wrench,) = tip_spring(EXAMPLE, (0, 150, 0), (0, 0.3, 1.0))(0.0, ca.DM([0.1, 0.5, 0.9]))
+    np.testing.assert_allclose(flat(wrench.force), [0, -30, 0])
+    assert wrench.link == EXAMPLE.robot.tip
 
 
-@given(seeds, sizes)
+@given(cases)
 @few
-def test_a_sampled_motion_is_evaluated_point_by_point(seed: int, size: int) -> None:
-    rng = np.random.default_rng(seed)
-    machine = random_standing(rng, size)
+def test_a_sampled_motion_is_evaluated_point_by_point(case: Case) -> None:
+    rng, machine, _, _ = case
     q, qd, qdd = rng.normal(size=(3, 4, machine.joint_size))
-    t = np.array([0.0, 0.1, 0.3, 0.7])
-    pull = rng.normal(size=3)
+    t, pull = np.array([0.0, 0.1, 0.3, 0.7]), rng.normal(size=3)
 
     def external(time: Any, tip: Any) -> list[Wrench]:
         return [machine.tip_wrench(time * ca.DM(pull) - 2 * tip)]
 
     found = standing_motion(machine, t, q, qd, qdd, external)
     for k in range(4):
-        tip = numeric(machine.tip_pose((), q[k]).position).ravel()
-        wrenches = [machine.tip_wrench(t[k] * pull - 2 * tip)]
-        reaction = numeric(machine.ground_reaction(q[k], qd[k], qdd[k], wrenches)).ravel()
-        point = numeric(center_of_pressure(reaction)).ravel()
-        np.testing.assert_allclose(found.ground_force[k], reaction[3:], atol=1e-9)
-        np.testing.assert_allclose(found.zero_moment_point[k], point, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(found.index[k], numeric(machine.stability_index(point)).ravel(), rtol=1e-9)
-        np.testing.assert_allclose(
-            found.joint_torques[k], numeric(machine.joint_torques(q[k], qd[k], qdd[k], wrenches)).ravel(), atol=1e-9
-        )
-        np.testing.assert_allclose(found.external_force[k], t[k] * pull - 2 * tip, atol=1e-12)
+        push = t[k] * pull - 2 * flat(machine.tip_pose((), q[k]).position)
+        motion = q[k], qd[k], qdd[k], [machine.tip_wrench(push)]
+        reaction = flat(machine.ground_reaction(*motion))
+        point = flat(center_of_pressure(reaction))
+        close(found.ground_force[k], reaction[3:], 1e-7)
+        close(found.zero_moment_point[k], point)
+        close(machine.stability_index(point), found.index[k], 1e-9, 0)
+        close(machine.joint_torques(*motion), found.joint_torques[k], 1e-7)
+        close(found.external_force[k], push, 1e-7, 1e-12)
         inside = bool((point > 0).all() and point.sum() < 1)
         assert (found.foot_margin[k] > 0) == inside
     lifted = found.ground_force[:, 2] <= 0
@@ -262,15 +265,15 @@ def test_a_sampled_motion_is_evaluated_point_by_point(seed: int, size: int) -> N
 
 
 def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
-    machine = standing_example()
-    q = np.array([machine.robot.lower, machine.robot.upper, (machine.robot.lower + machine.robot.upper) / 2])
-    q = np.vstack([q, q[1] + [0, 0, 0.2, 0, 0]])
-    found = standing_motion(machine, np.arange(4.0), q, 0 * q, 0 * q)
+    lower, upper = EXAMPLE.robot.lower, EXAMPLE.robot.upper
+    beyond = upper + np.array([0, 0, 0.2, 0, 0])
+    q = np.array([lower, upper, (lower + upper) / 2, beyond])
+    found = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, 0 * q)
     np.testing.assert_allclose(found.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
     np.testing.assert_allclose(found.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
     assert found.joint_excess[2] < 0
     assert not found.stays_in_limits
-    assert standing_motion(machine, np.arange(3.0), q[:3], 0 * q[:3], 0 * q[:3]).stays_in_limits
+    assert standing_motion(EXAMPLE, np.arange(3.0), q[:3], 0 * q[:3], 0 * q[:3]).stays_in_limits
 
 
 def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
@@ -288,18 +291,19 @@ def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
         ({"most_stable_point": (0.1,)}, "most_stable_point has shape"),
         ({"robot": planar_chain([1.0], [0.0])}, "has no mass"),
         ({"robot": Robot((Link("stone", 1.0),))}, "no moving joint"),
+        ({"support": "wide"}, r"support must be a Support, .* not 'wide'"),
         ({"gravity": -9.81}, "gravity -9.81 m/s.2 is not positive"),
         ({"gravity": np.nan}, "gravity .*not finite"),
     ],
 )
 def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        replace(standing_example(), **changes)
+        replace(EXAMPLE, **changes)
 
 
 def test_a_motion_of_a_wrong_shape_is_refused() -> None:
     with pytest.raises(ModelError, match=r"joint_velocities has shape \(2, 4\), expected \(2, 5\)"):
-        standing_motion(standing_example(), [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
+        standing_motion(EXAMPLE, [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
 
 
 def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
@@ -309,13 +313,10 @@ def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
         Link("counterweight", -1.0)
 
 
-def test_a_support_that_is_none_and_wrenches_that_are_no_list_are_refused() -> None:
-    machine, rest = standing_example(), np.zeros(5)
-    wide: Any = "wide"
-    with pytest.raises(ModelError, match=r"support must be a Support, .* not 'wide'"):
-        replace(machine, support=wide)
-    alone: Any = machine.tip_wrench((0, 0, 1))
-    for call in (machine.zero_moment_point, machine.joint_torques, machine.ground_reaction):
+def test_wrenches_that_are_no_list_are_refused() -> None:
+    rest, alone = np.zeros(5), EXAMPLE.tip_wrench((0, 0, 1))
+    for name in ("zero_moment_point", "joint_torques", "ground_reaction"):
+        call: Any = getattr(EXAMPLE, name)
         with pytest.raises(ModelError, match="wrenches must be a list"):
             call(rest, rest, rest, alone)
 
@@ -324,4 +325,4 @@ def test_a_support_that_is_none_and_wrenches_that_are_no_list_are_refused() -> N
 def test_a_motion_of_no_times_is_refused(times: Any) -> None:
     rest = np.zeros((len(times), 5))
     with pytest.raises(ModelError, match="motion: "):
-        standing_motion(standing_example(), times, rest, rest, rest)
+        standing_motion(EXAMPLE, times, rest, rest, rest)
