@@ -23,19 +23,9 @@ from typing import Any, NamedTuple, TypeVar
 import casadi as ca
 import numpy as np
 
-from models.cts.rig import (
-    HOME,
-    Branch,
-    Rig,
-    RigPosture,
-    Tunnel,
-    corner_circle,
-    joints_of,
-    posture_at,
-)
+from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, joints_of, posture_at
 from models.cts.roll import (
     Candidate,
-    angle_ends,
     index_harmonics,
     inside_limit,
     level_points,
@@ -45,6 +35,7 @@ from models.cts.roll import (
     simple_ends,
     slide_points,
     verdict,
+    why_no_roll,
     yaw_chart,
     yaw_levels,
 )
@@ -246,8 +237,7 @@ class Search:
         known = [seen, more]
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
-            nowhere = stacked(Rough, [NOWHERE] * 4)
-            rough = choose(self._rough_stationary(), nowhere.shape)(self._one_minimum()(target), nowhere, target)
+            rough = self._rough_stationary()(target)
             best = self._gates(self._sharpen(self._stationary), 4)(target, previous, rough, best)
             known.append(stacked(Seen, [Seen(point.bound, point.value) for point in unstacked(Rough, rough)]))
         seen = ca.horzcat(*known)
@@ -258,7 +248,7 @@ class Search:
                 settled = (now.above if upper else now.below) >= now.cost
                 best = choose(self._slide(chart, upper), (BEST_SIZE, 1))(settled, best, target, previous, best)
         found = self._finish()(target, previous, best)
-        result = choose(self._reason(), (ANSWER_SIZE, 1))(_record(Best, best).cost < ca.inf, found, target)
+        result = choose(self._nowhere(), (ANSWER_SIZE, 1))(_record(Best, best).cost < ca.inf, found, target)
         return ca.Function("thorough", [target, previous, first, known[0]], [result])
 
     # ---- candidates ------------------------------------------------------------------------------------------
@@ -271,22 +261,17 @@ class Search:
         best, seen, _ = self._compare(target, previous, ends, _record(Best, first))
         return ca.Function("simple", [target, previous, first], ca.cse([ca.vertcat(*best), stacked(Seen, seen)]))
 
-    def _one_minimum(self) -> Any:
-        """Function (target) -> whether I1 certainly has one minimum only."""
-        target, _ = _given(ca.SX)
-        f = self._index(target)
-        first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
-        return ca.Function("one_minimum", [target], [first > 4.001 * second])
-
     def _rough_stationary(self) -> Any:
-        """Function (target) -> points near the minima of I1."""
+        """Function (target) -> points near the minima of I1; nowhere where it certainly has one minimum only."""
         target, _ = _given(ca.SX)
-        rough, (sin4_slack, _) = self._rough(target), self._slack()
-        points = []
-        for c, s in roots(self._index(target).derivative(), steps=0):
-            posture = self._posture(target, c, s)
-            points.append(rough(ca.fabs(posture.sin4) < 1 + sin4_slack, c, s, posture.cos2))
-        return ca.Function("rough", [target], ca.cse([stacked(Rough, points)]))
+        rough, f = self._rough(target), self._index(target)
+        points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
+        near = ca.Function("rough", [target], ca.cse([stacked(Rough, points)]))
+        first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
+        one_minimum = ca.Function("one_minimum", [target], [first > 4.001 * second])
+        x, nowhere = ca.MX.sym("target", 5), stacked(Rough, [NOWHERE] * len(points))
+        found = choose(near, nowhere.shape)(one_minimum(x), nowhere, x)
+        return ca.Function("rough_stationary", [x], [found])
 
     def _levels(self, chart: Any, count: int) -> Any:
         """Function (target, previous, seen, best) -> best, with the ends by joints 2 and 3 and the yaw link's reach.
@@ -296,23 +281,19 @@ class Search:
         """
         target, _ = _given(ca.SX)
         rolls, suspect = ca.SX.sym("seen", len(Seen._fields), count), ca.SX.sym("suspect", len(Suspect._fields))
-        sin4_slack, cos2_slack = self._slack()
-        suspects = []
+        suspects, (_, slack) = [], self._slack()
         for level in yaw_levels(self.rig, target, self.branch):
             bound = ca.SX(ca.inf)
             for roll in unstacked(Seen, rolls):
                 over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
-                bound = ca.fmin(bound, ca.if_else(over < cos2_slack, roll.cost, ca.inf))
+                bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
             bound = ca.if_else(level.relevant, bound, ca.inf)
             suspects.append(Suspect(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
         needed = ca.Function("levels", [target, rolls], ca.cse([stacked(Suspect, suspects)]))
 
-        asked, rough, points = _record(Suspect, suspect), self._rough(target), []
-        for c, s in level_points(self.rig, target, asked.cosine):
-            posture = self._posture(target, c, s)
-            near = ca.fabs(posture.cos2 - asked.cosine) < cos2_slack
-            near = ca.logic_and(near, ca.fabs(posture.sin4) < 1 + sin4_slack)
-            points.append(rough(near, c, s, asked.cosine, asked.code, asked.side))
+        (_, cosine, code, _, side), rough = _record(Suspect, suspect), self._rough(target)
+        ends = level_points(self.rig, target, cosine)
+        points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
         near_level = ca.Function("rough", [target, suspect], ca.cse([stacked(Rough, points)]))
 
         def polished(at: Expression, end: Rough) -> Point:
@@ -320,8 +301,8 @@ class Search:
 
         x, before = _given(ca.MX)
         first, column = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("suspect", len(Suspect._fields))
-        ends = self._gates(self._sharpen(polished), len(points))(x, before, near_level(x, column), first)
-        one = choose(ca.Function("level", [x, before, column, first], [ends]), (BEST_SIZE, 1))
+        found = self._gates(self._sharpen(polished), len(points))(x, before, near_level(x, column), first)
+        one = choose(ca.Function("level", [x, before, column, first], [found]), (BEST_SIZE, 1))
         seen = ca.MX.sym("seen", *rolls.shape)
         best = first
         for level in ca.horzsplit(needed(x, seen)):
@@ -336,12 +317,9 @@ class Search:
     def _slide(self, chart: Any, upper: bool) -> Any:
         """Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-        rough, (sin4_slack, cos2_slack) = self._rough(target), self._slack()
-        limit, ends = inside_limit(self.rig, 1, upper), []
-        for c, s in (ca.vertsplit(point) for point in ca.horzsplit(points)):
-            posture = self._posture(target, c, s)
-            near = ca.logic_and(ca.fabs(posture.sin4) < 1 + sin4_slack, ca.fabs(posture.cos2) < 1 + cos2_slack)
-            ends.append(rough(near, c, s, limit, limit_code(1, upper)))
+        rough, reach = self._rough(target), (0, 1 + self._slack()[1])
+        datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
+        ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
         near_limit = ca.Function("rough", [target, points], ca.cse([stacked(Rough, ends)]))
 
         def polished(at: Expression, end: Rough) -> Point:
@@ -361,12 +339,19 @@ class Search:
         return sin4, (ROOT_REACH * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
     def _rough(self, target: Expression) -> Callable[..., Rough]:
-        """Maker of a Rough from whether its roll can be, and all but its bound."""
-        f = self._index(target)
+        """Maker of a Rough from all but its bound; cos q2 must be within (middle, half) where they are given."""
+        f, (slack4, _) = self._index(target), self._slack()
         slack = ROOT_REACH * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
 
-        def rough(near: Expression, c: Expression, s: Expression, value: Any, code: Any = 0, side: Any = 0) -> Rough:
-            return Rough(ca.if_else(near, f.value(c, s) - slack, ca.inf), c, s, value, code, side)
+        def rough(
+            c: Expression, s: Expression, value: Expression = None, code: Any = 0, side: Any = 0, about: Any = None
+        ) -> Rough:
+            posture = self._posture(target, c, s)
+            near = ca.fabs(posture.sin4) < 1 + slack4
+            if about is not None:
+                near = ca.logic_and(near, ca.fabs(posture.cos2 - about[0]) < about[1])
+            bound = ca.if_else(near, f.value(c, s) - slack, ca.inf)
+            return Rough(bound, c, s, posture.cos2 if value is None else value, code, side)
 
         return rough
 
@@ -435,20 +420,11 @@ class Search:
         found = self._answer(target, previous, _record(Best, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([found]))
 
-    def _reason(self) -> Any:
+    def _nowhere(self) -> Any:
         """Function (target) -> answer where no roll will do: without joints, with the status that tells why."""
-        target, rig, branch = ca.SX.sym("target", 5), self.rig.unlimited(), self.branch
-        axle, e_c, _ = corner_circle(rig, target)
-        pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
-        points: list[Point] = [(1.0, 0.0)]
-        points += [(end.c, end.s) for end in angle_ends(rig, target, branch)]
-        yaw: Expression = 0
-        for c, s in points:
-            posture = posture_at(rig, target, c, s, branch)
-            yaw = ca.logic_or(yaw, verdict(rig, target, posture, c, s).relaxed())
-        status = ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
-        result = Answer(ca.DM.ones(6) * np.nan, np.nan, 0, status)
-        return ca.Function("reason", [target], ca.cse([ca.vertcat(*result)]))
+        target = ca.SX.sym("target", 5)
+        result = Answer(ca.DM.ones(6) * np.nan, np.nan, 0, why_no_roll(self.rig, target, self.branch))
+        return ca.Function("nowhere", [target], ca.cse([ca.vertcat(*result)]))
 
     def _answer(self, target: Expression, previous: Expression, best: Best, status: Expression) -> Expression:
         """The Answer with the best roll. Shape (9, 1)."""

@@ -134,6 +134,19 @@ def verdict(rig: Rig, target: Expression, posture: RigPosture, c: Expression, s:
     return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], *slide)
 
 
+def why_no_roll(rig: Rig, target: Expression, branch: Branch) -> Expression:
+    """Code in STATUS of a target that no roll holds: which link does not reach, or else that limits are in the way."""
+    rig = rig.unlimited()
+    axle, e_c, _ = corner_circle(rig, target)
+    pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
+    points: list[Point] = [(1.0, 0.0)]
+    points += [(end.c, end.s) for end in angle_ends(rig, target, branch)]
+    yaw: Expression = 0
+    for c, s in points:
+        yaw = ca.logic_or(yaw, verdict(rig, target, posture_at(rig, target, c, s, branch), c, s).relaxed())
+    return ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
+
+
 def angle_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     """Ends of the reachable arcs by everything but the limits of joint 1, and points that mean nothing among them."""
     ends = simple_ends(rig, target, branch)
