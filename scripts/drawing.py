@@ -46,7 +46,7 @@ COLORS = {
 }
 """Okabe, Ito 2008: told apart with every kind of colour vision."""
 
-DASHES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (1, 1)))
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (1, 1)))
 """Line styles in the order of the curves, so that no curve is known by its colour alone."""
 
 STYLE: Any = {

@@ -42,7 +42,7 @@ REACH_INSET = 1e-13
 
 SQUARED_POLISH_REACH = 1e-5
 SINE_ROUNDING = 2e-15  # of sin q4 and what depends on it
-LIMIT_SLACK = 1e-7  # in a cosine, where it is only asked whether an end can matter
+COSINE_SLACK = 1e-7  # in a cosine, where it is only asked whether an end can matter
 
 
 class Candidate(NamedTuple):
@@ -198,7 +198,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[Level]:
             angle = inside_limit(rig, 3, upper)
             cosine = s_yaw * np.cos(angle) - c_yaw * np.sin(angle)  # of q2 = yaw - pi/2 - q3
             sine = -c_yaw * np.cos(angle) - s_yaw * np.sin(angle)
-            within = ca.logic_and(branch.yaw * sine > -LIMIT_SLACK, _within(rig, 2, sine, cosine))
+            within = ca.logic_and(branch.yaw * sine > -COSINE_SLACK, _within(rig, 2, sine, cosine))
             add(sine, cosine, limit_code(3, upper), (branch.yaw < 0) == upper, within)
     return found
 
@@ -244,7 +244,7 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
     return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
-def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = LIMIT_SLACK) -> Expression:
+def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
     """Whether an angle given by its sine and cosine is within the limits of a joint, or as good as."""
     if not rig.limited(joint):
         return 1

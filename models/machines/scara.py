@@ -27,7 +27,7 @@ __all__ = ["Elbow", "Scara"]
 
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
-LIMIT_SLACK = 1e-9
+JOINT_SLACK = 1e-9
 """Joint limits are exceeded beyond this, rad or m: rounding is not."""
 REACH_ROUNDING = 1e-12
 """Reaches beyond the boundary by no more than this, relative, are on it."""
@@ -144,11 +144,11 @@ class Scara:
         """
         low, high = float(self.lower[joint]), float(self.upper[joint])
         turn = 0.0
-        if joint != QUILL and least < low - LIMIT_SLACK:
-            turn = FULL_TURN * float(np.ceil((low - LIMIT_SLACK - least) / FULL_TURN))
-        elif joint != QUILL and most > high + LIMIT_SLACK:
-            turn = -FULL_TURN * float(np.ceil((most - high - LIMIT_SLACK) / FULL_TURN))
-        return turn if low - LIMIT_SLACK <= least + turn and most + turn <= high + LIMIT_SLACK else None
+        if joint != QUILL and least < low - JOINT_SLACK:
+            turn = FULL_TURN * float(np.ceil((low - JOINT_SLACK - least) / FULL_TURN))
+        elif joint != QUILL and most > high + JOINT_SLACK:
+            turn = -FULL_TURN * float(np.ceil((most - high - JOINT_SLACK) / FULL_TURN))
+        return turn if low - JOINT_SLACK <= least + turn and most + turn <= high + JOINT_SLACK else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
         """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).

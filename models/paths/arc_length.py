@@ -17,9 +17,9 @@ from models.errors import ModelError
 
 __all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
 
-NODES, WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
-NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
-ACCURACY = 1e-13
+GAUSS_NODES, GAUSS_WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
+GAUSS_NODES, GAUSS_WEIGHTS = (GAUSS_NODES + 1) / 2, GAUSS_WEIGHTS / 2
+LENGTH_ACCURACY = 1e-13
 """Largest disagreement of the rule on a cell and on its halves, relative to the length of the cell's curve."""
 STEEPEST = 3.0
 """Largest slope du/ds at a cell's ends over its mean: up to it the cubic between them is monotone."""
@@ -69,7 +69,7 @@ def _speed(derivative: Array, u: Array) -> Array:
 
 def _lengths(derivative: Array, start: Array, width: Array) -> Array:
     # (3, 5, M), (M,), (M,) to (M,)
-    return np.asarray(width * (WEIGHTS @ _speed(derivative, start + width * NODES[:, None])))
+    return np.asarray(width * (GAUSS_WEIGHTS @ _speed(derivative, start + width * GAUSS_NODES[:, None])))
 
 
 def cells(coefficients: Array) -> Cells:
@@ -90,7 +90,7 @@ def cells(coefficients: Array) -> Cells:
         half = width / 2
         mine = slopes[:, :, curve]
         left, right = _lengths(mine, start, half), _lengths(mine, start + half, half)
-        fine = np.abs(whole - left - right) <= ACCURACY * scale[curve]
+        fine = np.abs(whole - left - right) <= LENGTH_ACCURACY * scale[curve]
         slowest = np.minimum(_speed(mine, start), _speed(mine, start + width))
         fine &= left + right <= STEEPEST * width * slowest
         done.append((curve[fine], start[fine], width[fine], (left + right)[fine]))

@@ -16,7 +16,7 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_choice
 from models.errors import ModelError
-from models.paths.arc_length import NEWTON_STEPS, NODES, WEIGHTS, speed
+from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, NEWTON_STEPS, speed
 from models.paths.orientation import orientation_function
 from models.paths.smooth_path import SmoothPath
 
@@ -90,7 +90,9 @@ def _in_cell() -> Any:
     at: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
     for _ in range(NEWTON_STEPS - 1):
         step = at - first_u
-        mean = sum(float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(NODES, WEIGHTS, strict=True))
+        mean = sum(
+            float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
+        )
         at = at - (step * mean - distance) / rate_of(row, at)
     rate_u = ca.dot(first, second) / rate
     rate_uu = (ca.dot(second, second) + ca.dot(first, third) - rate_u**2) / rate

@@ -18,7 +18,10 @@ from models.spatial import FULL_TURN
 __all__ = ["Overlap", "smooth"]
 
 Overlap: TypeAlias = Literal["shrink", "refuse"]
-SAMPLES, FINER = 33, 33  # of a blend whose deviation is looked for, and of the neighbourhood of the extreme
+BLEND_SAMPLES, EXTREME_SAMPLES = (
+    33,
+    33,
+)  # of a blend whose deviation is looked for, and of the neighbourhood of the extreme
 KEPT_BACK = 1e-3
 """Share of the tolerance kept back for what lies between the samples of a deviation."""
 MOST_TRIALS, MOST_SHRINKS = 60, 30
@@ -154,14 +157,16 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     evenly and again about the extreme: the first is never below the truth, the second by at most 0.1 %. Shape (V,), m.
     """
     path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
-    u = np.linspace(0, 1, SAMPLES)
+    u = np.linspace(0, 1, BLEND_SAMPLES)
     points = polynomial(curves[:, None], u[None, :])
     tip = path.start[vertices + 1][:, None]
     corner = np.linalg.norm(points - tip, axis=-1)
     near = _from_segments(path, vertices, points, remaining)
 
     def about(extreme: NDArray[np.intp]) -> Array:
-        places = u[np.clip(extreme, 1, SAMPLES - 2)][:, None] + np.linspace(-1, 1, FINER) / (SAMPLES - 1)
+        places = u[np.clip(extreme, 1, BLEND_SAMPLES - 2)][:, None] + np.linspace(-1, 1, EXTREME_SAMPLES) / (
+            BLEND_SAMPLES - 1
+        )
         return polynomial(curves[:, None], places)
 
     closest = np.linalg.norm(about(corner.argmin(axis=1)) - tip, axis=-1)
@@ -173,7 +178,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 def _from_blend(corners: _Corners, remaining: Array) -> Array:
     """Largest distance of the two stretches that each blend replaces from the blend. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
-    u, v = np.linspace(0, 1, 4 * SAMPLES), np.linspace(0, 1, SAMPLES)
+    u, v = np.linspace(0, 1, 4 * BLEND_SAMPLES), np.linspace(0, 1, BLEND_SAMPLES)
     for first in range(0, len(remaining), CORNERS_AT_ONCE):
         part = slice(first, first + CORNERS_AT_ONCE)
         some, away = corners.some(part), remaining[part]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -126,20 +127,24 @@ def test_rows_that_are_no_task_are_refused(rows: tuple[int, ...], message: str) 
             machine.manipulability(machine.base_home(), np.zeros(machine.joint_size), rows)
 
 
-def test_vectors_of_a_wrong_size_are_refused() -> None:
-    fixed, floating = FixedBase(planar_chain([1.0], [1.0])), paper_example()
-    with pytest.raises(ModelError, match=r"base has shape \(3, 1\), expected \(0, 1\)"):
-        fixed.tip_pose(np.zeros(3), np.zeros(1))
-    with pytest.raises(ModelError, match=r"q has shape \(2, 1\), expected \(1, 1\)"):
-        fixed.tip_jacobian((), np.zeros(2))
-    with pytest.raises(ModelError, match=r"joint_rates has shape \(2, 1\), expected \(3, 1\)"):
-        floating.base_rate(np.zeros(3), np.zeros(3), np.zeros(2))
-    with pytest.raises(ModelError, match=r"base has shape \(7, 1\), expected \(3, 1\): \(x, y, angle\)"):
-        floating.tip_pose(np.zeros(7), np.zeros(3))
-    with pytest.raises(ModelError, match=r"base_twist has shape \(6, 1\), expected \(3, 1\)"):
-        floating.momentum(np.zeros(3), np.zeros(3), np.zeros(6), np.zeros(3))
-    with pytest.raises(ModelError, match=r"base_rate has shape \(2, 1\), expected \(3, 1\)"):
-        floating.momentum_residual(np.zeros(3), np.zeros(3), np.zeros(2), np.zeros(3))
+FIXED, FLOATING, ONE, TWO, THREE = FixedBase(planar_chain([1.0], [1.0])), paper_example(), *map(np.zeros, (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: FIXED.tip_pose(THREE, ONE), r"base has shape \(3, 1\), expected \(0, 1\)"),
+        (lambda: FIXED.tip_jacobian((), TWO), r"q has shape \(2, 1\), expected \(1, 1\)"),
+        (lambda: FLOATING.base_rate(THREE, THREE, TWO), r"joint_rates has shape \(2, 1\), expected \(3, 1\)"),
+        (lambda: FLOATING.tip_pose(np.zeros(7), THREE), r"base has shape \(7, 1\), expected \(3, 1\): \(x, y, angle\)"),
+        (lambda: FLOATING.momentum(THREE, THREE, np.zeros(6), THREE), r"base_twist .*\(6, 1\), expected \(3, 1\)"),
+        (lambda: FLOATING.momentum_residual(THREE, THREE, TWO, THREE), r"base_rate .*\(2, 1\), expected \(3, 1\)"),
+        (lambda: FixedBase(FIXED.robot, rotation=np.ones((3, 3))), r"fixed base: rotation .* not a rotation matrix"),
+    ],
+)
+def test_vectors_of_a_wrong_size_and_what_is_no_rotation_are_refused(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        call()
 
 
 def test_machines_without_a_moving_joint_are_refused() -> None:
@@ -147,8 +152,3 @@ def test_machines_without_a_moving_joint_are_refused() -> None:
     for make in (FixedBase, FreeFloating):
         with pytest.raises(ModelError, match="no moving joint"):
             make(robot)
-
-
-def test_a_fixed_base_stands_on_a_proper_frame() -> None:
-    with pytest.raises(ModelError, match=r"fixed base: rotation .* not a rotation matrix"):
-        FixedBase(planar_chain([1.0], [1.0]), rotation=np.ones((3, 3)))

@@ -19,6 +19,7 @@ from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
 HORIZON = 10.0
+DENSE = np.linspace(0, HORIZON, 401)
 SMOOTH = Collocation(intervals=25, degree=3)
 HELD = Collocation(intervals=50, degree=3, control="held")  # its double integrator is exact
 
@@ -30,6 +31,20 @@ def falling(time: Any) -> list[Any]:
 
 def targets_at(t: Any) -> Any:
     return np.array([np.broadcast_to(part, len(t)) for part in falling(np.asarray(t))])
+
+
+def joints_along(rig: Rig, found: Solution, t: Any) -> Any:
+    """Joints of the plan at some times, between the nodes too. Shape (6, samples)."""
+    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
+    joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]]).map(len(t))
+    return np.array(joints(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1)))
+
+
+def least_gaps(around: Surroundings, joints: Any) -> Any:
+    """Distance of the rig from its surroundings for joints of shape (6, samples)."""
+    q = ca.SX.sym("q", 6)
+    gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
+    return np.array(gaps.map(joints.shape[1])(joints))
 
 
 def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Solution:
@@ -68,17 +83,11 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
 
 def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
     around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
-    q = ca.SX.sym("q", 6)
-    gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
-    t = np.linspace(0, HORIZON, 101)
-    free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(t), np.zeros((1, 101)))[0]
-    assert np.array(gaps.map(101)(free)).min() < -0.02  # in its midst
+    free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
+    assert least_gaps(around, free).min() < -0.02  # in its midst
     problem = roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, clearance=0.01)
     found = solve(problem, SMOOTH)
-    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
-    joints = ca.Function("j", [x, phi], [inverse(RIG, x, phi, HOME)[0]]).map(len(found.t))
-    rows = joints(targets_at(found.t), found["roll"].T)
-    assert np.array(gaps.map(len(found.t))(rows)).min() >= 0.01 - 1e-6
+    assert least_gaps(around, joints_along(RIG, found, found.t)).min() >= 0.01 - 1e-6
     assert found.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
 
 
@@ -112,44 +121,24 @@ def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must
 
 def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
     around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
-    q = ca.SX.sym("q", 6)
-    gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
-    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
-    gap = ca.Function("gap", [x, phi], [gaps(inverse(RIG, x, phi, HOME)[0])])
 
     def mean(weight: float) -> float:
         found = plan(surroundings=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
-        t = np.linspace(0, HORIZON, 101)
-        return float(np.array(gap.map(101)(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1))).mean())
+        return float(least_gaps(around, joints_along(RIG, found, np.linspace(0, HORIZON, 101))).mean())
 
     assert mean(0.02) > mean(0.0) + 5e-3
-    for options, name in (
-        ({"clearance_weight": -1.0}, "clearance_weight"),
-        ({"clearance_width": 0.0}, "clearance_width"),
-        ({"clearance": np.nan}, "clearance nan"),
-    ):
-        with pytest.raises(ProblemError, match=name):
-            roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, **options)  # type: ignore[arg-type]
-
-
-def joints_along(rig: Rig, found: Solution) -> Any:
-    """Joints between the nodes too, shape (6, samples)."""
-    t = np.linspace(0, HORIZON, 401)
-    x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
-    joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]]).map(len(t))
-    return np.array(joints(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1)))
 
 
 def test_joint_limits_hold_along_the_plan() -> None:
     rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 3, 0.175, 3, 9))
-    assert joints_along(rig, plan(rig))[3].max() == pytest.approx(0.175, abs=1e-4)
+    assert joints_along(rig, plan(rig), DENSE)[3].max() == pytest.approx(0.175, abs=1e-4)
 
 
 def test_a_roll_that_a_joint_limit_forbids_all_the_way_is_gone_round() -> None:
     """Joint 3 forbids roll pi / 2 at every target: near the best roll of each by itself there is no way across."""
     rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 0.3, 3, 3, 9))
     found = plan(rig)
-    assert joints_along(rig, found)[2].max() <= 0.3 + 1e-5
+    assert joints_along(rig, found, DENSE)[2].max() <= 0.3 + 1e-5
     assert found["roll"][-1, 0] < -3.0
 
 
@@ -160,15 +149,25 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
     assert table.cost == pytest.approx(plan().cost, rel=1e-6)
 
 
-def test_what_cannot_be_planned_is_named() -> None:
-    with pytest.raises(ProblemError, match="no roll reaches the target at 0 s"):
-        roll_problem(RIG, TUNNEL, lambda time: [9.0, 9.0, 9.0, 0.0, 0.0], HORIZON, symbols=ca.SX)
-    with pytest.raises(ProblemError, match="start_roll nan"):
-        roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, start_roll=np.nan)
-    with pytest.raises(ProblemError, match="horizon"):
-        roll_problem(RIG, TUNNEL, falling, 0.0)
-    with pytest.raises(ProblemError, match="rate_limit"):
-        roll_problem(RIG, TUNNEL, falling, HORIZON, rate_limit=-1.0)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"targets": lambda time: [9.0, 9.0, 9.0, 0.0, 0.0]}, "no roll reaches the target at 0 s"),
+        ({"start_roll": np.nan}, "start_roll nan"),
+        ({"horizon": 0.0}, "horizon"),
+        ({"rate_limit": -1.0}, "rate_limit"),
+        ({"clearance_weight": -1.0}, "clearance_weight"),
+        ({"clearance_width": 0.0}, "clearance_width"),
+        ({"clearance": np.nan}, "clearance nan"),
+    ],
+)
+def test_what_cannot_be_planned_is_named(options: dict[str, Any], message: str) -> None:
+    asked = {"targets": falling, "horizon": HORIZON, "symbols": ca.SX, **options}
+    with pytest.raises(ProblemError, match=message):
+        roll_problem(RIG, TUNNEL, **asked)
+
+
+def test_a_table_that_is_none_is_named() -> None:
     with pytest.raises(ProblemError, match="times"):
         spline_targets([0, 1, 1, 2], np.zeros((4, 5)))
     with pytest.raises(ProblemError, match="row 1"):
