@@ -5,7 +5,8 @@ frame's origin), a force vector is (moment about the frame's origin, force), a m
 about the origin, linear momentum). Every function takes SX, MX, DM, numpy arrays or nested lists, and keeps
 structural zeros, so that a planar machine written in three dimensions costs no more than one written in two.
 
-Linear algebra of small symbolic matrices, element by element to keep expression graphs small.
+Systems of equations and determinants of small symbolic matrices are worked out element by element, which keeps the
+graphs of their expressions small.
 """
 
 from __future__ import annotations

@@ -182,9 +182,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 def tool_frame(rig: Rig, q: Expression) -> Frame:
     """Tool frame in world by the closed expressions (6)-(14), (19)-(21)."""
     q = expression(q)
-    c23, s23 = ca.cos(q[1] + q[2]), ca.sin(q[1] + q[2])
-    c45, s45 = ca.cos(q[3] + q[4]), ca.sin(q[3] + q[4])
-    c6, s6 = ca.cos(q[5]), ca.sin(q[5])
+    (c23, s23), (c45, s45), (c6, s6) = _cosines_and_sines(q)
     turn = ca.vertcat(
         ca.horzcat(-s23 * s45, c45 * s23 * s6 - c23 * c6, c23 * s6 + c45 * s23 * c6),
         ca.horzcat(c23 * s45, -s23 * c6 - c23 * c45 * s6, s23 * s6 - c23 * c45 * c6),
@@ -199,9 +197,7 @@ def forward(rig: Rig, q: Expression) -> Expression:
     Yaw and pitch are the sums of the joint angles, not folded into one turn.
     """
     q = expression(q)
-    c23, s23 = ca.cos(q[1] + q[2]), ca.sin(q[1] + q[2])
-    c45, s45 = ca.cos(q[3] + q[4]), ca.sin(q[3] + q[4])
-    c6, s6 = ca.cos(q[5]), ca.sin(q[5])
+    (c23, s23), (c45, s45), (c6, s6) = _cosines_and_sines(q)
     along = rig.yaw_link_2 + rig.pitch_link * ca.cos(q[3]) + rig.sting * s45 + rig.goose_neck * c45 * c6
     aside = rig.yaw_offset + rig.goose_neck * s6
     return ca.vertcat(
@@ -212,6 +208,11 @@ def forward(rig: Rig, q: Expression) -> Expression:
         q[3] + q[4] - HALF_PI,
         q[5],
     )
+
+
+def _cosines_and_sines(q: Expression) -> list[tuple[Expression, Expression]]:
+    """Of the sums of joints 2 and 3 and of 4 and 5, and of joint 6."""
+    return [(ca.cos(angle), ca.sin(angle)) for angle in (q[1] + q[2], q[3] + q[4], q[5])]
 
 
 def task_jacobian(rig: Rig, q: Expression) -> Expression:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +15,18 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from models import ModelError
-from models.paths import Arc, Line, Path, SmoothPath, end_curvature, gamma, middle_curvature, peak_curvature, smooth
+from models.paths import (
+    Arc,
+    Line,
+    Path,
+    SmoothPath,
+    end_curvature,
+    gamma,
+    middle_curvature,
+    peak_curvature,
+    rest_to_rest,
+    smooth,
+)
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
 from tests.models.paths.task_paths import random_path, seeds
@@ -57,6 +69,16 @@ def test_lengths_over_the_remaining_distance_are_the_numbers_checked(
     degrees: float, shape: float, length: float
 ) -> None:
     assert corner(degrees, 0.15, "cubic", shape).blend(0).length / 0.15 == pytest.approx(length, abs=5e-5)
+
+
+def test_a_way_from_rest_to_rest_begins_and_ends_without_speed_and_acceleration() -> None:
+    s = ca.SX.sym("s")
+    way = rest_to_rest(s)
+    speed = ca.jacobian(way, s)
+    function = ca.Function("f", [s], [way, speed, ca.jacobian(speed, s)])
+    assert [float(value) for value in function(0.0)] == [0.0, 0.0, 0.0]
+    assert [float(value) for value in function(1.0)] == pytest.approx([1.0, 0.0, 0.0], abs=1e-14)
+    assert rest_to_rest(np.array([0.0, 0.5, 1.0])) == pytest.approx([0.0, 0.5, 1.0])
 
 
 def test_the_quintic_bends_less_than_the_cubic_as_stated() -> None:
