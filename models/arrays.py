@@ -95,7 +95,15 @@ def checked_number(
 
 
 def one_for_each(
-    value: ArrayInput, count: int, owner: str, what: str, items: str, *, positive: bool = False, unit: str = ""
+    value: ArrayInput,
+    count: int,
+    owner: str,
+    what: str,
+    items: str,
+    *,
+    finite: bool = True,
+    positive: bool = False,
+    unit: str = "",
 ) -> Array:
     """`value`, one number for all `items` or one for each of the `count`, as one for each. Shape (count,).
 
@@ -106,7 +114,7 @@ def one_for_each(
     if array.ndim and array.shape != (count,):
         message = f"{owner}: {what} has shape {array.shape}; give one number, or one for each of the {count} {items}"
         raise ModelError(message, name=what, value=array, limit=(count,))
-    known = checked_array(array, array.shape, owner, what, positive=positive, unit=unit)
+    known = checked_array(array, array.shape, owner, what, finite=finite, positive=positive, unit=unit)
     return frozen(np.array(np.broadcast_to(known, (count,))))
 
 

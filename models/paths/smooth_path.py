@@ -201,7 +201,7 @@ class SmoothPath:
             ModelError: A number of values that is not that of the segments.
         """
         count = len(self.path.segments)
-        values = one_for_each(of_segments, count, "path", "speed", "segments")
+        values = one_for_each(of_segments, count, "path", "speed", "segments", finite=False)
         blends = np.minimum(values[self.piece_blend], values[np.minimum(self.piece_blend + 1, count - 1)])
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
