@@ -3,7 +3,7 @@
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
 from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
@@ -13,7 +13,7 @@ from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Line, Path, SmoothPath, smooth
-from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
+from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
 from models.robot.kinematics import (
     center_of_mass,
     center_of_mass_jacobian,
@@ -27,7 +27,7 @@ from models.robot.kinematics import (
     tip_pose,
 )
 from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
-from models.robot.parts import Joint, Link
+from models.robot.parts import CollisionShape, Joint, Link, Mimic
 from models.robot.rebuild import (
     attached,
     locked,
@@ -49,6 +49,7 @@ __all__ = [
     "Arc",
     "Box",
     "Capsule",
+    "CollisionShape",
     "FixedBase",
     "Footprint",
     "Frame",
@@ -57,7 +58,9 @@ __all__ = [
     "Line",
     "Link",
     "Machine",
+    "Mimic",
     "ModelError",
+    "ModelWarning",
     "Path",
     "Rig",
     "Robot",
@@ -80,6 +83,7 @@ __all__ = [
     "link_jacobians",
     "link_motions",
     "locked",
+    "mass_matrix",
     "merged",
     "momentum",
     "momentum_matrix",

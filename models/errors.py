@@ -22,3 +22,7 @@ class ModelError(ValueError):
     ) -> None:
         super().__init__(message)
         self.name, self.value, self.limit, self.time = name, value, limit, time
+
+
+class ModelWarning(UserWarning):
+    """Something odd in what describes a machine, which can be worked with; the message names where it is."""

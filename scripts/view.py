@@ -85,9 +85,9 @@ def parser() -> argparse.ArgumentParser:
         "--lock", type=_locked, action="append", metavar="NAME=VALUE", help="joint held fixed, rad or m; repeatable"
     )
     reading.add_argument(
-        "--mimic", choices=("error", "lock", "free"), help="what to do about joints that follow others"
+        "--mimic", choices=("couple", "lock", "free"), help="what to do about joints that follow others"
     )
-    reading.add_argument("--as-given", action="store_true", help="take inertias that no body can have")
+    reading.add_argument("--as-given", action="store_true", help="do not warn of inertias that no body can have")
     plan = words.add_argument_group("what the plan means")
     plan.add_argument("--joints", metavar="STATE", help="state of the joint positions (default: joints)")
     plan.add_argument("--base", metavar="STATE", help="state of the base, 3 or 7 entries (default: base)")

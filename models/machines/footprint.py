@@ -1,10 +1,9 @@
-"""Where a robot described in URDF touches level ground: its support, from the collision shapes of wheels and feet."""
+"""Where a robot touches level ground: its support, from the collision shapes of its wheels and feet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
-from xml.etree import ElementTree
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,9 +12,8 @@ from models.arrays import Array, ArrayInput, checked_number, checked_rotation
 from models.errors import ModelError
 from models.machines.support import Support
 from models.robot.kinematics import link_frames
+from models.robot.parts import CollisionShape
 from models.robot.robot import Robot
-from models.robot.tree import absent
-from models.robot.urdf import Source, child_of, name_of, number_of, numbers_of, origin_of, parsed
 from models.spatial import FULL_TURN, Frame
 
 RIM = 32
@@ -46,61 +44,45 @@ class Footprint(NamedTuple):
 
 def footprint(
     robot: Robot,
-    source: Source,
     *,
     q: ArrayInput = None,
     rotation: ArrayInput = None,
     links: Sequence[str] | None = None,
     depth: float = 0.005,
 ) -> Footprint:
-    """Support of a robot that stands on whatever of its shapes is lowest.
+    """Support of a robot that stands on whatever of its collision shapes is lowest.
 
-    Boxes, cylinders, capsules and spheres of <collision> are looked at. Meshes are not read: where a foot is a mesh
+    Boxes, cylinders, capsules and spheres are looked at. Meshes are not read: where a foot is a mesh
     give the support yourself; where a mesh might be lower than what is found name the `links` that touch the ground.
 
     Args:
-        robot: Made from `source`, before it is simplified: it has the links whose shapes may touch the ground.
-        source: URDF text or path, as Robot.from_urdf takes it.
+        robot: With the links whose shapes may touch the ground, or what carries them.
         q: Joint positions in which it stands, zeros if None. Shape (dof,), rad or m.
         rotation: The root link's axes, as columns, in the world, z upwards; those of the world if None. Shape (3, 3).
         links: Links that may touch the ground; all if None.
         depth: How far above the lowest point a point still counts as touching, m: wheels and casters give way.
 
     Raises:
-        ModelError: Unknown links, links with shapes that the robot lacks, no shape but meshes or the origin of a mesh
-            below them, contact points in one line, sizes that are not positive, no rotation.
+        ModelError: Unknown links, no shape but meshes or the origin of a mesh below them, contact points in one line, a
+            negative depth, no rotation.
     """
     if checked_number(depth, "footprint", "depth") < 0:
         raise ModelError(f"footprint: depth {depth!r} m must be zero or positive", name="depth", value=depth, limit=0.0)
-    known = [link.name for link in robot.links]
-    for name in links or ():
-        if name not in known:
-            raise absent("footprint: link", name, known)
+    standing = robot.links if links is None else [robot.link(name) for name in links]
     upright = checked_rotation(np.eye(3) if rotation is None else rotation, "footprint", "rotation")
     frames = link_frames(robot, np.zeros(robot.dof) if q is None else q, Frame(ca.DM(upright), ca.DM.zeros(3)))
     owners: list[str] = []
     points: list[Array] = []
     meshes: list[tuple[float, str]] = []  # height of the origin, link
-    for element in parsed(source).findall("link"):
-        name = name_of(element)
-        if links is not None and name not in links:
-            continue
-        if name not in frames:
-            if element.find("collision") is not None:
-                message = (
-                    f"footprint: the robot has no link {name!r}, whose shapes may be the lowest; take the footprint "
-                    "before the robot is simplified or cut, or name the links that touch the ground"
-                )
-                raise ModelError(message, name=name)
-            continue
-        turn, place = (np.array(ca.DM(part)) for part in frames[name])
-        for shape in element.findall("collision"):
-            corners = _corners(shape, f"link {name!r}", turn)
-            if corners is None:
-                meshes.append((float((place.ravel() + turn @ origin_of(shape, name)[0])[2]), name))
-                continue
-            points.extend(corners @ turn.T + place.ravel())
-            owners.extend([name] * len(corners))
+    for link in standing:
+        turn, place = (np.array(ca.DM(part)) for part in frames[link.name])
+        for shape in (each.placed(turn, place.ravel()) for each in link.collisions):
+            if shape.kind == "mesh":
+                meshes.append((float(shape.translation[2]), link.name))
+            else:
+                corners = _corners(shape)
+                points.extend(corners)
+                owners.extend([link.name] * len(corners))
     if not points:
         owning = sorted({name for _, name in meshes})
         what = f"only meshes, in {owning}, which are not read" if meshes else "no collision shapes"
@@ -149,24 +131,17 @@ def _chain(points: Iterable[Array], flat: float) -> list[Array]:
     return chain
 
 
-def _corners(shape: ElementTree.Element, owner: str, world_from_link: Array) -> Array | None:
-    """Points of a shape that may be its lowest, in the link's frame; None for a mesh. Shape (k, 3), m."""
-    kinds: list[Any] = list(child_of(shape, "geometry", owner))
-    if len(kinds) != 1:
-        raise ModelError(f"{owner}: <geometry> has {len(kinds)} shapes, not one")
-    kind = kinds[0]
-    shift, turn = origin_of(shape, owner)
-    down = -(world_from_link @ turn)[2]  # in the shape's axes
-    if kind.tag == "box":
-        half = _positive(numbers_of(kind, "size", owner, 3), "size", owner) / 2
-        corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * half
-    elif kind.tag == "sphere":
-        corners = _positive(number_of(kind, "radius", owner), "radius", owner) * down[None, :]
-    elif kind.tag in ("cylinder", "capsule"):
-        radius = _positive(number_of(kind, "radius", owner), "radius", owner)
-        half = _positive(number_of(kind, "length", owner), "length", owner) / 2
-        ends = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])
-        if kind.tag == "capsule":
+def _corners(shape: CollisionShape) -> Array:
+    """Points of a shape in the world, no mesh, that may be its lowest. Shape (k, 3), m."""
+    down = -np.asarray(shape.rotation)[2]  # in the shape's axes
+    if shape.kind == "box":
+        corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * shape.size / 2
+    elif shape.kind == "sphere":
+        corners = shape.size * down[None, :]
+    else:
+        radius, length = shape.size
+        ends = np.array([[0.0, 0.0, -length / 2], [0.0, 0.0, length / 2]])
+        if shape.kind == "capsule":
             corners = ends + radius * down
         else:
             lowest = np.arctan2(down[1], down[0])  # the rim's own lowest point is one of its corners
@@ -174,14 +149,4 @@ def _corners(shape: ElementTree.Element, owner: str, world_from_link: Array) -> 
             rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
             rim = rim[rim @ down >= (rim @ down).max() - LEVEL * radius]  # a wheel stands on its lowest line alone
             corners = (ends[:, None] + rim[None]).reshape(-1, 3)
-    elif kind.tag == "mesh":
-        return None
-    else:
-        raise ModelError(f"{owner}: unknown shape <{kind.tag}>; a shape is a box, cylinder, capsule, sphere or mesh")
-    return np.asarray(corners @ turn.T + shift)
-
-
-def _positive(value: Any, what: str, owner: str) -> Any:
-    if not (np.asarray(value) > 0).all() or not np.isfinite(value).all():
-        raise ModelError(f"{owner}: {what} {value} of a collision shape is not positive", name=what, value=value)
-    return value
+    return np.asarray(corners @ shape.rotation.T + shape.translation)

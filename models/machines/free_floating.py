@@ -25,11 +25,13 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_choice
 from models.errors import ModelError
-from models.machines.machine import TWIST_SIZE, jacobian_manipulability, require_joints
+from models.machines.machine import require_joints
+from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import (
     center_of_mass,
     checked_vector,
     frames_and_axes,
+    joint_momenta,
     joint_vector,
     point_jacobian,
     robot_inertia,
@@ -140,13 +142,13 @@ class FreeFloating:
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
         """Generalized Jacobian G (25), the linear part of the tip's twist. Shape (6, joint_size)."""
-        return self._tip_motion(base, self._reaction(q, None))
+        return self._tip_motion(base, self._reaction(q, None, tip=True))
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Twist of the tip, G joint_rates (25) and what the conserved momentum adds. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
-        return self._tip_motion(base, self._reaction(q, rates, base))
+        return self._tip_motion(base, self._reaction(q, rates, base, tip=True))
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
@@ -232,7 +234,7 @@ class FreeFloating:
         tip = tip_frame(self.robot, frames).position
         tip_from_base: Expression = ca.mtimes(turn, tip)
         lever = motion_transform((ca.DM.eye(3), -tip_from_base))
-        joints = point_jacobian(self.robot, axes, str(self.robot.tip), tip)
+        joints = point_jacobian(self.robot, axes, self.robot.tip_link, tip)
         both = motion_transform((turn, ca.DM(3, 1)))
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
 
@@ -260,26 +262,28 @@ class FreeFloating:
         center = center_of_mass(self.robot, q, self.world_from_base(base))
         return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
-    def _reaction(self, q: Expression, joint_rates: Expression | None, base: Expression = None) -> _Reaction:
+    def _reaction(
+        self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
+    ) -> _Reaction:
         """Of the robot, with the conserved momentum in the base's axes where rates are given."""
         carried = None
         if joint_rates is not None and self._moves_by_itself:
             turn = self.world_from_base(base).rotation
             angular, linear = self._spatial_momentum()
             carried = ca.mtimes(turn.T, angular), ca.mtimes(turn.T, linear)
-        return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar")
+        return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar", tip=tip)
 
 
 class _Reaction(NamedTuple):
     """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each.
 
-    The latter with what the conserved momentum adds.
+    The latter with what the conserved momentum adds. That of the tip is None unless asked for.
     """
 
     base_angular: Expression
     base_linear: Expression
-    tip_angular: Expression
-    tip_linear: Expression
+    tip_angular: Expression = None
+    tip_linear: Expression = None
 
 
 def _reaction(
@@ -289,6 +293,7 @@ def _reaction(
     carried: tuple[Expression, Expression] | None = None,
     *,
     planar: bool = False,
+    tip: bool = True,
 ) -> _Reaction:
     """_Reaction of a base that floats to unit rate of each joint (n columns), or to given joint rates (one column).
 
@@ -299,17 +304,18 @@ def _reaction(
         carried: Momentum that the machine has, with given joint rates only: (angular about the centre of mass,
             linear), axes of the base. Shape (3, 1) each; none if None.
         planar: Whether the base moves in the plane z = constant only.
+        tip: Whether the motion of the tip is asked for.
+
+    Raises:
+        ModelError: The tip is asked for of a robot that has none; wrong sizes.
     """
     frames, axes = frames_and_axes(robot, q)
     moments = subtree_moments(robot, frames)
     total = moments[robot.root]
     center = total.first / total.mass
-    columns = [moments[joint.child].momentum(*axes[joint.name]) for joint in robot.moving_joints]
-    momentum: Expression = ca.horzcat(*(ca.vertcat(*column) for column in columns))
-    tip = tip_frame(robot, frames).position
-    joints = point_jacobian(robot, axes, str(robot.tip), tip)
+    momentum = joint_momenta(robot, axes, moments)
     if joint_rates is not None:
-        momentum, joints = ca.mtimes(momentum, joint_rates), ca.mtimes(joints, joint_rates)
+        momentum = ca.mtimes(momentum, joint_rates)
     if carried is not None:
         momentum = momentum - ca.vertcat(carried[0] + cross(center, carried[1]), carried[1])
 
@@ -322,14 +328,20 @@ def _reaction(
         turning = -solve_spd(inertia, about_center)
     # The centre of mass moves with the carried momentum alone, which fixes the velocity of the base's origin.
     linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
-    tip_linear = ca.mtimes(skew(center - tip), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
+    if not tip:
+        return _Reaction(turning, linear)
+    place = tip_frame(robot, frames).position
+    joints = point_jacobian(robot, axes, robot.tip_link, place)
+    if joint_rates is not None:
+        joints = ca.mtimes(joints, joint_rates)
+    tip_linear = ca.mtimes(skew(center - place), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
     return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
 
 
 def _require_planar(robot: Robot) -> None:
     """Raise ModelError for a joint that moves the robot out of the plane z = constant of its root link."""
     _, axes = frames_and_axes(robot, np.zeros(robot.dof))
-    for joint in robot.moving_joints:
+    for joint in (joint for joint in robot.joints if joint.moves):
         angular, linear = (np.array(part).ravel() for part in axes[joint.name])
         if joint.kind == "prismatic" and abs(linear[2]) > 1e-9:
             message = f"joint {joint.name!r} moves along {linear.tolist()} of the base link, out of the plane of "

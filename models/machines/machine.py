@@ -11,11 +11,10 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
+from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
 from models.robot.robot import Robot
-from models.spatial import Expression, Frame, determinant, expression, on_scalars
-
-TWIST_SIZE = 6
+from models.spatial import Expression, Frame, expression, on_scalars
 
 
 class Machine(Protocol):
@@ -68,43 +67,6 @@ class Machine(Protocol):
 
         Shape (1, 1).
         """
-
-
-@on_scalars
-def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985). Shape (1, 1).
-
-    Zero where the task is singular.
-
-    Args:
-        jacobian: Shape (6, n).
-        rows: Which rows of the twist the task fixes: angular 0..2, linear 3..5.
-
-    Raises:
-        ModelError: Rows out of range, repeated, or none.
-    """
-    task = ca.densify(expression(jacobian))[checked_rows(rows), :]
-    return ca.sqrt(ca.fmax(determinant(ca.mtimes(task, task.T)), 0))  # rounding can make a zero negative
-
-
-def checked_rows(rows: Sequence[int]) -> list[int]:
-    """`rows` as a list; ModelError unless they are different indices of a twist, 0..5, and at least one."""
-    try:
-        chosen = [int(row) for row in rows]
-        whole = all(row == given for row, given in zip(chosen, rows, strict=True))
-    except (TypeError, ValueError):
-        whole = False
-    if not whole:
-        message = f"rows must be a list of the twist rows 0..5, not {rows!r}"
-    elif not chosen:
-        message = "rows is empty; a task fixes at least one of the twist rows 0..5"
-    elif len(set(chosen)) < len(chosen):
-        message = f"rows {chosen} name a twist row more than once"
-    elif not all(0 <= row < TWIST_SIZE for row in chosen):
-        message = f"rows {chosen} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)"
-    else:
-        return chosen
-    raise ModelError(message, name="rows", value=rows, limit=(0, TWIST_SIZE - 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,15 +82,14 @@ class Scara:
     @cached_property
     def robot(self) -> Robot:
         """The arm as a kinematic tree, massless, for whatever takes a robot."""
-        limits = [{"lower": float(a), "upper": float(b)} for a, b in zip(self.lower, self.upper, strict=True)]
         links = tuple(Link(name) for name in ("base", "upper arm", "forearm", "quill", "tool"))
         places = (tuple(self.mount), (self.upper_arm, 0.0, 0.0), (self.forearm, 0.0, 0.0), (0.0, 0.0, 0.0))
         kinds: tuple[Any, ...] = ("revolute", "revolute", "prismatic", "revolute")
-        joints = tuple(
-            Joint(name, kind, links[i].name, links[i + 1].name, places[i], axis=(0.0, 0.0, 1.0), **limits[i])
-            for i, (name, kind) in enumerate(zip(self.names, kinds, strict=True))
-        )
-        return Robot(links, joints)
+        joints = []
+        for i, (name, kind) in enumerate(zip(self.names, kinds, strict=True)):
+            ends = links[i].name, links[i + 1].name
+            joints.append(Joint(name, kind, *ends, places[i], lower=self.lower[i], upper=self.upper[i]))
+        return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
         """Frame of the tool in world. `joints` of shape (4,), casadi or numbers."""

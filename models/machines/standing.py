@@ -212,7 +212,7 @@ class Standing(FixedBase):
 
     def tip_wrench(self, force: Expression, moment: Expression = (0.0, 0.0, 0.0)) -> Wrench:
         """A force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""
-        return Wrench(str(self.robot.tip), force, moment, self.robot.tip_translation)
+        return Wrench(self.robot.tip_link, force, moment, self.robot.tip_translation)
 
 
 def center_of_pressure(reaction: Expression) -> Expression:

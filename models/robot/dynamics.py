@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from models.errors import ModelError
-from models.robot.kinematics import Placement, checked_vector, frames_and_axes
+from models.robot.kinematics import Placement, by_joint_vector, checked_vector, frames_and_axes, subtree_moments
 from models.robot.motion import LinkMotion, momentum_rates, motions_of
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars
@@ -68,16 +68,16 @@ def inverse_dynamics(
 ) -> Expression:
     """Torques (forces of prismatic joints) that the joints must give. Shape (dof, 1), N m or N.
 
+    A joint with followers gives what moves them too: its own torque and multiplier times those of each of them.
+
     The base may move: `base_twist` and `base_acceleration` are (angular velocity, velocity of the origin of the root
     link's frame) and their time derivatives, world axes, shape (6, 1).
 
     Raises:
         ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
-    stacked = stacked_wrenches(robot, wrenches)
-    links = tuple(w.link for w in wrenches)
-    moving = (base_twist, base_acceleration)
-    return _inverse_dynamics(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *moving)
+    stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
+    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[0]
 
 
 def base_reaction(
@@ -100,10 +100,30 @@ def base_reaction(
     Raises:
         ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
-    stacked = stacked_wrenches(robot, wrenches)
-    links = tuple(w.link for w in wrenches)
-    moving = (base_twist, base_acceleration)
-    return _base_reaction(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *moving)
+    stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
+    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[1]
+
+
+@on_scalars
+def mass_matrix(robot: Robot, q: Expression) -> Expression:
+    """Joint-space inertia M of T = q'^T M q' / 2, the base standing still. Shape (dof, dof), kg m^2, kg m or kg.
+
+    Composite rigid bodies (Featherstone 2008, 6.2): the momentum of all that joint j carries, per rate of j, along the
+    axis of each joint i that carries j.
+    """
+    frames, axes = frames_and_axes(robot, q)
+    moments = subtree_moments(robot, frames)
+    below: dict[tuple[str, str], Expression] = {}
+    for joint in robot.joints:
+        if joint.moves:
+            momentum = ca.vertcat(*moments[joint.child].momentum(*axes[joint.name]))
+            for carrier in robot.path_to(joint.child):
+                if carrier.moves:
+                    entry = ca.dot(ca.vertcat(*axes[carrier.name]), momentum)
+                    below[carrier.name, joint.name] = below[joint.name, carrier.name] = entry
+    rows = {one: {other: below.get((one, other), ca.DM(1, 1)) for other in axes} for one in axes}
+    columns = {one: ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, row)) for one, row in rows.items()}
+    return ca.densify(ca.horzcat(ca.DM(robot.dof, 0), *by_joint_vector(robot, columns)))
 
 
 def external_wrench(
@@ -141,7 +161,7 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 @on_scalars
-def _inverse_dynamics(
+def _efforts(
     robot: Robot,
     q: Expression,
     qd: Expression,
@@ -152,36 +172,20 @@ def _inverse_dynamics(
     world_from_base: Placement | None,
     base_twist: Expression | None,
     base_acceleration: Expression | None,
-) -> Expression:
+) -> tuple[Expression, Expression]:
+    """Torques of the joints and reaction of the base."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = motions_of(robot, frames, axes, qd, qdd, base_twist, base_acceleration)
     needed = _needed_wrenches(robot, frames, motions, gravity)
-    for link, wrench in _given_wrenches(frames, stacked, links):
+    given = _given_wrenches(frames, stacked, links)
+    total: Expression = sum(needed.values(), start=ca.DM(6, 1))
+    reaction = total - sum((wrench for _, wrench in given), start=ca.DM(6, 1))
+    for link, wrench in given:
         needed[link] = needed[link] - wrench
     for joint in reversed(robot.joints):
         needed[joint.parent] = needed[joint.parent] + needed[joint.child]
-    torques = [ca.dot(ca.vertcat(*axes[joint.name]), needed[joint.child]) for joint in robot.moving_joints]
-    return ca.densify(ca.vertcat(ca.DM(0, 1), *torques))
-
-
-@on_scalars
-def _base_reaction(
-    robot: Robot,
-    q: Expression,
-    qd: Expression,
-    qdd: Expression,
-    stacked: Expression,
-    links: tuple[str, ...],
-    gravity: Expression,
-    world_from_base: Placement | None,
-    base_twist: Expression | None,
-    base_acceleration: Expression | None,
-) -> Expression:
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = motions_of(robot, frames, axes, qd, qdd, base_twist, base_acceleration)
-    needed = _needed_wrenches(robot, frames, motions, gravity)
-    total: Expression = sum(needed.values(), start=ca.DM(6, 1))
-    return total - sum((wrench for _, wrench in _given_wrenches(frames, stacked, links)), start=ca.DM(6, 1))
+    torques = {j.name: ca.dot(ca.vertcat(*axes[j.name]), needed[j.child]) for j in robot.joints if j.moves}
+    return ca.densify(ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, torques))), reaction
 
 
 def _needed_wrenches(

@@ -1,13 +1,14 @@
 """Where the links of a robot are and how they move: frames, Jacobians, centre of mass, momentum.
 
-Every function takes the joint positions q, shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM
-or numbers, and the placement of the root link in the world, `world_from_base` = (rotation, position), the
-world's own frame if None. Velocities and momenta are those of the joints alone: the base stands still unless
-said otherwise.
+Every function takes the joint positions q, shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
+numbers, with which joints that follow others move too, and the placement of the root link in the world,
+`world_from_base` = (rotation, position), the world's own frame if None. Velocities and momenta are those of the
+joints alone: the base stands still unless said otherwise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import casadi as ca
@@ -74,6 +75,27 @@ def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Exp
     return value
 
 
+def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
+    """Rates or accelerations of all joints that move, followers included, by name, from those of the joint vector; of
+    its positions, followers' lack their offsets. ModelError as of joint_vector.
+    """
+    vector, drives = joint_vector(robot, vector, what), robot.drives.items()
+    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in drives}
+
+
+def by_joint_vector(robot: Robot, given: Mapping[str, Expression]) -> list[Expression]:
+    """What belongs to each entry of the joint vector, given what belongs to each joint that moves, by name.
+
+    Columns of a Jacobian or forces: that of the joint, and multiplier times those of its followers.
+    """
+    found = [given[name] for name in robot.joint_names]
+    for joint in robot.joints:
+        if joint.mimic is not None:
+            column, multiplier, _ = robot.drives[joint.name]
+            found[column] = found[column] + multiplier * given[joint.name]
+    return found
+
+
 def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
     """Frames of all links in the world, by link name, root first."""
     return frames_and_axes(robot, q, world_from_base)[0]
@@ -86,7 +108,7 @@ def tip_pose(robot: Robot, q: Expression, world_from_base: Placement | None = No
 
 def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
     """Frame of the tip in the world, given the frames of the links."""
-    link = frames[str(robot.tip)]
+    link = frames[robot.tip_link]
     return Frame(ca.mtimes(link.rotation, _constant(robot.tip_rotation)), link.point(robot.tip_translation))
 
 
@@ -146,7 +168,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 
     Shape (6, dof).
     """
-    return frame_jacobian(robot, q, str(robot.tip), robot.tip_translation, world_from_base)
+    return frame_jacobian(robot, q, robot.tip_link, robot.tip_translation, world_from_base)
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
@@ -163,8 +185,7 @@ def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | No
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     moments = subtree_moments(robot, frames)
-    columns = [ca.vertcat(*moments[joint.child].momentum(*axes[joint.name])) for joint in robot.moving_joints]
-    return ca.densify(ca.horzcat(ca.DM(6, 0), *columns))
+    return ca.densify(joint_momenta(robot, axes, moments))
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
@@ -188,30 +209,41 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
     return moments
 
 
+def joint_momenta(
+    robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
+) -> Expression:
+    """As momentum_matrix, from the axes of frames_and_axes and the moments of subtree_moments."""
+    children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
+    momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
+    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
+
+
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
     """As frame_jacobian, from the axes of frames_and_axes and a point in the world. Shape (6, dof)."""
     carriers = {joint.name for joint in robot.path_to(link)}
-    columns = [
-        ca.vertcat(axes[name][0], axes[name][1] + cross(axes[name][0], point)) if name in carriers else ca.DM(6, 1)
-        for name in robot.joint_names
-    ]
-    return ca.horzcat(ca.DM(6, 0), *columns)
+    columns = {
+        name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
+        for name, (angular, linear) in axes.items()
+    }
+    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, columns))
 
 
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Frames of the links, and motion vectors of the moving joints, both by name.
+    """Frames of the links, and motion vectors of all joints that move, followers included, both by name.
 
-    A motion vector is (angular velocity, velocity at the world's origin) per unit rate, world axes.
+    A motion vector is (angular velocity, velocity at the world's origin) per unit rate of that joint, world axes.
     """
-    q = joint_vector(robot, q)
+    positions = each_joint(robot, q)
+    for name, drive in robot.drives.items():
+        if drive.offset:
+            positions[name] = positions[name] + drive.offset
     base = Frame(ca.DM.eye(3), ca.DM(3, 1)) if world_from_base is None else Frame(*map(expression, world_from_base))
     frames: dict[str, Frame] = {robot.root: base}
     axes: dict[str, tuple[Expression, Expression]] = {}
-    column = 0
     turns: dict[str, _Turn] = {}
     for joint in robot.joints:
         parent, turn = frames[joint.parent], turns.get(joint.parent)
@@ -221,18 +253,17 @@ def frames_and_axes(
         if joint.kind == "prismatic":
             axis = ca.mtimes(frame.rotation, _constant(joint.axis))
             axes[joint.name] = (ca.DM(3, 1), axis)
-            frame = Frame(frame.rotation, frame.position + q[column] * axis)
+            frame = Frame(frame.rotation, frame.position + positions[joint.name] * axis)
         elif joint.moves:
             # Parallel axes in a row: the angles add up, which is cheaper than a product of rotations.
             if turn is not None and np.array_equal(turn.axis, joint.axis):
-                turn = turn._replace(angle=turn.angle + q[column])
+                turn = turn._replace(angle=turn.angle + positions[joint.name])
             else:
-                turn = _Turn(frame.rotation, joint.axis, q[column])
+                turn = _Turn(frame.rotation, joint.axis, positions[joint.name])
             axis = ca.mtimes(turn.before, _constant(joint.axis))
             axes[joint.name] = (axis, cross(frame.position, axis))
             turned = ca.mtimes(turn.before, rotation(_constant(joint.axis), turn.angle))
             frame = Frame(turned, frame.position)
-        column += joint.moves
         frames[joint.child] = frame
         if turn is not None:
             turns[joint.child] = turn

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from models.robot.kinematics import Placement, checked_vector, frames_and_axes, joint_vector
+from models.robot.kinematics import Placement, checked_vector, each_joint, frames_and_axes
 from models.robot.parts import Link, massless
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars
@@ -128,7 +128,7 @@ def motions_of(
 
     The root link's frame may move: (angular, of its origin) velocity and acceleration, shape (6, 1), world axes.
     """
-    qd, qdd = joint_vector(robot, qd, "qd"), joint_vector(robot, qdd, "qdd")
+    rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     meaning = "angular, then of the origin of the root link's frame"
     twist, push = (
         ca.DM(6, 1) if given is None else checked_vector(given, 6, what, meaning)
@@ -138,7 +138,6 @@ def motions_of(
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {
         robot.root: (twist[3:6], push[3:6], twist[0:3], push[0:3])
     }
-    column = 0
     for joint in robot.joints:
         velocity, acceleration, spin, turning = origin[joint.parent]
         arm = frames[joint.child].position - frames[joint.parent].position
@@ -146,8 +145,7 @@ def motions_of(
         velocity, acceleration = velocity + swing, acceleration + cross(turning, arm) + cross(spin, swing)
         if joint.moves:
             angular, linear = axes[joint.name]
-            rate, push = qd[column], qdd[column]
-            column += 1
+            rate, push = rates[joint.name], accelerations[joint.name]
             if joint.kind == "prismatic":
                 velocity = velocity + linear * rate
                 acceleration = acceleration + linear * push + 2 * cross(spin, linear * rate)

@@ -1,11 +1,11 @@
-"""Links and joints, the parts of a robot, checked when they are made.
+"""Links, their shapes, and joints: the parts of a robot, checked when they are made.
 
 Attributes that are arrays are given as anything numpy reads and stored as read-only float arrays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import casadi as ca
@@ -16,10 +16,54 @@ from models.errors import ModelError
 from models.spatial import rotation
 
 Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
+ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 KINDS = ("fixed", "revolute", "continuous", "prismatic")
+SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
+"""Kinds of collision shapes, and how many numbers their size is."""
 INERTIA_TOLERANCE = 1e-6
 """Relative slack of the inertia checks: inertias printed to six digits still pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionShape:
+    """A shape that stands for a link, or for a part of one, where it may touch something.
+
+    Attributes:
+        kind: "box", "sphere", "cylinder", "capsule" or "mesh". Those with a length lie along z of the shape's frame.
+        size: Edges along x, y, z of a box; (radius,) of a sphere; (radius, length) of a cylinder, or of a capsule
+            without its caps; scale along x, y, z of a mesh, negative where it is mirrored. m, but for the scale.
+        file: Of a mesh, as it was given: nothing looks for it here.
+        translation: Origin of the shape's frame, the middle of all but a mesh, in the link frame. Shape (3,), m.
+        rotation: Axes of the shape's frame, as columns, in the link frame. Shape (3, 3).
+
+    Raises:
+        ModelError: Unknown kind, wrong sizes, a size that is not positive, a mesh without a file or scaled to nothing.
+    """
+
+    kind: ShapeKind
+    size: ArrayInput
+    file: str = ""
+    translation: ArrayInput = (0.0, 0.0, 0.0)
+    rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        owner = "collision shape"
+        if self.kind not in SHAPES:
+            raise ModelError(f"{owner}: unknown kind {self.kind!r}; use one of {', '.join(SHAPES)}")
+        size = checked_array(self.size, (SHAPES[self.kind],), owner, f"size of the {self.kind}")
+        if self.kind == "mesh" and not self.file:
+            raise ModelError(f"{owner}: a mesh needs the name of its file")
+        if not (size.all() if self.kind == "mesh" else (size > 0).all()):
+            raise ModelError(f"{owner}: size {size.tolist()} of the {self.kind} is not positive")
+        object.__setattr__(self, "size", size)
+        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
+        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+
+    def placed(self, rotation: Array, translation: Array) -> CollisionShape:
+        """The same shape in a frame in which its link stands so. Shape (3, 3) and (3,)."""
+        shift = translation + rotation @ self.translation
+        return replace(self, translation=shift, rotation=rotation @ self.rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +76,7 @@ class Link:
         center_of_mass: In the link frame. Shape (3,), m.
         inertia: About the centre of mass, in link axes. Shape (3, 3), kg m^2.
         any_inertia: Take an inertia that no body has, as some robot descriptions give. It must still be symmetric.
+        collisions: Shapes that stand for the body where it may touch something.
 
     Raises:
         ModelError: Negative or non-finite mass, wrong sizes, an inertia that no mass distribution has (not
@@ -43,6 +88,7 @@ class Link:
     center_of_mass: ArrayInput = (0.0, 0.0, 0.0)
     inertia: ArrayInput = field(default_factory=lambda: np.zeros((3, 3)))
     any_inertia: bool = False
+    collisions: tuple[CollisionShape, ...] = ()
 
     def __post_init__(self) -> None:
         owner = f"link {self.name!r}"
@@ -54,6 +100,30 @@ class Link:
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
         object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
+        object.__setattr__(self, "collisions", tuple(self.collisions))
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """What ties a joint to another one that it follows: its position is multiplier times that one's, plus offset.
+
+    Attributes:
+        joint: Name of the joint that is followed, which may itself follow another.
+        multiplier: rad or m per rad or m of the joint that is followed.
+        offset: rad or m.
+
+    Raises:
+        ModelError: A number that is not finite.
+    """
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what in ("multiplier", "offset"):
+            number = checked_array(getattr(self, what), (), f"mimic of joint {self.joint!r}", what).item()
+            object.__setattr__(self, what, number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +145,11 @@ class Joint:
         upper: Greatest position, rad or m.
         velocity: Greatest speed, rad/s or m/s.
         effort: Greatest torque or force, N m or N.
+        mimic: Which joint it follows, and how; None for a joint of its own.
 
     Raises:
         ModelError: Unknown kind, wrong sizes, zero axis, a rotation that is none, lower > upper, a negative
-            limit, position limits of a continuous joint.
+            limit, position limits of a continuous joint, a fixed joint that follows another.
     """
 
     name: str
@@ -92,6 +163,7 @@ class Joint:
     upper: float = np.inf
     velocity: float = np.inf
     effort: float = np.inf
+    mimic: Mimic | None = None
 
     def __post_init__(self) -> None:
         owner = f"joint {self.name!r}"
@@ -120,9 +192,12 @@ class Joint:
                 "given; make it revolute or leave them out"
             )
 
+        if self.mimic is not None and not self.moves:
+            raise ModelError(f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}")
+
     @property
     def moves(self) -> bool:
-        """Whether the joint has a degree of freedom."""
+        """Whether the joint is not fixed; one that follows another moves with it."""
         return self.kind != "fixed"
 
     def placed(self, position: float) -> tuple[Array, Array]:

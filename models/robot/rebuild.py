@@ -14,13 +14,14 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
 from models.errors import ModelError
+from models.robot.mimicry import cut, held
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
 from models.robot.tree import reroot
 
 
 def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
-    """The robot with some joints held fixed.
+    """The robot with some joints held fixed, and with each the joints that follow it, where that puts them.
 
     Args:
         robot: The robot.
@@ -29,8 +30,7 @@ def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
     Raises:
         ModelError: A joint that is fixed already; a position that is not finite.
     """
-    held = {name: robot.joint(name).locked(position) for name, position in positions.items()}
-    return replace(robot, joints=tuple(held.get(joint.name, joint) for joint in robot.joints))
+    return replace(robot, joints=held(robot.joints, {robot.joint(name).name: at for name, at in positions.items()}))
 
 
 def retipped(
@@ -92,7 +92,7 @@ def attached(
     shift = checked_array(translation, (3,), "attached tool", "translation")
     turn = checked_rotation(_turn(rotation), "attached tool", "rotation")
     if link is None:
-        link = str(robot.tip)
+        link = robot.tip_link
         shift, turn = robot.tip_translation + robot.tip_rotation @ shift, robot.tip_rotation @ turn
     mount = Joint(f"{added.root}_mount", "fixed", robot.link(link).name, added.root, shift, turn)
     owner = robot if keep_tip else added
@@ -144,11 +144,13 @@ def renamed(robot: Robot, prefix: str) -> Robot:
     if not prefix:
         return robot
     links = tuple(replace(link, name=prefix + link.name) for link in robot.links)
-    joints = tuple(
-        replace(joint, name=prefix + joint.name, parent=prefix + joint.parent, child=prefix + joint.child)
-        for joint in robot.joints
-    )
-    return replace(robot, links=links, joints=joints, tip=f"{prefix}{robot.tip}", name=prefix + robot.name)
+    joints = []
+    for joint in robot.joints:
+        tie = joint.mimic and replace(joint.mimic, joint=prefix + joint.mimic.joint)
+        name, parent, child = (prefix + each for each in (joint.name, joint.parent, joint.child))
+        joints.append(replace(joint, name=name, parent=parent, child=child, mimic=tie))
+    tip = robot.tip and prefix + robot.tip
+    return replace(robot, links=links, joints=tuple(joints), tip=tip, name=prefix + robot.name)
 
 
 def rerooted(robot: Robot, root: str) -> Robot:
@@ -161,34 +163,37 @@ def rerooted(robot: Robot, root: str) -> Robot:
 
 
 def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
-    """A link with all that it carries, as a robot of its own.
+    """A link with all that it carries, as a robot of its own; `pruned` says what becomes of joints that follow others.
 
     Args:
         robot: The robot.
         root: Name of the link.
-        tip: Link whose frame is the tip. If None the robot's tip where it is among them, else the only leaf.
+        tip: Link whose frame is the tip. If None the robot's tip where it is among them, else the only leaf if any.
     """
     kept = {robot.link(root).name}
-    joints = []
     for joint in robot.joints:
         if joint.parent in kept:
             kept.add(joint.child)
-            joints.append(joint)
-    links = tuple(link for link in robot.links if link.name in kept)
+    links, joints = tuple(link for link in robot.links if link.name in kept), cut(robot.joints, kept - {root})
     if tip is None and robot.tip in kept:
-        return replace(robot, links=links, joints=tuple(joints))
-    return Robot(links, tuple(joints), tip, name=robot.name)
+        return replace(robot, links=links, joints=joints)
+    return Robot(links, joints, tip, name=robot.name)
 
 
 def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     """The links on the way from the root to the tip, and to the links of `keep`; other branches, mass and all, go.
 
-    To keep what the other branches weigh, lock their joints instead, and simplify.
+    To keep what the other branches weigh, lock their joints instead, and simplify. Joints that follow one that goes
+    are tied to each other as they were by it: see `models.robot.mimicry.cut`.
+
+    Raises:
+        ModelError: No tip and nothing to keep.
     """
-    ways = [robot.path_to(name) for name in (str(robot.tip), *_names(keep))]
-    stay = {robot.root, *(joint.child for way in ways for joint in way)}
+    named = _names(keep)
+    ends = [*named] if robot.tip is None and named else [robot.tip_link, *named]
+    stay = {robot.root, *(joint.child for name in ends for joint in robot.path_to(name))}
     links = tuple(link for link in robot.links if link.name in stay)
-    return replace(robot, links=links, joints=tuple(joint for joint in robot.joints if joint.child in stay))
+    return replace(robot, links=links, joints=cut(robot.joints, stay))
 
 
 def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
@@ -223,19 +228,17 @@ def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
             links.append(_welded(link, [part for part in parts[link.name] if part[0] is not link]))
         elif carrier[link.name][0] == link.name:
             links.append(Link(link.name))
-    tip, turn, shift = carrier[str(robot.tip)]
-    return replace(
-        robot,
-        links=tuple(links),
-        joints=tuple(joints),
-        tip=tip,
-        tip_translation=shift + turn @ robot.tip_translation,
-        tip_rotation=turn @ robot.tip_rotation,
-    )
+    if robot.tip is None:
+        return replace(robot, links=tuple(links), joints=tuple(joints))
+    tip, turn, shift = carrier[robot.tip]
+    shift, turn = shift + turn @ robot.tip_translation, turn @ robot.tip_rotation
+    return replace(robot, links=tuple(links), joints=tuple(joints), tip=tip, tip_translation=shift, tip_rotation=turn)
 
 
 def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """One link of several, the others placed in its frame by (rotation, translation); parallel axes theorem."""
+    """One link of several, shapes and all, the others placed in its frame by (rotation, translation); parallel axes."""
+    shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
+    link = replace(link, collisions=(*link.collisions, *shapes))
     others = [part for part in others if part[0].mass or part[0].inertia.any()]
     if not others:
         return link
@@ -249,7 +252,7 @@ def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
         arm = place - center
         inertia += turn @ part.inertia @ turn.T + own * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     doubtful = any(part.any_inertia for part, _, _ in parts)
-    return Link(link.name, mass, center, inertia, any_inertia=doubtful)
+    return replace(link, mass=mass, center_of_mass=center, inertia=inertia, any_inertia=doubtful)
 
 
 def _turn(rotation: ArrayInput | None) -> ArrayInput:

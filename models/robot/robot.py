@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeAlias
+from warnings import warn
 
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_rotation
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
+from models.robot.mimicry import Drive, drives, held, joint_limits, ties_to_leaders
 from models.robot.parts import Joint, Link
 from models.robot.tree import absent, find_root, require_unique, reroot, tree_order
-from models.robot.urdf import InertiaRule, MimicRule, Source, held_by_mimicry, read_urdf
+from models.robot.urdf import InertiaRule, Source, read_urdf, written_urdf
+
+MimicRule: TypeAlias = Literal["couple", "lock", "free"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,15 +29,17 @@ class Robot:
 
     Attributes:
         links: Every link, in the order given.
-        joints: Every joint, parents first; the order given is kept wherever it already is such an order.
-        tip: Name of the link that carries the tip; the only leaf when not given.
+        joints: Every joint, parents first; the order given is kept wherever it already is such an order. Joints that
+            follow one that does not move are fixed.
+        tip: Name of the link that carries the tip; when not given the only leaf, None where there are several.
         tip_translation: Tip frame's origin in the tip link's frame. Shape (3,), m.
         tip_rotation: Tip frame's axes, as columns, in the tip link's frame. Shape (3, 3).
         name: What the robot is called in texts.
         root: Name of the link without a parent, the base.
 
     Raises:
-        ModelError: Duplicate or unknown names, a loop, several roots, several leaves and no tip, wrong sizes.
+        ModelError: Duplicate or unknown names, a loop, several roots, wrong sizes; joints that follow none that exists
+            or each other in a ring, or whose limits leave the joint that they follow no position.
     """
 
     links: tuple[Link, ...]
@@ -45,6 +54,7 @@ class Robot:
         links, joints = tuple(self.links), tuple(self.joints)
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
+        joints = held(joints, {})
         edges = [(joint.name, joint.parent, joint.child) for joint in joints]
         root = find_root([link.name for link in links], edges)
         object.__setattr__(self, "root", root)
@@ -54,18 +64,29 @@ class Robot:
         owner = "robot"
         object.__setattr__(self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation"))
         object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
+        _ = self._limits  # raises where followers leave a joint no position
 
-    def _find_tip(self) -> str:
+    def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
-        if self.tip is not None:
-            if self.tip not in names:
-                raise absent("tip link", self.tip, names)
-            return self.tip
+        if self.tip is not None and self.tip not in names:
+            raise absent("tip link", self.tip, names)
+        leaves = self._leaves
+        return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
+
+    @property
+    def _leaves(self) -> list[str]:
         parents = {joint.parent for joint in self.joints}
-        leaves = [name for name in names if name not in parents]
-        if len(leaves) > 1:
-            raise ModelError(f"the tree has the leaves {leaves}; say which carries the tip: tip=name")
-        return leaves[0]
+        return [link.name for link in self.links if link.name not in parents]
+
+    @property
+    def tip_link(self) -> str:
+        """Name of the link that carries the tip; ModelError, which says how to give it, where there is none."""
+        if self.tip is None:
+            raise ModelError(
+                f"{self.name!r} has no tip, which is needed here: its tree has the leaves {self._leaves}; say which "
+                "link carries it, tip=NAME where the robot is made or retipped(robot, NAME), or let tasks name links"
+            )
+        return self.tip
 
     @classmethod
     def from_urdf(
@@ -77,55 +98,84 @@ class Robot:
         tip_translation: ArrayInput = (0.0, 0.0, 0.0),
         tip_rotation: ArrayInput = None,
         lock: Mapping[str, float] | None = None,
-        mimic: MimicRule = "error",
-        inertia: InertiaRule = "error",
+        mimic: MimicRule = "couple",
+        inertia: InertiaRule = "warn",
     ) -> Robot:
         """The robot of a URDF description; `models.robot.urdf.read_urdf` says what is read, with which defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
-            tip: Link that carries the tip; needed where the tree has several leaves.
+            tip: Link that carries the tip; if None the one that the file names as to_urdf does, else the only leaf.
             root: Link to hang the tree up at, the base of the robot; the root of the file if None. Links keep their
                 frames, joints their names, limits and signs, see `models.robot.tree.reroot`.
             tip_translation: As of Robot.
             tip_rotation: As of Robot; no turn if None.
-            lock: Joints to hold fixed at given positions (rad or m), by name.
-            mimic: Joints that follow one that is locked or fixed are held with it. The other followers: refuse them
-                ("error"), hold each where it is when the joint that it follows is at 0 ("lock"), or take them as
-                independent ("free").
-            inertia: What to do about an inertia that no body can have: refuse it ("error") or take it "as_given".
+            lock: Joints to hold fixed at given positions (rad or m), by name, and with them the joints that follow.
+            mimic: Joints that follow another one: move with it ("couple"), hold each where it is when the joint that
+                it follows is at 0 ("lock"), or take all, also those of locked joints, as independent ("free").
+            inertia: What to do about inertias that no body can have: "warn" that they are taken, or take them
+                "as_given" without a word.
 
         Raises:
             ModelError: What read_urdf, Robot and `models.robot.rebuild.locked` refuse.
+
+        Warns:
+            ModelWarning: Inertias that no body can have, attributes that mean nothing in URDF, joints whose followers'
+                limits leave them one position.
         """
+        if mimic not in ("couple", "lock", "free"):
+            raise ModelError(f"unknown mimic rule {mimic!r}; use 'couple', 'lock' or 'free'")
         found = read_urdf(source, inertia=inertia)
-        held = dict(lock or {})
-        moving = {joint.name: joint for joint in found.joints}
-        for name in held:
-            if name not in moving:
-                raise absent("joint", name, moving)
-        held |= held_by_mimicry(found.joints, found.mimics, held, mimic)
-        joints = tuple(joint.locked(held[joint.name]) if joint.name in held else joint for joint in found.joints)
+        joints = found.joints if mimic != "free" else tuple(replace(joint, mimic=None) for joint in found.joints)
+        known = {joint.name: None for joint in joints}
+        for name in lock or {}:
+            if name not in known:
+                raise absent("joint", name, known)
+        joints = held(joints, lock or {})
+        if mimic == "lock":
+            joints = held(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
         links = found.links
         if root is not None:
             whole = cls(links, joints, tip=links[0].name)  # says what is wrong with the tree before it is turned round
             links, joints = reroot(links, joints, whole.root, root)
         turn = np.eye(3) if tip_rotation is None else tip_rotation
-        return cls(links, joints, tip, tip_translation, turn, found.name)
+        robot = cls(links, joints, found.tip if tip is None else tip, tip_translation, turn, found.name)
+        room = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
+        if names := [joint.name for joint, lower, upper in room if lower == upper and joint.lower < joint.upper]:
+            warn(f"joints {names} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)
+        return robot
+
+    def to_urdf(self, file: str | os.PathLike[str] | None = None) -> str:
+        """The robot as URDF text, of which from_urdf makes the same robot; written to a file too where one is given.
+
+        See `models.robot.urdf.written_urdf` for what other readers make of it. The file is replaced as a whole.
+        """
+        place = np.asarray(self.tip_translation), np.asarray(self.tip_rotation)
+        text = written_urdf(self.name, self.links, self.joints, self.tip, *place)
+        if file is not None:
+            part = Path(file).with_name(Path(file).name + ".part")
+            part.write_text(text, encoding="utf-8")
+            part.replace(file)
+        return text
 
     @cached_property
     def moving_joints(self) -> tuple[Joint, ...]:
-        """Joints with a degree of freedom, in tree order: the order of every joint vector."""
-        return tuple(joint for joint in self.joints if joint.moves)
+        """Joints that move and follow no other, in tree order: the order of every joint vector."""
+        return tuple(joint for joint in self.joints if joint.moves and joint.mimic is None)
+
+    @cached_property
+    def drives(self) -> dict[str, Drive]:
+        """What moves each joint that moves, followers included, by name."""
+        return drives(self.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the moving joints, in tree order."""
+        """Names of the entries of the joint vector."""
         return tuple(joint.name for joint in self.moving_joints)
 
     @property
     def dof(self) -> int:
-        """Number of moving joints."""
+        """Length of the joint vector."""
         return len(self.moving_joints)
 
     @property
@@ -133,25 +183,29 @@ class Robot:
         """kg."""
         return float(sum(link.mass for link in self.links))
 
+    @cached_property
+    def _limits(self) -> dict[str, Array]:
+        return joint_limits(self.joints, self.drives)
+
     @property
     def lower(self) -> Array:
-        """Least positions of the moving joints. Shape (dof,), rad or m."""
-        return np.array([joint.lower for joint in self.moving_joints], dtype=float)
+        """Least positions of the joint vector, at which no follower passes its limits. Shape (dof,), rad or m."""
+        return self._limits["lower"].copy()
 
     @property
     def upper(self) -> Array:
-        """Greatest positions of the moving joints. Shape (dof,), rad or m."""
-        return np.array([joint.upper for joint in self.moving_joints], dtype=float)
+        """Greatest positions, likewise. Shape (dof,), rad or m."""
+        return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Greatest speeds of the moving joints. Shape (dof,), rad/s or m/s."""
-        return np.array([joint.velocity for joint in self.moving_joints], dtype=float)
+        """Greatest speeds, likewise. Shape (dof,), rad/s or m/s."""
+        return self._limits["velocity"].copy()
 
     @property
     def effort(self) -> Array:
-        """Greatest torques or forces of the moving joints. Shape (dof,), N m or N."""
-        return np.array([joint.effort for joint in self.moving_joints], dtype=float)
+        """Greatest torques or forces of the joints' own drives. Shape (dof,), N m or N."""
+        return self._limits["effort"].copy()
 
     @cached_property
     def _links_by_name(self) -> dict[str, Link]:
@@ -193,7 +247,7 @@ class Robot:
     def __str__(self) -> str:
         lines = [
             f"{self.name} of {len(self.links)} links, {self.dof} degrees of freedom, "
-            f"{self.total_mass:g} kg, tip on {self.tip}",
+            f"{self.total_mass:g} kg, {'no tip' if self.tip is None else f'tip on {self.tip}'}",
             f"{self.root}  {self.link(self.root).mass:g} kg",
         ]
         below = defaultdict(list)
@@ -215,6 +269,8 @@ class Robot:
 def _limits(joint: Joint) -> str:
     unit, push = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
     parts: list[str] = [joint.kind]
+    if (tie := joint.mimic) is not None:
+        parts.append(f"{tie.multiplier:g} x {tie.joint}" + (f" {tie.offset:+g} {unit}" if tie.offset else ""))
     if np.isfinite([joint.lower, joint.upper]).any() and joint.moves:
         parts.append(f"{joint.lower:g} .. {joint.upper:g} {unit}")
     if np.isfinite(joint.velocity) and joint.moves:

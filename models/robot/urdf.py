@@ -1,42 +1,44 @@
-"""Robot descriptions in URDF, the XML format of ROS, read into links and joints.
+"""Robot descriptions in URDF, the XML format of ROS, read into links and joints, and written.
 
-Only kinematics, inertias and limits are read; <visual>, <collision>, <transmission>, <gazebo>, <safety_controller>,
-<dynamics> and unknown elements are passed over, so that no mesh file is ever looked for. The standard library's
-parser is enough: the libraries that read URDF bring mesh and XML packages along, which a core without meshes spares.
+Kinematics, inertias, limits, mimicry and collision shapes are read; <visual>, <transmission>, <gazebo>,
+<safety_controller>, <dynamics> and unknown elements are passed over. Meshes are named, and no file of theirs is ever
+looked for. The standard library's parser is enough: the libraries that read URDF bring mesh and XML packages along,
+which a core without meshes spares.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
+from warnings import warn
 from xml.etree import ElementTree
 
 import numpy as np
 
 from models.arrays import Array
-from models.errors import ModelError
-from models.robot.parts import Joint, Kind, Link
-from models.robot.tree import absent
+from models.errors import ModelError, ModelWarning
+from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic
 from models.spatial import rotation_from_rpy
 
 Source: TypeAlias = str | os.PathLike[str]
-InertiaRule: TypeAlias = Literal["error", "as_given"]
-MimicRule: TypeAlias = Literal["error", "lock", "free"]
+InertiaRule: TypeAlias = Literal["warn", "as_given"]
 
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """The position of a joint as URDF ties it to another's: multiplier times that plus offset (rad or m)."""
-
-    joint: str
-    multiplier: float = 1.0
-    offset: float = 0.0
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    "limit": ("lower", "upper", "velocity", "effort"),
+    "mimic": ("joint", "multiplier", "offset"),
+    "origin": ("xyz", "rpy"),
+    "axis": ("xyz",),
+    "mass": ("value",),
+    "inertia": MOMENTS,
+}
+"""Elements in which a misspelt attribute would go unseen, and the attributes that they have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,34 +48,39 @@ class Description:
     Attributes:
         name: Of the robot; "robot" where the file gives none.
         links, joints: In the order of the file.
-        mimics: Of the joints that follow another one, by name.
+        tip: Link that carries the tip, where the file says so by <tip link="NAME"/>, which is no part of the format.
     """
 
     name: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
-    mimics: Mapping[str, Mimic]
+    tip: str | None = None
 
 
-def read_urdf(source: Source, *, inertia: InertiaRule = "error") -> Description:
+def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     """Read a URDF description.
 
     What is left out has the meaning of the format: an origin of zeros, the axis x, no inertia. A revolute or
     prismatic joint whose <limit> gives only one of lower and upper has 0 for the other; with neither, or without
     <limit>, it has no position limits. Likewise for effort and velocity. A floating joint between a massless root and
-    its only child says that the robot floats: both are left out.
+    its only child says that the robot floats: both are left out. A fixed joint follows none, whatever it mimics.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
-        inertia: What to do about an inertia that no body can have: refuse it, or take it "as_given".
+        inertia: What to say about an inertia that no body can have: "warn", or nothing and take it "as_given".
 
     Raises:
-        ModelError: No such file, malformed XML, xacro, missing or non-numeric attributes, kinds of joints that are not
-            supported, impossible inertias, masses or limits.
+        ModelError: No such file, malformed XML, xacro, missing, misspelt or non-numeric attributes, elements given
+            twice, kinds of joints or shapes that are not supported, impossible masses, limits or shapes.
+
+    Warns:
+        ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF.
     """
-    if inertia not in ("error", "as_given"):
-        raise ModelError(f"unknown inertia rule {inertia!r}; use 'error' or 'as_given'")
+    if inertia not in ("warn", "as_given"):
+        raise ModelError(f"unknown inertia rule {inertia!r}; use 'warn' or 'as_given'")
     tree = parsed(source)
+    if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
+        warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unread)}", ModelWarning, 3)
     links = _links(tree, inertia)
     floating = {name_of(each) for each in tree.findall("joint") if each.get("type") == "floating"}
     pairs = [(name_of(each), _joint(each)) for each in tree.findall("joint")]
@@ -88,48 +95,87 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "error") -> Description:
             )
         links = tuple(link for link in links if link is not base)
         pairs = [pair for pair in pairs if pair[0] != name]
-    joints = tuple(joint for _, joint in pairs)
-    return Description(tree.get("name") or "robot", links, joints, dict(_mimics(tree, joints)))
+    tip = _only(tree, "tip", "the robot")
+    named = None if tip is None else text_of(tip, "link", "the robot")
+    return Description(tree.get("name") or "robot", links, tuple(joint for _, joint in pairs), named)
 
 
-def held_by_mimicry(
-    joints: tuple[Joint, ...], mimics: Mapping[str, Mimic], held: Mapping[str, float], rule: MimicRule
-) -> dict[str, float]:
-    """Positions (rad or m) at which joints that follow others are to be locked, by name.
+def written_urdf(
+    name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, translation: Array, rotation: Array
+) -> str:
+    """A robot as URDF text, of which `read_urdf` makes the same links, joints and tip, numbers to the last digit.
 
-    A joint that follows a joint held or fixed is held with it under "error" and "lock". Of the others, "lock" holds
-    each where it is when the joint that it follows is at 0, and "free" makes all followers independent.
-
-    Raises:
-        ModelError: An unknown rule; a follower of a moving joint under "error"; of an unknown joint, or in a ring of
-            followers, unless they are "free".
+    A tip that does not stand in its link's own frame, (3,) and (3, 3) as of Robot, becomes a link "LINK_tip" on a fixed
+    joint. The tip is named by <tip link="NAME"/>, which is no part of the format and which other readers pass over. A
+    limit that there is not is left out, which urdfdom, and so ROS and Pinocchio, does not accept of revolute and
+    prismatic joints: give such a robot limits of effort and velocity, and of position on both sides or none, first.
     """
-    if rule not in ("error", "lock", "free"):
-        raise ModelError(f"unknown mimic rule {rule!r}; use 'error', 'lock' or 'free'")
-    kinds = {joint.name: joint.kind for joint in joints}
-    places: dict[str, float] = {}
-    moving: list[str] = []
-    for name in mimics if rule != "free" else ():
-        factor, shift, chain = 1.0, 0.0, [name]
-        while (last := chain[-1]) in mimics and last not in held:
-            tie = mimics[last]
-            factor, shift = factor * tie.multiplier, shift + factor * tie.offset
-            if tie.joint not in kinds:
-                raise absent(f"joint {last!r}: <mimic> of the joint", tie.joint, kinds)
-            if tie.joint in chain:
-                raise ModelError(f"joints {chain} mimic each other in a ring; remove a <mimic> of one of them")
-            chain.append(tie.joint)
-        if len(chain) > 1:
-            places[name] = shift + factor * float(held.get(last, 0.0))
-            if last not in held and kinds[last] != "fixed":
-                moving.append(f"{name!r} ({mimics[name].multiplier:g} x {mimics[name].joint!r})")
-    if moving and rule == "error":
-        raise ModelError(
-            f"joints that mimic a moving joint are not supported: {', '.join(moving)}; lock the joint they follow, "
-            "lock={...}, which locks them with it; or say mimic='lock' to hold each where the joint it follows is at "
-            "0, or mimic='free' to make them independent"
-        )
-    return places
+    robot = ElementTree.Element("robot", name=name)
+    if tip is not None and (translation.any() or not np.array_equal(rotation, np.eye(3))):
+        taken = {link.name for link in links} | {joint.name for joint in joints}
+        free = (f"{tip}_tip{i or ''}" for i in range(len(taken) + 1))
+        end = next(name for name in free if name not in taken and f"{name}_fixed" not in taken)
+        links, joints = [*links, Link(end)], [*joints, Joint(f"{end}_fixed", "fixed", tip, end, translation, rotation)]
+        tip = end
+    for link in links:
+        element = ElementTree.SubElement(robot, "link", name=link.name)
+        if link.mass or link.inertia.any() or link.center_of_mass.any():
+            body = ElementTree.SubElement(element, "inertial")
+            _write_origin(body, link.center_of_mass, np.eye(3))
+            ElementTree.SubElement(body, "mass", value=_text(link.mass))
+            moments = map(_text, link.inertia[np.triu_indices(3)])
+            ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
+        for shape in link.collisions:
+            collision = ElementTree.SubElement(element, "collision")
+            _write_origin(collision, shape.translation, shape.rotation)
+            if shape.kind == "mesh":
+                sizes = {"filename": shape.file, "scale": _text(shape.size)}
+            elif shape.kind == "box":
+                sizes = {"size": _text(shape.size)}
+            else:
+                sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
+            ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), shape.kind, sizes)
+    for joint in joints:
+        element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+        _write_origin(element, joint.translation, joint.rotation)
+        ElementTree.SubElement(element, "parent", link=joint.parent)
+        ElementTree.SubElement(element, "child", link=joint.child)
+        if not joint.moves:
+            continue
+        ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
+        given = [what for what in ("effort", "velocity") if np.isfinite(getattr(joint, what))]
+        given += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
+        if given:
+            ElementTree.SubElement(element, "limit", {what: _text(getattr(joint, what)) for what in given})
+        if (tie := joint.mimic) is not None:
+            numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
+            ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
+    if tip is not None:
+        ElementTree.SubElement(robot, "tip", link=tip)
+    ElementTree.indent(robot)
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
+    """No rpy where nothing is turned, so that zeros stay exact."""
+    turned = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
+    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | turned)
+
+
+def _rpy(rotation: Array) -> Array:
+    """Angles about the fixed x, y, z that make a rotation. Shape (3,), rad.
+
+    At pitch = +-pi/2 yaw is whatever rounding says, and roll, which is measured with this yaw taken back, makes up for
+    it: exact to rounding there too.
+    """
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y of the frame that is turned by yaw alone
+    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
+
+
+def _text(numbers: Any) -> str:
+    return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
 def parsed(source: Source) -> ElementTree.Element:
@@ -185,10 +231,12 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
         except ModelError as error:
             refused.append(str(error))
         links.append(link)
-    if refused and rule == "error":
-        raise ModelError(
-            "; ".join(refused) + ". Correct the file, or take such inertias unchecked: from_urdf(..., "
-            "inertia='as_given')"
+    if refused and rule == "warn":
+        warn(
+            f"inertias that no body can have are taken as given: {'; '.join(refused)}. Correct the file, or have no "
+            "more said of it: from_urdf(..., inertia='as_given')",
+            ModelWarning,
+            4,
         )
     if not links:
         raise ModelError(f"the robot {tree.get('name') or ''!r} has no <link>")
@@ -198,17 +246,36 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
 def _link(element: ElementTree.Element) -> Link:
     name = name_of(element)
     owner = f"link {name!r}"
-    found = element.findall("inertial")
-    if not found:
-        return Link(name)
-    if len(found) > 1:
-        raise ModelError(f"{owner} has {len(found)} <inertial> elements; a link has one at most")
-    center, turn = origin_of(found[0], owner)
-    mass = number_of(child_of(found[0], "mass", owner), "value", owner)
-    given = child_of(found[0], "inertia", owner)
-    xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    shapes = tuple(_shape(each, owner) for each in element.findall("collision"))
+    body = _only(element, "inertial", owner)
+    if body is None:
+        return Link(name, collisions=shapes)
+    center, turn = origin_of(body, owner)
+    mass = number_of(child_of(body, "mass", owner), "value", owner)
+    given = child_of(body, "inertia", owner)
+    xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in MOMENTS)
     inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return Link(name, mass, center, inertia, any_inertia=True)
+    return Link(name, mass, center, inertia, any_inertia=True, collisions=shapes)
+
+
+def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
+    found: list[Any] = list(child_of(element, "geometry", owner))
+    if len(found) != 1:
+        raise ModelError(f"{owner}: <geometry> has {len(found)} shapes, not one")
+    (shape,) = found
+    kind = shape.tag
+    if kind not in SHAPES:
+        raise ModelError(f"{owner}: unknown shape <{kind}>; a shape is one of {', '.join(SHAPES)}")
+    file = text_of(shape, "filename", owner) if kind == "mesh" else ""
+    if kind in ("box", "mesh"):
+        key = "size" if kind == "box" else "scale"
+        size = np.ones(3) if kind == "mesh" and key not in shape.attrib else numbers_of(shape, key, owner, 3)
+    else:
+        size = np.array([number_of(shape, key, owner) for key in ("radius", "length")[: SHAPES[kind]]])
+    try:
+        return CollisionShape(kind, size, file, *origin_of(element, owner))
+    except ModelError as error:
+        raise ModelError(f"{owner}: {error}") from None
 
 
 def _joint(element: ElementTree.Element) -> Joint:
@@ -224,39 +291,58 @@ def _joint(element: ElementTree.Element) -> Joint:
     shift, turn = origin_of(element, owner)
     if kind not in MOVING:
         return Joint(name, "fixed", parent, child, shift, turn)
-    stated = element.find("axis")
+    stated = _only(element, "axis", owner)
     axis = np.array([1.0, 0.0, 0.0]) if stated is None else numbers_of(stated, "xyz", owner, 3)
     limits: dict[str, float] = {}
-    if (limit := element.find("limit")) is not None:
-        given = [key for key in ("lower", "upper", "velocity", "effort") if key in limit.attrib]
+    if (limit := _only(element, "limit", owner)) is not None:
+        given = [key for key in ATTRIBUTES["limit"] if key in limit.attrib]
         limits = {key: number_of(limit, key, owner) for key in given}
         if kind == "continuous":
             limits = {key: value for key, value in limits.items() if key in ("velocity", "effort")}
         elif "lower" in limits or "upper" in limits:
             limits = {"lower": 0.0, "upper": 0.0, **limits}
-    return Joint(name, MOVING[kind], parent, child, shift, turn, axis, **limits)
-
-
-def _mimics(tree: ElementTree.Element, joints: tuple[Joint, ...]) -> Iterator[tuple[str, Mimic]]:
-    moves = {joint.name: joint.moves for joint in joints}
-    for element in tree.findall("joint"):
-        name, tie = name_of(element), element.find("mimic")
-        if tie is None or not moves.get(name):
-            continue
-        owner = f"joint {name!r}"
-        followed = text_of(tie, "joint", f"{owner}: <mimic>")
+    mimic = None
+    if (tie := _only(element, "mimic", owner)) is not None:
         numbers = {key: number_of(tie, key, owner) for key in ("multiplier", "offset") if key in tie.attrib}
-        yield name, Mimic(followed, **numbers)
+        mimic = Mimic(text_of(tie, "joint", owner), **numbers)
+    return Joint(name, MOVING[kind], parent, child, shift, turn, axis, mimic=mimic, **limits)
+
+
+def _unread(owner: ElementTree.Element) -> list[str]:
+    """Attributes below a link or a joint that are none of URDF's, where one is lacking that they may stand for.
+
+    Beside all of URDF's they are an extension, and passed over as unknown elements are. ModelError for an attribute
+    that looks like one that is lacking.
+    """
+    found = []
+    parts = [part for tag in ("inertial", "collision") for part in owner.findall(tag)]
+    for element in (each for part in (owner, *parts) for each in part):
+        known = ATTRIBUTES.get(element.tag, ())
+        lacking = [word for word in known if word not in element.attrib]
+        for key in [key for key in element.attrib if lacking and key not in known and "}" not in key]:
+            where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
+            if near := get_close_matches(key.casefold(), lacking, n=1):
+                raise ModelError(f"{where} is no attribute of URDF; did you mean {near[0]!r}?")
+            found.append(where)
+    return found
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
     """Position (3,) and rotation (3, 3) of an <origin>."""
-    origin = element.find("origin")
+    origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
         shift = numbers_of(origin, "xyz", owner, 3) if "xyz" in origin.attrib else shift
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
     return shift, np.array(rotation_from_rpy(*angles)) if angles.any() else np.eye(3)
+
+
+def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
+    """The child of that tag, None without; ModelError naming `owner` where there are several."""
+    found = element.findall(tag)
+    if len(found) > 1:
+        raise ModelError(f"{owner} has {len(found)} <{tag}> elements in <{element.tag}>; it takes one at most")
+    return found[0] if found else None
 
 
 def name_of(element: ElementTree.Element) -> str:
@@ -265,8 +351,8 @@ def name_of(element: ElementTree.Element) -> str:
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """The first child of that tag; ModelError naming `owner` without."""
-    found = element.find(tag)
+    """The one child of that tag; ModelError naming `owner` without, or with several."""
+    found = _only(element, tag, owner)
     if found is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>")
     return found

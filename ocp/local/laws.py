@@ -13,9 +13,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.machines.machine import jacobian_manipulability
 from models.machines.standing import External, Standing, wrenches_at
-from models.robot.indices import joint_limit_index
+from models.robot.indices import jacobian_manipulability, joint_limit_index
 from models.robot.motion import center_of_mass_motion, momentum
 from ocp.errors import ProblemError
 from ocp.local.rates import least_rates

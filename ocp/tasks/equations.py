@@ -248,8 +248,10 @@ def _combinations(by_base: Array, count: int) -> Array:
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
     """The equations of a task, or of several stacked, for a machine.
 
+    That of the equations has the frame of the first task for its tip where the robot has none.
+
     Raises:
-        ProblemError: No task, something else than a task, an unknown link.
+        ProblemError: No task, something else than a task, an unknown link, a task of the tip of a robot that has none.
     """
     listed = [tasks] if isinstance(tasks, TipTask) else list(tasks)
     if not listed:
@@ -259,12 +261,13 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
         if not isinstance(task, TipTask):
             raise ProblemError(f"task must be a TipTask or a list of them, not {task!r}")
         try:
-            tip = machine if task.link is None else with_tip(machine, task.link, task.point)
+            tip = with_tip(machine, task.link, task.point) if task.link is not None else machine
+            _ = tip.robot.tip_link
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
         except ModelError as error:
             raise ProblemError(str(error)) from error
         bound.append(Bound(task, tip, reference))
-    return TaskEquations(machine, tuple(bound))
+    return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 
 
 def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, base: Any, joints: Any) -> Array:

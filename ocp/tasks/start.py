@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine, ModelError
-from models.machines.machine import checked_rows
+from models.robot.indices import checked_rows
 from ocp.errors import ProblemError
 
 __all__ = [

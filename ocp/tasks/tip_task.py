@@ -15,10 +15,10 @@ import numpy as np
 
 from models import ModelError
 from models.arrays import ArrayInput, checked_array
-from models.machines.machine import checked_rows
 from models.paths.functions import path_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
+from models.robot.indices import checked_rows
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError
 from ocp.tasks.start import Array, Velocity

@@ -56,7 +56,7 @@ METHOD = Collocation(16, degree=3, scheme="legendre")
 def anymal() -> tuple[Standing, Footprint]:
     """ANYmal on its feet, the arm free, with its load."""
     whole = ANYMAL.read()
-    ground = footprint(whole, ANYMAL.path, links=FEET)
+    ground = footprint(whole, links=FEET)
     robot = with_load(whole, str(whole.tip), LOAD)
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 

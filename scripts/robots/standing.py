@@ -92,7 +92,7 @@ def tiago(load: float = LOAD) -> tuple[Standing, Footprint]:
     """TIAGo on its wheels and casters, lift and arm free, with a load (kg) in its hand."""
     file = robot_file()
     whole = Robot.from_urdf(file, tip=HAND, inertia="as_given")  # some of the file's inertias are rounded
-    ground = footprint(whole, file)
+    ground = footprint(whole)
     robot = locked(whole, {name: 0.0 for name in whole.joint_names if name not in JOINTS})
     robot = with_load(robot, HAND, load) if load else robot
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground

@@ -149,6 +149,8 @@ def _serial_bodies(robot: Robot) -> tuple[Array, list[tuple[Joint, Array]], list
     for joint in robot.joints:
         body, X = place[joint.parent]
         X = motion_transform(joint.rotation.T, joint.translation) @ X
+        if joint.mimic is not None:
+            raise ModelError(f"joint {joint.name!r} follows joint {joint.mimic.joint!r}; the recursion knows none")
         if joint.moves:
             if body != len(joints):
                 raise ModelError(
@@ -161,7 +163,7 @@ def _serial_bodies(robot: Robot) -> tuple[Array, list[tuple[Joint, Array]], list
         else:
             bodies[body] = bodies[body] + X.T @ spatial_inertia(robot.link(joint.child)) @ X
             place[joint.child] = (body, X)
-    body, X = place[str(robot.tip)]
+    body, X = place[robot.tip_link]
     if body != len(joints):
         raise ModelError(
             f"the tip is on link {robot.tip!r}, before the joint {joints[body][0].name!r}; the recursion is for a tip "

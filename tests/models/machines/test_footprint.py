@@ -53,7 +53,7 @@ def area(corners: np.ndarray) -> float:
 
 def test_wheels_stand_on_their_lowest_lines_and_a_ball_on_its_lowest_point() -> None:
     text = wheels_and_ball()
-    found = footprint(Robot.from_urdf(text, tip="base"), text)
+    found = footprint(Robot.from_urdf(text))
     assert found.links == ("left", "right", "caster")
     assert found.translation[2] == pytest.approx(0.052, abs=1e-15)
     expected = {(0.2, 0.27), (0.2, -0.27), (-0.25, 0.0)}
@@ -62,16 +62,16 @@ def test_wheels_stand_on_their_lowest_lines_and_a_ball_on_its_lowest_point() -> 
 
 def test_what_is_higher_than_the_depth_does_not_touch() -> None:
     text = wheels_and_ball()
-    robot = Robot.from_urdf(text, tip="base")
+    robot = Robot.from_urdf(text)
     with pytest.raises(ModelError, match=r"'caster'.*one point or line"):
-        footprint(robot, text, depth=0.001)  # the wheels are 2 mm higher
-    held_up = footprint(robot, text, links=["left", "right", "base"], depth=0.2)
+        footprint(robot, depth=0.001)  # the wheels are 2 mm higher
+    held_up = footprint(robot, links=["left", "right", "base"], depth=0.2)
     assert held_up.support.area == pytest.approx((0.27 * 2 + 0.4) * 0.1 / 2 + 0.5 * 0.4, rel=0.2)
 
 
 def test_a_standing_cylinder_gives_a_polygon_inside_its_rim() -> None:
     text = cart(part("foot", "0.1 -0.2 -0.3", '<cylinder length="0.5" radius="0.15"/>'))
-    found = footprint(Robot.from_urdf(text, tip="base"), text)
+    found = footprint(Robot.from_urdf(text))
     away = np.linalg.norm(found.support.vertices - [0.1, -0.2], axis=1)
     np.testing.assert_allclose(away, 0.15, atol=1e-14)
     assert 0.99 * np.pi * 0.15**2 < found.support.area < np.pi * 0.15**2
@@ -85,8 +85,8 @@ def test_the_pose_of_the_legs_counts() -> None:
         '<origin xyz="{x} {y} 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
     )
     text = cart(*(leg.format(n=f"leg{x}{y}", x=0.3 * x, y=0.2 * y) for x in (-1, 1) for y in (-1, 1)))
-    robot = Robot.from_urdf(text, tip="base")
-    straight, spread = footprint(robot, text), footprint(robot, text, q=[0.5, 0.5, -0.5, -0.5])
+    robot = Robot.from_urdf(text)
+    straight, spread = footprint(robot), footprint(robot, q=[0.5, 0.5, -0.5, -0.5])
     assert straight.translation[2] == pytest.approx(0.32)
     assert spread.translation[2] == pytest.approx(0.3 * np.cos(0.5) + 0.02)
     np.testing.assert_allclose(straight.support.half_widths, [0.3, 0.2], atol=1e-12)
@@ -108,8 +108,8 @@ def test_the_hull_is_that_of_an_independent_library(points: list[tuple[int, int]
     ("shape", "message"),
     [
         ('<mesh filename="package://a/b.stl"/>', r"only meshes, in \['foot'\].*give the support yourself"),
-        ('<sphere radius="-0.1"/>', r"link 'foot': radius -0.1 of a collision shape is not positive"),
-        ('<box size="0.1 0 0.1"/>', r"link 'foot': size .* is not positive"),
+        ('<sphere radius="-0.1"/>', r"link 'foot': .*size \[-0.1\] of the sphere is not positive"),
+        ('<box size="0.1 0 0.1"/>', r"link 'foot': .*size .* of the box is not positive"),
         ('<cylinder radius="0.1"/>', r"link 'foot': <cylinder> has no attribute 'length'"),
         ('<cone radius="0.1"/>', "link 'foot': unknown shape <cone>"),
         ("", "link 'foot': <geometry> has 0 shapes"),
@@ -118,16 +118,16 @@ def test_the_hull_is_that_of_an_independent_library(points: list[tuple[int, int]
 def test_shapes_that_are_not_read_are_named(shape: str, message: str) -> None:
     text = cart(part("foot", "0 0 -1", shape))
     with pytest.raises(ModelError, match=message):
-        footprint(Robot.from_urdf(text, tip="base"), text, links=["foot"])
+        footprint(Robot.from_urdf(text), links=["foot"])
 
 
 def test_unknown_links_and_impossible_depths_are_named() -> None:
     text = cart()
-    robot = Robot.from_urdf(text, tip="base")
+    robot = Robot.from_urdf(text)
     with pytest.raises(ModelError, match=r"link 'bace' does not exist; did you mean 'base'"):
-        footprint(robot, text, links=["bace"])
+        footprint(robot, links=["bace"])
     with pytest.raises(ModelError, match=r"depth -1 m"):
-        footprint(robot, text, depth=-1)
+        footprint(robot, depth=-1)
 
 
 def test_a_root_link_that_is_not_upright_is_set_upright() -> None:
@@ -138,38 +138,38 @@ def test_a_root_link_that_is_not_upright_is_set_upright() -> None:
         <child link="base"/><origin xyz="0.3 0.1 0.2" rpy="{np.pi / 2} 0 0"/></joint></robot>""",
     )
     turned = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    upright = footprint(Robot.from_urdf(text, tip="base"), text)
-    robot = Robot.from_urdf(lying, tip="base")
-    found = footprint(robot, lying, rotation=turned)
+    upright = footprint(Robot.from_urdf(text))
+    robot = Robot.from_urdf(lying)
+    found = footprint(robot, rotation=turned)
     shift = turned @ [0.3, 0.1, 0.2]
     np.testing.assert_allclose(found.support.vertices, upright.support.vertices + shift[:2], atol=1e-12)
     assert found.translation[2] == pytest.approx(upright.translation[2] - shift[2])
     frames = link_frames(robot, [], (ca.DM(found.rotation), ca.DM(found.translation)))
     assert float(frames["caster"].position[2]) == pytest.approx(0.03)  # its radius: it touches z = 0
     with pytest.raises(ModelError, match="not a rotation"):
-        footprint(robot, lying, rotation=2 * np.eye(3))
+        footprint(robot, rotation=2 * np.eye(3))
 
 
-def test_a_robot_without_its_feet_is_refused() -> None:
-    text = wheels_and_ball()
-    robot = simplified(Robot.from_urdf(text, tip="base"))
-    with pytest.raises(ModelError, match="no link 'left', whose shapes may be the lowest; take the footprint before"):
-        footprint(robot, text)
+def test_a_simplified_robot_stands_on_the_same_shapes() -> None:
+    robot = Robot.from_urdf(wheels_and_ball())
+    found, whole = footprint(simplified(robot)), footprint(robot)
+    assert (found.links, whole.links) == (("base",), ("left", "right", "caster"))
+    np.testing.assert_allclose(found.support.vertices, whole.support.vertices, atol=1e-15)
 
 
 def test_a_mesh_below_all_shapes_is_refused() -> None:
     text = cart(part("foot", "0.1 0 -0.4", '<mesh filename="package://a/b.stl"/>'))
-    robot = Robot.from_urdf(text, tip="base")
+    robot = Robot.from_urdf(text)
     with pytest.raises(ModelError, match=r"mesh of link 'foot' begins 0.5 m lower than all shapes"):
-        footprint(robot, text)
-    np.testing.assert_allclose(footprint(robot, text, links=["base"]).support.half_widths, [0.3, 0.2])
+        footprint(robot)
+    np.testing.assert_allclose(footprint(robot, links=["base"]).support.half_widths, [0.3, 0.2])
 
 
 def test_footprints_of_real_robots() -> None:
     """TIAGo on two wheels and four casters, ANYmal on the lowest points of its four feet: figures of their files."""
     package, ending, options = ROBOTS["tiago"]
     file = urdf_file(package, ending)
-    found = footprint(Robot.from_urdf(file, **options), file)
+    found = footprint(Robot.from_urdf(file, **options))
     corners = {(-0.1895, 0.102), (-0.1895, -0.102), (0.0, 0.2222), (0.0, -0.2222), (0.1535, 0.102), (0.1535, -0.102)}
     assert {tuple(v + 0.0) for v in found.support.vertices.round(9)} == corners
     assert abs(found.translation[2]) < 1e-9
@@ -178,7 +178,7 @@ def test_footprints_of_real_robots() -> None:
     robot = Robot.from_urdf(file, **options)
     feet = ["LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"]
     q = np.random.default_rng(4).uniform(-0.02, 0.02, robot.dof)
-    found = footprint(robot, file, q=q, links=feet, depth=0.1)
+    found = footprint(robot, q=q, links=feet, depth=0.1)
     frames = link_frames(robot, q)
     centers = [numeric(frames[foot].point(ca.DM([0, 0, 0.02325])))[:2, 0] for foot in feet]
     np.testing.assert_allclose(sorted(map(tuple, found.support.vertices)), sorted(map(tuple, centers)), atol=1e-12)
@@ -187,4 +187,4 @@ def test_footprints_of_real_robots() -> None:
 def test_source_may_be_a_file(tmp_path: Path) -> None:
     file = tmp_path / "cart.urdf"
     file.write_text(wheels_and_ball())
-    assert footprint(Robot.from_urdf(file, tip="base"), file).links == ("left", "right", "caster")
+    assert footprint(Robot.from_urdf(file)).links == ("left", "right", "caster")

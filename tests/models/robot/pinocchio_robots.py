@@ -32,6 +32,12 @@ ROBOTS: dict[str, tuple[str, str, dict[str, Any]]] = {
 """Distribution, end of the file's path, and what Robot.from_urdf needs to be told."""
 
 
+def collection() -> list[Path]:
+    """Every URDF file of the distribution."""
+    files = distribution(DATA).files or []
+    return sorted(Path(str(file.locate())) for file in files if file.suffix == ".urdf")
+
+
 def urdf_file(package: str, ending: str) -> Path:
     """A file of an installed distribution."""
     owner = distribution(package)
@@ -56,6 +62,12 @@ class State:
         """Position and quaternion [w, x, y, z]."""
         return np.concatenate([self.position, np.roll(Rotation.from_matrix(self.rotation).as_quat(), 1)])
 
+    @property
+    def base_twist_at_origin(self) -> Array:
+        """The base's twist with the velocity of its point at the world's origin."""
+        turning, moving = self.base_twist[:3], self.base_twist[3:]
+        return np.concatenate([turning, moving - np.cross(turning, self.position)])
+
 
 def random_state(robot: Robot, rng: np.random.Generator) -> State:
     slides = np.array([joint.kind == "prismatic" for joint in robot.moving_joints])
@@ -79,11 +91,15 @@ class Peer:
 
     @classmethod
     def of(cls, path: Path, robot: Robot) -> Peer:
-        """Without limits Pinocchio takes no revolute joint: such joints are continuous to it."""
+        """Without limits Pinocchio takes no revolute joint: such joints are continuous to it.
+
+        A follower that it reads before the joint that is followed it does not take either.
+        """
         text = path.read_text(encoding="utf-8")
         if "<limit" not in text:
             text = text.replace('"revolute"', '"continuous"')
-        return cls(pinocchio.buildModelFromXML(text, pinocchio.JointModelFreeFlyer()), robot)
+        mimic = any(joint.mimic is not None for joint in robot.joints)
+        return cls(pinocchio.buildModelFromXML(text, pinocchio.JointModelFreeFlyer(), mimic), robot)
 
     @cached_property
     def data(self) -> Any:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import ModelError, center_of_mass, frame_jacobian, link_frames, momentum_matrix, planar_chain
-from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
+from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics, mass_matrix
 from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from tests.models.robot.trees import (
     Array,
@@ -148,19 +148,34 @@ def test_the_reaction_is_the_rate_of_momentum_less_weight_and_wrenches(seed: int
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
 
+@given(seeds, st.integers(1, 6))
+@few
+def test_the_mass_matrix_is_symmetric_and_gives_the_torques_of_accelerations_from_rest(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size, followers=True)
+    q, rest, qdd = rng.normal(size=robot.dof), np.zeros(robot.dof), rng.normal(size=robot.dof)
+    inertia = numeric(mass_matrix(robot, q))
+    np.testing.assert_allclose(inertia, inertia.T, atol=1e-12)
+    torques = numeric(inverse_dynamics(robot, q, rest, qdd, gravity=(0.0, 0.0, 0.0))).ravel()
+    np.testing.assert_allclose(inertia @ qdd, torques, rtol=1e-10, atol=1e-10)
+
+
 @settings(max_examples=10)
 @given(seeds)
 def test_mx_and_sx_symbols_give_the_same(seed: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, 4)
-    motion, push = random_motion(rng, robot.dof), rng.normal(size=3)
+    motion, push, base_motion = random_motion(rng, robot.dof), rng.normal(size=3), rng.normal(size=(2, 6))
     results = []
     for symbols in (ca.SX, ca.MX):
-        q, qd, qdd, force = (symbols.sym(name, size) for name, size in zip("abcd", (*[robot.dof] * 3, 3), strict=True))
-        wrenches = [Wrench(str(robot.tip), force)]
-        outputs = [inverse_dynamics(robot, q, qd, qdd, wrenches), base_reaction(robot, q, qd, qdd, wrenches)]
+        sizes = (*[robot.dof] * 3, 3, 6, 6)
+        q, qd, qdd, force, twist, swing = (symbols.sym(name, size) for name, size in zip("abcdef", sizes, strict=True))
+        moving = {"base_twist": twist, "base_acceleration": swing}
+        wrenches = [Wrench(robot.tip_link, force)]
+        outputs = [function(robot, q, qd, qdd, wrenches, **moving) for function in (inverse_dynamics, base_reaction)]
         outputs += [momentum(robot, q, qd), momentum_rate(robot, q, qd, qdd), *center_of_mass_motion(robot, q, qd, qdd)]
-        values = ca.Function("all", [q, qd, qdd, force], outputs)(*motion, push)
+        outputs.append(ca.vec(mass_matrix(robot, q)))
+        values = ca.Function("all", [q, qd, qdd, force, twist, swing], outputs)(*motion, push, *base_motion)
         results.append(np.concatenate([numeric(value).ravel() for value in values]))
     np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
 
@@ -180,12 +195,15 @@ def test_a_planar_machine_keeps_its_structural_zeros() -> None:
         ({"qdd": np.zeros(5)}, "qdd has shape"),
         ({"wrenches": [Wrench("hand")]}, "link 'hand' does not exist"),
         ({"gravity": (0.0, -9.81)}, "gravity has shape"),
+        ({"base_twist": np.zeros(3)}, r"base_twist has shape \(3, 1\), expected \(6, 1\)"),
+        ({"base_acceleration": np.zeros(3)}, r"base_acceleration has shape \(3, 1\), expected \(6, 1\)"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {"q": np.zeros(2), "qd": np.zeros(2), "qdd": np.zeros(2), **changes}
-    with pytest.raises(ModelError, match=message):
-        inverse_dynamics(planar_chain([1.0, 1.0], [1.0, 1.0]), **arguments)
+    for function in (inverse_dynamics, base_reaction):
+        with pytest.raises(ModelError, match=message):
+            function(planar_chain([1.0, 1.0], [1.0, 1.0]), **arguments)
 
 
 def test_a_robot_without_mass_has_no_centre_of_mass_motion() -> None:

@@ -119,7 +119,7 @@ def test_a_reduced_robot_is_that_of_pinocchio() -> None:
 def test_a_robot_hung_up_elsewhere_moves_the_same(seed: int, size: int) -> None:
     """Relative poses of all links, and what floats freely does not know its root: the generalized Jacobian."""
     rng = np.random.default_rng(seed)
-    robot = random_robot(rng, size)
+    robot = random_robot(rng, size, followers=True)
     root = robot.links[int(rng.integers(len(robot.links)))].name
     turned = rerooted(robot, root)
     assert turned.root == root
@@ -159,9 +159,9 @@ def test_rerooting_to_and_fro_adds_massless_frames_once_and_changes_no_motion() 
 @fewer_still
 def test_a_simplified_robot_has_the_same_dynamics(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
-    robot = random_robot(rng, size)
+    robot = random_robot(rng, size, followers=True)
     fewer = simplified(robot)
-    assert len(fewer.links) == robot.dof + 1
+    assert len(fewer.links) == len(robot.drives) + 1
     assert fewer.joint_names == robot.joint_names
     assert_same_dynamics(robot, fewer, seed)
     kept = robot.links[int(rng.integers(1, len(robot.links)))].name
@@ -185,7 +185,7 @@ def test_a_simplified_real_robot_has_the_same_dynamics(name: str) -> None:
 @few
 def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, size: int, more: int) -> None:
     rng = np.random.default_rng(seed)
-    robot, tool = random_robot(rng, size), random_robot(rng, more)
+    robot, tool = random_robot(rng, size, followers=True), random_robot(rng, more, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     turn, shift = random_frame(rng)
     whole = attached(robot, tool, link, shift, turn, prefix="tool_")
@@ -221,7 +221,7 @@ def test_a_tool_stands_at_the_tip_unless_a_link_is_named() -> None:
 @fewer_still
 def test_a_load_is_a_link_that_is_fixed(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
-    robot = random_robot(rng, size)
+    robot = random_robot(rng, size, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     center, inertia = rng.normal(size=3), random_inertia(rng, 3.0)
     loaded = with_load(robot, link, 3.0, center, inertia)

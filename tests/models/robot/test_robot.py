@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import Joint, Link, ModelError, Robot, planar_chain
-from tests.models.robot.trees import random_inertia, random_robot, random_rotation, seeds
+from models import (
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    Joint,
+    Link,
+    ModelError,
+    Robot,
+    attached,
+    locked,
+    planar_chain,
+    pruned,
+    renamed,
+    simplified,
+    tip_jacobian,
+    tip_pose,
+)
+from tests.models.robot.trees import numeric, random_inertia, random_robot, random_rotation, seeds
 
 
 def joint(name: str, parent: str, child: str, **fields: Any) -> Joint:
@@ -52,6 +69,37 @@ def test_the_only_leaf_is_the_tip_unless_named() -> None:
     assert chain.tip == "link2"
     assert dataclasses.replace(chain, tip="link1").tip == "link1"
     assert Robot((Link("alone"),)).tip == "alone"
+
+
+def test_a_tree_of_several_leaves_has_no_tip_and_says_so_where_one_is_needed() -> None:
+    """Everything that does not need one works."""
+    robot = Robot(
+        tuple(Link(name, 1.0, inertia=np.eye(3)) for name in "abc"), (joint("j", "a", "b"), joint("k", "a", "c"))
+    )
+    assert robot.tip is None
+    machine, rates = FreeFloating(robot), [1.0, 2.0]
+    base, q = machine.base_home(), [0.3, 0.4]
+    with_tip_b = FreeFloating(dataclasses.replace(robot, tip="b"))
+    np.testing.assert_array_equal(
+        numeric(machine.base_twist(base, q, rates)), numeric(with_tip_b.base_twist(base, q, rates))
+    )
+    assert [each.tip for each in (renamed(robot, "x_"), simplified(robot), locked(robot, {"j": 0.0}))] == [None] * 3
+    assert pruned(robot, "c").tip == "c"
+    assert attached(robot, Link("tool"), "b").tip == "tool"
+    assert str(robot).startswith("robot of 3 links, 2 degrees of freedom, 3 kg, no tip")
+    needing: list[Callable[[], Any]] = [
+        lambda: tip_pose(robot, q),
+        lambda: tip_jacobian(robot, q),
+        lambda: FixedBase(robot).tip_twist([], q, rates),
+        lambda: machine.tip_pose(base, q),
+        lambda: machine.tip_jacobian(base, q),
+        lambda: machine.jacobians(base, q),
+        lambda: pruned(robot),
+        lambda: attached(robot, Link("tool")),
+    ]
+    for use in needing:
+        with pytest.raises(ModelError, match=r"'robot' has no tip.*leaves \['b', 'c'\].*tip=NAME.*retipped"):
+            use()
 
 
 def test_limits_are_arrays_of_the_moving_joints() -> None:
@@ -146,6 +194,22 @@ def test_an_impossible_link_is_refused(fields: dict[str, Any], message: str) -> 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
+        ({"kind": "cone", "size": 1.0}, r"collision shape: unknown kind 'cone'; use one of box, sphere"),
+        ({"kind": "box", "size": 1.0}, r"collision shape: size of the box has shape \(\), expected \(3,\)"),
+        ({"kind": "sphere", "size": [0.0]}, r"collision shape: size \[0.0\] of the sphere is not positive"),
+        ({"kind": "mesh", "size": [1, 1, 1]}, r"collision shape: a mesh needs the name of its file"),
+        ({"kind": "mesh", "size": [1, 0, 1], "file": "a"}, r"collision shape: size .* of the mesh is not positive"),
+        ({"kind": "sphere", "size": [1], "rotation": np.ones((3, 3))}, r"rotation .* is not a rotation matrix"),
+    ],
+)
+def test_an_impossible_shape_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        CollisionShape(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
         ({"kind": "ball"}, r"joint 'j': unknown kind 'ball'"),
         ({"axis": (0, 0, 0)}, r"joint 'j': axis .* has no direction"),
         ({"axis": (0, 1)}, r"joint 'j': axis has shape"),
@@ -180,7 +244,6 @@ def test_an_impossible_joint_is_refused(fields: dict[str, Any], message: str) ->
         ("ab", [("j", "a", "b"), ("k", "b", "a")], r"form a loop"),
         ("abc", [("j", "b", "c"), ("k", "c", "b")], r"joints \['j', 'k'\] form a loop .* root link 'a'"),
         ("a", [("j", "a", "a")], r"joint 'j' connects link 'a' to itself: a loop"),
-        ("abc", [("j", "a", "b"), ("k", "a", "c")], r"leaves \['b', 'c'\]; say which carries the tip"),
     ],
 )
 def test_links_that_form_no_tree_are_refused(links: str, edges: list[tuple[str, str, str]], message: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Literal, cast
 
 import casadi as ca
@@ -11,7 +13,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from models import Joint, Link, Robot, link_frames
+from models import (
+    Joint,
+    Link,
+    Mimic,
+    Robot,
+    inverse_dynamics,
+    link_frames,
+    mass_matrix,
+    momentum_matrix,
+    robot_inertia,
+    tip_pose,
+)
 from models.robot.parts import Kind
 
 Array = NDArray[np.float64]
@@ -36,8 +49,10 @@ def random_inertia(rng: np.random.Generator, mass: float) -> Array:
     return inertia
 
 
-def random_robot(rng: np.random.Generator, size: int, base: Base = "spatial") -> Robot:
+def random_robot(rng: np.random.Generator, size: int, base: Base = "spatial", followers: bool = False) -> Robot:
     """Tree of 1 + `size` links with branches and all kinds of joints, of which at least one moves.
+
+    With `followers` about half of the moving joints but one follow another, in chains too.
 
     With a planar base all axes are along z of the base, up to sign, and all slides are in its plane; the
     joint frames may be turned about z or upside down and shifted along z.
@@ -64,7 +79,71 @@ def random_robot(rng: np.random.Generator, size: int, base: Base = "spatial") ->
         joints.append(Joint(f"joint{i}", kind, parent, f"link{i}", rng.normal(scale=0.5, size=3), turn, axis))
     tip = links[int(rng.integers(1, size + 1))].name
     turn = Rotation.from_euler("z", 0.4).as_matrix() if base == "planar" else random_rotation(rng)
-    return Robot(tuple(links), tuple(joints), tip, rng.normal(scale=0.3, size=3), turn)
+    place = rng.normal(scale=0.3, size=3)
+    return Robot(tuple(links), tuple(tied(rng, joints) if followers else joints), tip, place, turn)
+
+
+def tied(rng: np.random.Generator, joints: list[Joint]) -> list[Joint]:
+    """The joints, some of which now follow another, that may come after them or follow a third."""
+    order = [str(name) for name in rng.permutation([joint.name for joint in joints if joint.moves])]
+    ties = {}
+    for i, name in enumerate(order[1:]):
+        if rng.random() < 0.5:
+            ratio = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
+            ties[name] = Mimic(order[int(rng.integers(i + 1))], ratio, float(rng.choice([0.0, rng.normal()])))
+    return [replace(joint, mimic=ties.get(joint.name)) for joint in joints]
+
+
+def joint_positions(robot: Robot, q: Any) -> dict[str, float]:
+    """Where all joints that move stand, followers included, by following each tie from joint to joint."""
+    known = dict(zip(robot.joint_names, map(float, q), strict=True))
+    waiting = [joint for joint in robot.joints if joint.mimic is not None]
+    while waiting:
+        joint = waiting.pop(0)
+        if (tie := joint.mimic) is not None and tie.joint in known:
+            known[joint.name] = tie.multiplier * known[tie.joint] + tie.offset
+        else:
+            waiting.append(joint)
+    return known
+
+
+def ties(robot: Robot) -> tuple[Array, Array]:
+    """A and b of q_free = A q + b, by moving one entry of the joint vector at a time; see untied."""
+    names = untied(robot).joint_names
+    at = [np.array([joint_positions(robot, q)[name] for name in names]) for q in np.eye(robot.dof)]
+    b = np.array([joint_positions(robot, np.zeros(robot.dof))[name] for name in names])
+    return np.array(at).reshape(robot.dof, len(b)).T - b[:, None], b
+
+
+def untied(robot: Robot) -> Robot:
+    """The same joints, each on its own."""
+    return replace(robot, joints=tuple(replace(joint, mimic=None) for joint in robot.joints))
+
+
+@lru_cache(maxsize=2)
+def everything(robot: Robot) -> Any:
+    """Frames of the links, all inertia and the torques of a motion, as a function of q, q', q''."""
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    placed = link_frames(robot, q)
+    frames = ca.vertcat(*(ca.horzcat(*placed[link.name]) for link in robot.links))
+    inertia = [robot_inertia(robot, q), momentum_matrix(robot, q), mass_matrix(robot, q)]
+    outputs = [frames, *inertia, inverse_dynamics(robot, q, qd, qdd)]
+    return ca.Function("everything", [q, qd, qdd], [ca.densify(output) for output in outputs])
+
+
+def assert_same_robot(robot: Robot, other: Robot, rng: np.random.Generator) -> None:
+    """Same joint vector, same limits, and the same functions to 1e-12 of their greatest entry."""
+    assert other.joint_names == robot.joint_names
+    for limit in ("lower", "upper", "velocity", "effort"):
+        np.testing.assert_array_equal(getattr(other, limit), getattr(robot, limit))
+    motion = rng.normal(size=(3, robot.dof))
+    pairs = zip(everything(robot)(*motion), everything(other)(*motion), strict=True)
+    for expected, found in ((numeric(one), numeric(two)) for one, two in pairs):
+        known = found[: len(expected)]  # the frame of a tip's own link may have come after the others
+        np.testing.assert_allclose(known, expected, rtol=0, atol=1e-12 * np.abs(expected).max(initial=1e-300))
+    if robot.tip is not None:
+        tips = [np.c_[tuple(map(numeric, tip_pose(each, motion[0])))] for each in (robot, other)]
+        np.testing.assert_allclose(tips[1], tips[0], rtol=0, atol=1e-12 * np.abs(tips[0]).max())
 
 
 def seven_joint_arm() -> Robot:

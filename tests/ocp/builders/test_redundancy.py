@@ -24,7 +24,7 @@ def paper_problem(**changes: Any) -> Problem:
     return minimum_velocity_problem(paper_example(), (-1.0, -1.0), (3, 4), PAPER_START, 5.0, **changes)
 
 
-def slides(**limits: float) -> FixedBase:
+def slides(**limits: Any) -> FixedBase:
     """Two slides along x, one on the other: x1' + x2' = v, whose least-velocity split is v / 2 each."""
     first = Joint("first", "prismatic", "rail", "carriage", axis=(1, 0, 0), **limits)
     second = Joint("second", "prismatic", "carriage", "tool", axis=(1, 0, 0))

@@ -218,7 +218,7 @@ def test_a_turn_on_half_the_least_radius_lacks_as_much_again_and_is_found_in_few
     method: Any, turn: float, unit: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The length is just that of the arc, so that nothing else leads there; Newton's steps need exact derivatives."""
-    monkeypatch.setitem(elastic.IPOPT, "max_iter", 18)
+    monkeypatch.setitem(elastic.ELASTIC_IPOPT, "max_iter", 18)
     problem = Problem("turn")
     x = problem.state("x", initial=0.0, terminal=math.sin(turn) / 2)
     y = problem.state("y", initial=0.0, terminal=(1 - math.cos(turn)) / 2)

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 
 from models import ModelError
-from models.machines.machine import jacobian_manipulability
 from models.machines.standing import Standing
 from models.papers import STANDING_STARTS
-from models.robot.indices import joint_limit_index
+from models.robot.indices import jacobian_manipulability, joint_limit_index
 from models.robot.motion import momentum
 from ocp.errors import ProblemError
 from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser, resolve_accelerations

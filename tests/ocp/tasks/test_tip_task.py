@@ -32,6 +32,23 @@ MOMENTUM = (0.5, -0.3, 0.4, 1.0, -2.0, 1.5)
 TWIST = np.array([0.03, -0.02, 0.04, 0.02, -0.04, 0.03])
 
 
+def test_tasks_that_name_links_need_no_tip() -> None:
+    """The first link's frame is the tip of what is planned; a task of the tip itself is refused."""
+    arm = planar_chain([1.0, 1.0, 1.0], [1.0] * 3)
+    branch = replace(arm.joints[-1], parent="link1")
+    fork = FixedBase(replace(arm, joints=(*arm.joints[:-1], branch), tip=None, tip_translation=(0.0, 0.0, 0.0)))
+    end = (1.0, 0.0, 0.0)
+    task = TipTask(rows=(3, 4), velocity=(0.1, 0.2), link="link3", point=end)
+    told, found = (
+        resolve(machine, start_joints=[0.3, 0.5, -0.7], horizon=1.0, task=task)
+        for machine in (with_tip(fork, "link3", end), fork)
+    )
+    np.testing.assert_array_equal(found.joints, told.joints)
+    np.testing.assert_array_equal(found.tip_in_world, told.tip_in_world)
+    with pytest.raises(ProblemError, match=r"no tip.*leaves \['link2', 'link3'\]"):
+        bind(fork, TipTask(rows=(3, 4), velocity=(0.1, 0.2)))
+
+
 def twists_of(machine: Machine, local: Any, link: str) -> Array:
     """Of a link's frame along a motion, by the machine itself. Shape (M, 6)."""
     moved = with_tip(machine, link)
