@@ -27,9 +27,9 @@ __all__ = ["Elbow", "Scara"]
 
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
-JOINT_SLACK = 1e-9
+LIMIT_SLACK = 1e-9
 """Joint limits are exceeded beyond this, rad or m: rounding is not."""
-REACH_ROUNDING = 1e-12
+REACH_SLACK = 1e-12
 """Reaches beyond the boundary by no more than this, relative, are on it."""
 
 
@@ -141,13 +141,13 @@ class Scara:
             joint: Index.
             least, most: The range, rad or m.
         """
-        low, high = float(self.lower[joint]), float(self.upper[joint])
+        low, high = float(self.lower[joint]) - LIMIT_SLACK, float(self.upper[joint]) + LIMIT_SLACK
         turn = 0.0
-        if joint != QUILL and least < low - JOINT_SLACK:
-            turn = FULL_TURN * float(np.ceil((low - JOINT_SLACK - least) / FULL_TURN))
-        elif joint != QUILL and most > high + JOINT_SLACK:
-            turn = -FULL_TURN * float(np.ceil((most - high - JOINT_SLACK) / FULL_TURN))
-        return turn if low - JOINT_SLACK <= least + turn and most + turn <= high + JOINT_SLACK else None
+        if joint != QUILL and least < low:
+            turn = FULL_TURN * float(np.ceil((low - least) / FULL_TURN))
+        elif joint != QUILL and most > high:
+            turn = -FULL_TURN * float(np.ceil((most - high) / FULL_TURN))
+        return turn if low <= least + turn and most + turn <= high else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
         """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).
@@ -185,7 +185,7 @@ class Scara:
 
     def check_reach(self, radius: float, what: str) -> None:
         """ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
-        if not self.inner * (1 - REACH_ROUNDING) <= radius <= self.outer * (1 + REACH_ROUNDING):
+        if not self.inner * (1 - REACH_SLACK) <= radius <= self.outer * (1 + REACH_SLACK):
             message = (
                 f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
                 f"{self.inner:g} to {self.outer:g} m"

@@ -19,11 +19,14 @@ __all__ = ["JointsAlong", "ScaraPath", "scara_along"]
 
 DEFAULT_CLEARANCE = 1e-3
 """m that the path keeps from both ends of the reach unless told otherwise."""
-LARGEST_TILT = 1e-9  # of the entries x and y of a quaternion
-LARGEST_STEP = 0.3
+LARGEST_TILT = 1e-9
+"""Of the tool, as a component of its quaternion."""
+TABLE_STEP = 0.3
 """Largest change (rad) of an angle between two entries of the table that tells its turn."""
-MOST_REFINEMENTS = 40
-ANGLES = (0, 1, 3)  # joints that turn
+HALVINGS = 40
+"""Of an interval of that table, at most."""
+ANGLES = [0, 1, 3]
+"""The joints that turn."""
 
 
 class JointsAlong(NamedTuple):
@@ -84,39 +87,34 @@ def scara_along(
     rates = scara.inverse_rates(elbow)
     s = path.dense(8, 16)
     turn = path.turn(s)
-    tilt = np.abs(turn.quaternion[:, 1:3]).max()
-    if tilt > LARGEST_TILT:
-        at = s[int(np.abs(turn.quaternion[:, 1:3]).max(axis=1).argmax())]
+    tilt = np.abs(turn.quaternion[:, 1:3]).max(axis=1)
+    if tilt.max() > LARGEST_TILT:
+        at = s[int(tilt.argmax())]
         message = f"scara: the path tilts its tool at {at:g} m, a SCARA turns it about the vertical only"
-        raise ModelError(message, name="path", value=float(tilt), limit=LARGEST_TILT)
+        raise ModelError(message, name="path", value=float(tilt.max()), limit=LARGEST_TILT)
 
     def raw(places: Array) -> Array:
         return np.array(rates.map(len(places))(*_poses(path, places))[0]).T
 
     q = raw(s)
-    for _ in range(MOST_REFINEMENTS):
-        change = np.diff(q, axis=0)
-        change[:, ANGLES] = _wrapped(change[:, ANGLES])
-        wide = np.flatnonzero((np.abs(change[:, ANGLES]) > LARGEST_STEP).any(axis=1))
+    for _ in range(HALVINGS):
+        change = np.diff(q[:, ANGLES], axis=0)
+        wide = np.flatnonzero((np.abs((change + np.pi) % FULL_TURN - np.pi) > TABLE_STEP).any(axis=1))
         if not wide.size:
             break
         middle = (s[wide] + s[wide + 1]) / 2
         s, q = np.insert(s, wide + 1, middle), np.insert(q, wide + 1, raw(middle), axis=0)
-    for joint in ANGLES:
-        q[:, joint] = np.unwrap(q[:, joint])
+    q[:, ANGLES] = np.unwrap(q[:, ANGLES], axis=0)
     along = ScaraPath(scara, path, elbow, rates, (s, q), np.zeros(4))
     return replace(along, turns=_turns(along))
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
+    """(x, y, z, yaw) at distances (M,) and three derivatives by the distance. Shape (4, M) each."""
     place, turn = path.at(s), path.turn(s)
     yaw = 2 * np.arctan2(turn.quaternion[:, 3], turn.quaternion[:, 0])
     angular = (yaw, turn.rate[:, 2], turn.acceleration[:, 2], turn.jerk[:, 2])
     return [ca.DM(np.column_stack([linear, angle]).T) for linear, angle in zip(place, angular, strict=True)]
-
-
-def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % FULL_TURN - np.pi)
 
 
 def _continuous(q: Array, s: Array, table_s: Array, table_q: Array) -> Array:
@@ -130,8 +128,7 @@ def _continuous(q: Array, s: Array, table_s: Array, table_q: Array) -> Array:
 def _turns(along: ScaraPath) -> Array:
     """Whole turns to add to the joints so that they keep their limits. Shape (4,)."""
     turns, scara, (s, q) = np.zeros(4), along.scara, along.table
-    for joint, name in enumerate(scara.names):
-        low, high = float(scara.lower[joint]), float(scara.upper[joint])
+    for joint, (name, low, high) in enumerate(zip(scara.names, scara.lower, scara.upper, strict=True)):
         if np.isneginf(low) and np.isposinf(high):
             continue
 
@@ -153,6 +150,7 @@ def _turns(along: ScaraPath) -> Array:
 
 
 def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
+    """Refuse a path beyond the reach, or too near to its ends."""
     if checked_number(clearance, "scara", "clearance") < 0:
         raise ModelError(f"scara: clearance {clearance!r} m is negative", name="clearance", value=clearance, limit=0.0)
     s = path.dense(8, 32)

@@ -1,16 +1,17 @@
 """Redundancy resolved over the whole motion: the least joint velocity that does a task of the tip.
 
 Problem (27) of the free-floating paper (Kim, Kim 2011), for any machine of `models`, on a fixed or a floating
-base, and any task of `tip_task`: poses, free tool axes, several arms, a base held still.
-
-Redundancy resolved over the whole motion, solved and audited: a plan that holds, or a reason why there is none.
+base, and any task of `tip_task`: poses, free tool axes, several arms, a base held still. Declared by
+`minimum_velocity_problem`; solved and audited by `plan_minimum_velocity`: a plan that holds, or a reason why there is
+none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Literal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
@@ -20,9 +21,8 @@ from ocp.audit.audit import Audit
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError
-from ocp.local.inverse_kinematics import inverse_kinematics
+from ocp.local.inverse_kinematics import check_reach, inverse_kinematics
 from ocp.local.rates import LocalSolution, least_rates, resolve
-from ocp.local.reach import check_reach, leaves_limits
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -33,8 +33,23 @@ from ocp.tasks.tip_task import TipTask, one_of
 
 __all__ = ["minimum_velocity_problem", "plan_minimum_velocity"]
 
+Form: TypeAlias = Literal["rates", "null_space"]
+
 GUESS_TOLERANCE = 1e-8
+"""Of the integration of the local motion that serves as the guess."""
 LARGEST_DAMPING = 1.0
+"""Of the guess: the local motion is not damped further where it stops early."""
+LOCAL_SAMPLES = 51
+"""Of the pseudo-inverse motion that hints at what is out of reach."""
+IPOPT = {"max_iter": 150}
+MESHES = 3
+"""Of each guess, each twice as fine as the one before."""
+LARGEST_STRAY = 1e-6
+"""Way, m and rad, that the re-integrated tip may stray from its task before a finer mesh is tried."""
+LARGEST_CLOSURE = 1e-6
+"""Way, m and rad, that a cyclic task may give so that the joints close."""
+DEARER = 1e-6
+"""Share by which a plan may cost more than the pseudo-inverse without another guess being tried."""
 
 
 def minimum_velocity_problem(
@@ -49,7 +64,7 @@ def minimum_velocity_problem(
     free_start: bool = False,
     cyclic: bool = False,
     weights: Any = None,
-    formulation: Literal["rates", "null_space"] = "rates",
+    formulation: Form = "rates",
     limits: bool = True,
     guess_damping: float = 0.005,
     symbols: Any = ca.SX,
@@ -69,15 +84,9 @@ def minimum_velocity_problem(
     What a machine with momentum does at rest (its drift), and the feedback of a pose task, are part of v.
 
     Args:
-        machine: A FixedBase, a FreeFloating, or anything else that is a Machine.
-        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a function that
-            takes `problem.time` (s) and returns a casadi vector or a list of expressions.
-        rows: Which rows of the tip's twist the task fixes: angular 0..2, linear 3..5, world axes.
+        machine, tip_velocity, rows, horizon, task, start_base: As of `ocp.local.rates.resolve`.
         start_joints: Shape (joint_size,), rad or m. A guess where the start is free; then inverse kinematics finds one
             if None.
-        horizon: Final time, s.
-        task: Instead of tip_velocity and rows: a TipTask, or several that are done at once.
-        start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
         free_start: Whether the joints start wherever the tip is where the task begins (path of poses), or where it is
             at start_joints (velocities): the start condition "start pose".
         cyclic: Whether the joints end where they started, after a closed task. What of this follows from the task is
@@ -103,7 +112,7 @@ def minimum_velocity_problem(
             task that is not closed; a horizon or a damping that is not positive; an unknown formulation.
         Unreachable: No start found where it is free and not given (a ProblemError).
     """
-    if formulation not in ("rates", "null_space"):
+    if formulation not in get_args(Form):
         raise ProblemError(f"unknown formulation {formulation!r}; use 'rates' or 'null_space'")
     if not (np.isfinite(guess_damping) and guess_damping > 0):
         raise ProblemError(f"guess_damping must be positive, not {guess_damping!r}")
@@ -121,22 +130,22 @@ def minimum_velocity_problem(
         )
     if cyclic:
         check_closed(equations, duration)
-    lower, upper, speed = _limits(machine, limits)
-    _check_inside(machine, start, lower, upper)
+    robot, unbounded = machine.robot, np.full(machine.joint_size, np.inf)
+    lower, upper, speed = (robot.lower, robot.upper, robot.velocity) if limits else (-unbounded, unbounded, unbounded)
+    for name, value, low, high in zip(robot.joint_names, start, lower, upper, strict=True):
+        if not low <= value <= high:
+            raise ProblemError(
+                f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}; "
+                "start inside or pass limits=False"
+            )
     local = _local_motion(equations, start, place, duration, heavy, guess_damping)
-
     problem = Problem(f"minimum velocity, {formulation.replace('_', ' ')}", symbols=symbols)
     base: Any = np.zeros(0)
     if machine.base_size:
         base = problem.state("base", initial=place, guess=_guess(local, "base"))
+    ends = {} if free_start else {"initial": start, "terminal": start if cyclic else None}
     joints = problem.state(
-        "joints",
-        machine.joint_size,
-        initial=None if free_start else start,
-        terminal=start if cyclic and not free_start else None,
-        lower=lower,
-        upper=upper,
-        guess=_guess(local, "joints"),
+        "joints", machine.joint_size, **ends, lower=lower, upper=upper, guess=_guess(local, "joints")
     )
     problem.horizon(duration)
     try:
@@ -213,23 +222,6 @@ def _start_conditions(
     problem.start("start pose", ca.vertcat(error, equations.holding(base, joints, place, start)), 0, 0)
 
 
-def _limits(machine: Machine, limits: bool) -> tuple[Array, Array, Array]:
-    robot = machine.robot
-    if limits:
-        return robot.lower, robot.upper, robot.velocity
-    unbounded = np.full(machine.joint_size, np.inf)
-    return -unbounded, unbounded, unbounded
-
-
-def _check_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> None:
-    for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
-        if not low <= value <= high:
-            raise ProblemError(
-                f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}; "
-                "start inside or pass limits=False"
-            )
-
-
 def _guess(local: LocalSolution, what: str) -> Samples:
     times, values = local.t, getattr(local, what)
     if what == "joint_rates" and local.stopped is not None:  # it stands still from there
@@ -237,26 +229,65 @@ def _guess(local: LocalSolution, what: str) -> Samples:
     return Samples(times, values)
 
 
-OPTIONS = {"max_iter": 150}
-"""Of IPOPT."""
-LOCAL = ("tip_velocity", "rows", "task", "start_joints", "horizon", "start_base", "weights")
-LOOKS = 51
-WORSE = 1e-6
-GAP = 1e-6
-"""Largest way, m and rad, that a cyclic task may give so that the joints close."""
-STRAY = 1e-6
-"""Way, m and rad, that the re-integrated tip may stray from its task before a finer mesh is tried."""
-MESHES = 3
-"""Of each guess, each twice as fine as the one before."""
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """What is tried: the problem declared with one damping of its local motion, on a mesh.
+
+    Attributes:
+        guess: The plan on the mesh before; None for the local motion.
+        why: What was wrong with that plan.
+    """
+
+    problem: Problem
+    damping: float
+    mesh: Collocation
+    guess: Solution | None = None
+    why: str = ""
+
+    def __str__(self) -> str:
+        return f"damping {self.damping:g}, {self.mesh.intervals} intervals{self.why and f', from the plan {self.why}'}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """What became of an attempt.
+
+    Attributes:
+        solution: The plan, or the last iterate where there is none.
+        failure: What is wrong with it; None where the plan passes.
+        flaw: What a finer mesh may mend; None where nothing.
+        excess: The audit's worst value over its limit; infinite where there is none.
+    """
+
+    attempt: _Attempt
+    solution: Solution | None
+    failure: str | None = None
+    flaw: str | None = None
+    excess: float = np.inf
+
+    @property
+    def plan(self) -> Solution | None:
+        return None if self.failure else self.solution
 
 
 def plan_minimum_velocity(
     machine: Machine,
+    tip_velocity: Velocity | None = None,
+    rows: Sequence[int] | None = None,
+    start_joints: Any = None,
+    horizon: float | None = None,
     *,
+    task: TipTask | Sequence[TipTask] | None = None,
+    start_base: Any = None,
+    free_start: bool = False,
+    cyclic: bool = False,
+    weights: Any = None,
+    formulation: Form = "rates",
+    limits: bool = True,
+    symbols: Any = ca.SX,
     method: Collocation | None = None,
     dampings: Sequence[float] = (0.005, 0.05, 0.3),
     options: Mapping[str, Any] | None = None,
-    **asked: Any,
 ) -> Solution:
     """Solve `minimum_velocity_problem` and audit the plan; from other guesses and finer meshes where it does not hold.
 
@@ -266,82 +297,106 @@ def plan_minimum_velocity(
     fails is solved again on a mesh twice as fine, and once more where that halved the failure.
 
     Args:
-        machine: As for minimum_velocity_problem.
+        machine, ..., symbols: As of `minimum_velocity_problem`.
         method: Collocation; 50 Radau intervals of degree 4 if None.
-        dampings: Of the guesses, in the order in which they are tried.
-        options: Of IPOPT, besides those above.
-        asked: The other arguments of minimum_velocity_problem: tip_velocity and rows, or task, start_joints, ...
+        dampings: Of the guesses (`guess_damping`), in the order in which they are tried.
+        options: Of IPOPT, besides at most 150 iterations.
 
     Raises:
         SolveError: No guess leads to a plan that passes; says what became of each.
         ProblemError: As minimum_velocity_problem; Unreachable, which is one, where a fixed machine cannot reach what
-            its tasks ask (see ocp.local.reach).
+            its tasks ask (see ocp.local.inverse_kinematics.check_reach).
     """
     if not len(dampings):
         raise ProblemError("dampings are empty: there is no guess to start from")
-    if "guess_damping" in asked:
-        raise ProblemError("give dampings=(...,) instead of guess_damping")
-    how = method or Collocation(intervals=50, degree=4)
-    settings = {**OPTIONS, **(options or {})}
-    local = _local_start(machine, asked)
-    _check_reach(machine, asked, local)
-    target = _comparable_cost(asked, local)
-    passed: list[Solution] = []
-    reasons: list[str] = []
-    last: Solution | None = None
+    tasks = one_of(tip_velocity, rows, task)
+    asked: dict[str, Any] = {"start_joints": start_joints, "horizon": horizon, "task": tasks}
+    asked |= {"start_base": start_base, "weights": weights}
+    target = np.inf  # cost of the pseudo-inverse from the same start, where it answers the same question
+    try:
+        local = resolve(machine, **asked, samples=LOCAL_SAMPLES)
+    except ProblemError:  # the start is singular or not given
+        pass
+    else:
+        outside = (local.joints < machine.robot.lower) | (local.joints > machine.robot.upper)
+        if local.stopped or (limits and outside.any()):  # hints at what is out of reach
+            near = local.joints[:: LOCAL_SAMPLES // 5]
+            check_reach(machine, tasks, local.joints[0], checked_horizon(horizon), limits, near)
+        if not (local.stopped or free_start or cyclic):
+            target = float(local.cost[-1])
+    asked |= {"free_start": free_start, "cyclic": cyclic, "formulation": formulation, "limits": limits}
+    declare = partial(minimum_velocity_problem, machine, **asked, symbols=symbols)
+    mesh, settings = method or Collocation(intervals=50, degree=4), {**IPOPT, **(options or {})}
+    tried: list[_Outcome] = []
+    for attempt in _attempts(declare, mesh, dampings, target, tried):
+        # what conflicts is looked for once: it takes long
+        explain = attempt.damping == dampings[-1] and not any(one.plan for one in tried)
+        tried.append(_outcome(machine, tasks, attempt, settings, explain))
+    standing = {one.attempt.damping: one.plan for one in tried if one.plan}  # of each guess the plan on its finest mesh
+    if not standing:
+        reasons = "\n".join(f"{one.attempt}: {one.failure}" for one in tried)
+        last = next((one.solution for one in reversed(tried) if one.solution), None)
+        raise SolveError(f"no plan of minimum velocity passes its audit:\n{reasons}", last)
+    return min(standing.values(), key=lambda plan: plan.cost)
+
+
+def _attempts(
+    declare: Callable[..., Problem], mesh: Collocation, dampings: Sequence[float], target: float, tried: list[_Outcome]
+) -> Iterator[_Attempt]:
+    """Each guess on meshes refined from the plan before, until a plan stands that is no dearer than the target.
+
+    What became of an attempt must be the last of `tried` when the next one is asked for.
+    """
     for damping in dampings:
-        problem, guess, mesh = minimum_velocity_problem(machine, guess_damping=damping, **asked), None, how
-        found: Solution | None = None
-        before = np.inf
-        for attempt in range(MESHES):
-            name = f"damping {damping:g}, {mesh.intervals} intervals"
-            # what conflicts is looked for once: it takes long
-            final = damping == dampings[-1] and not passed and found is None
-            try:
-                solution = solve(problem, mesh, options=settings, guess=guess, check=final)
-            except SolveError as error:
-                last = error.solution or last
-                reasons.append(f"{name}: {error}")
+        attempt, plan, excess = _Attempt(declare(guess_damping=damping), damping, mesh), None, np.inf
+        for number in range(MESHES):
+            yield attempt
+            outcome = tried[-1]
+            plan = outcome.plan or plan
+            helps = outcome.plan or not number or outcome.excess < excess / 2
+            if not (outcome.flaw and helps):
                 break
-            if not solution.success:
-                if "User_Requested_Stop" in solution.status:
-                    raise SolveError(f"interrupted in the solve with {name}", solution)
-                last = solution
-                reasons.append(f"{name}: ipopt ended with {solution.status.split(':')[0]}")
-                break
-            audit = solution.audit()
-            gap = float(np.abs(solution["closure"]).max()) * solution.horizon if "closure" in solution.states else 0.0
-            if audit.passed and gap <= GAP:
-                found, guess, mesh = solution, solution, replace(mesh, intervals=2 * mesh.intervals, mesh=None)
-                if _stray(machine, asked, audit) <= STRAY:
-                    break
-                continue
-            worst = audit.failures[0] if audit.failures else None
-            why = f"the audit fails, {worst.name} {worst.value:.2g}" if worst else f"the task gives way by {gap:.2g}"
-            reasons.append(f"{name}: {why}")
-            last, guess, mesh = solution, solution, replace(mesh, intervals=2 * mesh.intervals, mesh=None)
-            excess = worst.value / worst.limit if worst and worst.limit else np.inf
-            if attempt and not excess < before / 2:
-                break  # a finer mesh does not help
-            before = excess
-        if found is None:
-            continue
-        passed.append(found)
-        if passed[-1].cost <= target * (1 + WORSE):
-            return passed[-1]
-    if not passed:
-        raise SolveError("no plan of minimum velocity passes its audit:\n" + "\n".join(reasons), last)
-    return min(passed, key=lambda solution: solution.cost)
+            excess = excess if outcome.plan else outcome.excess
+            finer = replace(attempt.mesh, intervals=2 * attempt.mesh.intervals, mesh=None)
+            attempt = replace(attempt, mesh=finer, guess=outcome.solution, why=outcome.flaw)
+        if plan and plan.cost <= target * (1 + DEARER):
+            return
 
 
-def _stray(machine: Machine, asked: Mapping[str, Any], audit: Audit) -> float:
+def _outcome(
+    machine: Machine, tasks: list[TipTask], attempt: _Attempt, options: Mapping[str, Any], explain: bool
+) -> _Outcome:
+    try:
+        solution = solve(attempt.problem, attempt.mesh, options=options, guess=attempt.guess, check=explain)
+    except SolveError as error:
+        return _Outcome(attempt, error.solution, str(error))
+    if not solution.success:
+        if "User_Requested_Stop" in solution.status:
+            raise SolveError(f"interrupted in the solve with {attempt}", solution)
+        return _Outcome(attempt, solution, f"ipopt ended with {solution.status.split(':')[0]}")
+    audit = solution.audit()
+    if not audit.passed:
+        worst = audit.failures[0]
+        failure, excess = (
+            f"the audit fails, {worst.name} {worst.value:.2g}",
+            worst.value / worst.limit if worst.limit else np.inf,
+        )
+        return _Outcome(attempt, solution, failure, "whose audit fails", excess)
+    gap = float(np.abs(solution["closure"]).max()) * solution.horizon if "closure" in solution.states else 0.0
+    if gap > LARGEST_CLOSURE:
+        return _Outcome(attempt, solution, f"the task gives way by {gap:.2g}", "that gives way")
+    strays = _stray(machine, tasks, audit) > LARGEST_STRAY
+    return _Outcome(attempt, solution, flaw="whose tip strays" if strays else None)
+
+
+def _stray(machine: Machine, tasks: list[TipTask], audit: Audit) -> float:
     """Largest time integral of the task's residual along the re-integrated plan, m and rad.
 
     Of a velocity it is how far the tip ends off its path. The null-space form does its task by itself: 0.
     """
     if "rates" not in audit.controls:
         return 0.0
-    equations = bind(machine, one_of(asked.get("tip_velocity"), asked.get("rows"), asked.get("task")))
+    equations = bind(machine, tasks)
     sizes = (machine.base_size, machine.joint_size, machine.joint_size)
     base, joints, rates, time = [ca.MX.sym("v", size) for size in (*sizes, 1)]
     targets = equations.target_function()(time)
@@ -351,27 +406,3 @@ def _stray(machine: Machine, asked: Mapping[str, Any], audit: Audit) -> float:
     off = np.array(residual.map(len(audit.t))(*inputs)).T
     steps = np.diff(audit.t)[:, None] * (off[1:] + off[:-1]) / 2
     return float(np.abs(np.cumsum(steps, axis=0)).max())
-
-
-def _local_start(machine: Machine, asked: Mapping[str, Any]) -> LocalSolution | None:
-    """The pseudo-inverse from the same start; None where the start is singular or not given."""
-    try:
-        return resolve(machine, **{name: asked[name] for name in LOCAL if name in asked}, samples=LOOKS)
-    except ProblemError:
-        return None
-
-
-def _comparable_cost(asked: Mapping[str, Any], local: LocalSolution | None) -> float:
-    """Cost of the pseudo-inverse where it answers the same question and reaches the end; else infinite."""
-    if local is None or local.stopped or asked.get("free_start") or asked.get("cyclic"):
-        return np.inf
-    return float(local.cost[-1])
-
-
-def _check_reach(machine: Machine, asked: Mapping[str, Any], local: LocalSolution | None) -> None:
-    """Raise Unreachable where the task is out of reach; looked for only where the local motion hints at it."""
-    limits = asked.get("limits", True)
-    if local is None or (local.stopped is None and not (limits and leaves_limits(machine, local))):
-        return
-    tasks = one_of(asked.get("tip_velocity"), asked.get("rows"), asked.get("task"))
-    check_reach(machine, tasks, local.joints[0], float(asked["horizon"]), limits, local.joints[:: LOOKS // 5])

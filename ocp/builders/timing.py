@@ -37,17 +37,17 @@ from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
 from ocp.schedule.limits import JointPath, LineLimits, PathLike
 from ocp.schedule.planner import Schedule
-from ocp.schedule.profile import Array, SpeedProfile
+from ocp.schedule.profile import Array, SpeedProfile, advanced
 from ocp.solution import Solution
 
 __all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "plan_minimum_time"]
 
-SPLIT = 2e-4
-"""Intervals in which a limit is passed by more than this share are cut, into up to `PARTS`."""
-DEFECT = 1e-6
+CUT_DEMAND = 2e-4
+"""Intervals in which a limit is passed by more than this share are cut, into up to `MOST_PARTS`."""
+CUT_DEFECT = 1e-6
 """And those whose states do not follow from their jerk to this share, of the distance and of the top speed."""
-PARTS = 8
-OPTIONS = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
+MOST_PARTS = 8
+IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +84,16 @@ class TimingProblem:
         curve = solution.control_interpolant
         if curve.values.shape[1] != 1:
             raise ProblemError("the jerk of this solution is not constant in its intervals; solve with control='held'")
-        breaks = np.asarray(curve.breaks)
-        states = solution.state_interpolant(breaks) * np.array(self.units[:2])
+        breaks, begin, horizon = np.asarray(curve.breaks), self.span[0], self.span[1] - self.span[0]
+        v, a = (solution.state_interpolant(breaks) * np.array(self.units[:2])).T
         jerk = curve.values[:, 0, 0] * self.units[2]
         points, weights = np.polynomial.legendre.leggauss(8)
-        inside = breaks[:-1, None] + np.diff(breaks)[:, None] * (points + 1) / 2
-        horizon = self.span[1] - self.span[0]
-        speed = solution.state_interpolant(inside.ravel())[:, 0].reshape(inside.shape) * self.units[0]
-        pace = self.reference.at(self.span[0] + horizon * inside.ravel()).speed.reshape(inside.shape) / speed
+        inside = (breaks[:-1, None] + np.diff(breaks)[:, None] * (points + 1) / 2).ravel()
+        speed = solution.state_interpolant(inside)[:, 0] * self.units[0]
+        pace = (self.reference.at(begin + horizon * inside).speed / speed).reshape(-1, len(points))
         durations = horizon * np.diff(breaks) * (pace @ weights) / 2
+        s = self.reference.at(begin + horizon * breaks).distance
         first, last = self.ends
-        theta = self.span[0] + horizon * breaks
-        s = self.reference.at(theta).distance
-        v, a = states.T
         ramps = 3 * first / v[0], 3 * last / v[-1]
         return SpeedProfile(
             np.concatenate([[0.0], np.cumsum([ramps[0], *durations, ramps[1]])]),
@@ -162,7 +159,7 @@ def plan_minimum_time(
     timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
-        solution = solve(timing.problem, timing.method, guess=solution, options={**OPTIONS, **(options or {})})
+        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **(options or {})})
         profile = timing.profile(solution)
         demand = demand_of_pieces(path, limits, joints, profile)
         parts = _parts(profile, demand)
@@ -229,6 +226,7 @@ def _declared(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
+    """The problem over a span of the reference's time, in units; `along`: reference speed and path_columns of theta."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     top, most, sharp = units
     asked = np.asarray(path.by_piece(limits.speed))
@@ -253,21 +251,17 @@ def _declared(
         problem.path(name, rows, lower=-1, upper=1)
 
     first, last = _ends(reference, span)
-    at_start = problem.at_start(speed) * top
-    whole = reference.duration
-    for where, sign, distance, ends, theta in (
-        ("start", 1.0, first, problem.start, 0.0),
-        ("end", -1.0, last, problem.end, whole),
-    ):
+    starts, stops = ("start", 1.0, first, problem.start), ("end", -1.0, last, problem.end)
+    for (where, sign, distance, ends), rest, bound in ((starts, 0.0, span[0]), (stops, reference.duration, span[1])):
         ends(f"{where} at rest", (sign * a - 2 * v**2 / (3 * distance)) / most, 0, 0)
         jerk = sign * a * v / (3 * distance)
         # the jerk, and with it the joints', at rest and where the problem begins
         rows = [jerk / limits.jerk]
         if joints is not None:
-            for at, v_, a_ in ((theta, 0.0, 0.0), (span[0] if sign > 0 else span[1], v, a)):
-                rows += [_demands(limits, joints, ca.DM(along(at)), v_, a_, jerk).get("joint jerk", ca.MX(0, 1))]
+            for theta, v_, a_ in ((rest, 0.0, 0.0), (bound, v, a)):
+                rows += [_demands(limits, joints, ca.DM(along(theta)), v_, a_, jerk).get("joint jerk", ca.MX(0, 1))]
         ends(f"{where} jerk", ca.vertcat(*rows), -1, 1)
-    problem.minimize(running=pace, terminal=3 * first / at_start + 3 * last / v)
+    problem.minimize(running=pace, terminal=3 * first / (problem.at_start(speed) * top) + 3 * last / v)
     return problem
 
 
@@ -295,14 +289,15 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 def _parts(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
     """Into how many each interval of the problem is to be cut; the error falls with the square of their width."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
-    covered = t * (v[:-1] + t * (a[:-1] / 2 + t * j / 6)) / np.diff(profile.distance) - 1
-    gained = (v[:-1] + t * (a[:-1] + t * j / 2) - v[1:]) / v.max()
-    error = np.maximum((demand - 1) / SPLIT, np.maximum(np.abs(covered), np.abs(gained)) / DEFECT)[1:-1]
+    way, speed, _ = advanced(v[:-1], a[:-1], j, t)
+    covered, gained = way / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
+    error = np.maximum((demand - 1) / CUT_DEMAND, np.maximum(np.abs(covered), np.abs(gained)) / CUT_DEFECT)[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
-    return np.where(error > 1, np.minimum(parts, PARTS), 1)
+    return np.where(error > 1, np.minimum(parts, MOST_PARTS), 1)
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
+    """Distances (m) before and after a span of the reference's time."""
     # the reference's jerk is constant there; from the cube, which keeps its digits near the end
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

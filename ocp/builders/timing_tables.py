@@ -1,9 +1,9 @@
-"""What a path asks of speed, as a smooth casadi function of a reference time: polynomials between its corners.
+"""What the minimum time along a path is declared with: a reference motion, the mesh over it, and tables of the path.
 
-Everything is sampled between the places where a derivative of the path jumps, never across one, and cells are halved
-until their polynomials agree with the path to `ACCURACY`.
-
-The motion whose time is the path parameter of ocp.builders.timing, and the mesh over it.
+The time of the reference motion is the path parameter of ocp.builders.timing. What the path asks of speed becomes a
+smooth casadi function of it, polynomials between the path's corners: everything is sampled between the places where a
+derivative of the path jumps, never across one, and cells are halved until their polynomials agree with the path to
+`TABLE_ACCURACY`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ocp.schedule.limits import (
     rates_along,
 )
 from ocp.schedule.planner import schedule
-from ocp.schedule.profile import Array, Motion, SpeedProfile
+from ocp.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
 
 __all__ = [
     "Columns",
@@ -47,13 +47,18 @@ Columns = Callable[[Array], Array]
 """Times (M,) to values (M, m)."""
 
 DEGREE = 7
-ACCURACY = 1e-8
+"""Of the polynomials of a table."""
+TABLE_ACCURACY = 1e-8
 """Largest error of a column, relative to its largest value."""
-SMALLEST = 1e-9
+SMALLEST_CELL = 1e-9
 """Cells below this share of the whole are not halved further."""
-ROUNDS = 40
-INSIDE = 40
+HALVINGS = 40
+PIECE_POINTS = 40
 """Points of a piece at which demands are looked at: ten times those of the collocation and the node."""
+BESIDE_JUMP = 1e-6
+"""Nodes stand this far before and after a place where the path's derivatives jump, over the whole time."""
+ONE_NODE = 1e-7
+"""Nodes closer than this over the whole time count as one."""
 
 
 def table(columns: Columns, breaks: Array) -> Any:
@@ -67,7 +72,7 @@ def table(columns: Columns, breaks: Array) -> Any:
     start, width = breaks[:-1], np.diff(breaks)
     done: list[tuple[Array, Array]] = []
     scale: Array | None = None
-    for number in range(ROUNDS):
+    for number in range(HALVINGS):
         if not start.size:
             break
         places = np.concatenate([nodes, between])
@@ -76,8 +81,8 @@ def table(columns: Columns, breaks: Array) -> Any:
             scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
         coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
         error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
-        fine = ((error <= ACCURACY * scale).all(axis=(1, 2))) | (width < SMALLEST * (breaks[-1] - breaks[0]))
-        fine |= number == ROUNDS - 1
+        fine = ((error <= TABLE_ACCURACY * scale).all(axis=(1, 2))) | (width < SMALLEST_CELL * (breaks[-1] - breaks[0]))
+        fine |= number == HALVINGS - 1
         done.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2
         start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
@@ -97,9 +102,7 @@ def table(columns: Columns, breaks: Array) -> Any:
 
 def asked_speed(path: PathLike, limits: LineLimits, s: Array) -> Array:
     """Asked line speed at distances (M,)."""
-    of_pieces = path.by_piece(limits.speed)
-    piece = np.clip(np.searchsorted(path.bounds, s, side="right") - 1, 0, len(of_pieces) - 1)
-    return np.asarray(of_pieces[piece])
+    return np.asarray(path.by_piece(limits.speed)[piece_of(path.bounds, s)])
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
@@ -118,7 +121,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
     return np.column_stack([*found, rates.first, rates.second, rates.third])
 
 
-def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: Motion) -> Array:
+def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
     """The largest of speed, acceleration, jerk, centripetal acceleration and joint demands over its limit. Shape (M,).
 
     Values of the path's derivatives where they jump are those after the jump.
@@ -127,12 +130,8 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
     rates = joints.at(s) if joints is not None and limits.joints is not None else None
     curvature = np.asarray(path.curvature(s)) if np.isfinite(limits.centripetal) else np.zeros(len(s))
     steady, power = line_demands(limits, curvature, rates)
-    rows = [
-        motion.speed / asked_speed(path, limits, s),
-        np.abs(motion.acceleration) / limits.acceleration,
-        np.abs(motion.jerk) / limits.jerk,
-        steady[0] * motion.speed**2,
-    ]
+    rows = [motion.speed / asked_speed(path, limits, s), steady[0] * motion.speed**2]
+    rows += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
     if rates is not None:
         velocities = steady[1:][power[1:] == 1]
         rows += [*(velocities * motion.speed), *joint_demands(limits, rates, motion)[0]]
@@ -141,24 +140,17 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 def demand_of_pieces(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
     """Largest demand inside each piece of a profile, from either side where the path jumps. Shape (K,)."""
-    count = INSIDE
-    inside = (np.arange(count) + 0.5) / count
+    inside = (np.arange(PIECE_POINTS) + 0.5) / PIECE_POINTS
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     distance = np.clip(motion.distance, 0.0, path.length)
     found = largest_demand(path, limits, joints, motion._replace(distance=distance))
-    return np.asarray(found.reshape(-1, count).max(axis=1))
+    return np.asarray(found.reshape(-1, PIECE_POINTS).max(axis=1))
 
 
 def _bernstein(x: Array) -> Array:
-    # values of the DEGREE + 1 Bernstein polynomials at x. Shape (len(x), DEGREE + 1)
+    """Values of the DEGREE + 1 Bernstein polynomials at x. Shape (len(x), DEGREE + 1)."""
     return np.stack([comb(DEGREE, i) * x**i * (1 - x) ** (DEGREE - i) for i in range(DEGREE + 1)], axis=1)
-
-
-JUST = 1e-6
-"""Nodes stand this far before and after a place where the path's derivatives jump, over the whole time."""
-CLOSE = 1e-7
-"""Nodes closer than this over the whole time count as one."""
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
@@ -199,13 +191,13 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
         span: s.
     """
     whole, (begin, end) = reference.duration, span
-    just = JUST * whole
+    just = BESIDE_JUMP * whole
     joins = joins[(joins > begin + 2 * just) & (joins < end - 2 * just)]
     sides = np.concatenate([joins - just, joins + just])
-    changes = reference.t[(reference.t > begin + CLOSE * whole) & (reference.t < end - CLOSE * whole)]
+    changes = reference.t[(reference.t > begin + ONE_NODE * whole) & (reference.t < end - ONE_NODE * whole)]
     if sides.size:
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * just]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), CLOSE * whole)
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), ONE_NODE * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
     mesh = cut(nodes, parts)
     fractions = (mesh - begin) / (end - begin)

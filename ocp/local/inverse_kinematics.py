@@ -1,4 +1,4 @@
-"""Joint positions for a pose: multi-start inverse kinematics under joint limits.
+"""Joint positions for a pose: multi-start inverse kinematics under joint limits, and where a task leaves the reach.
 
 Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, on bounds by projection: joints at a
 limit that a step would leave are held for that step. All starts share one mapped casadi function.
@@ -7,7 +7,7 @@ limit that a step would leave are held for that step. All starts share one mappe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -16,13 +16,23 @@ import numpy as np
 from models import Machine
 from ocp.errors import ProblemError
 from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.geometry import pose_in_reference
 from ocp.tasks.start import Array, checked_configuration
-from ocp.tasks.tip_task import TipTask
+from ocp.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["Posture", "Unreachable", "inverse_kinematics"]
+__all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics"]
 
-SLIDE = 1.0  # m: spread of the starts of slides without limits
-GROW, SHRINK, LEAST, MOST = 4.0, 0.25, 1e-12, 1e8  # of the damping
+SLIDE_SPREAD = 1.0
+"""m: of the starts of slides without limits."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
+GROWTH, SHRINKAGE = 4.0, 0.25
+"""Of the damping after a step that fails, and one that succeeds."""
+REACH_TIMES = 9
+"""Instants of the horizon at which a task's poses are looked for, the start among them."""
+REACH_TOLERANCE = 1e-4
+"""A pose missed by less, m or rad, is not called out of reach."""
+SIMPSON_STEPS = 400
+"""Over which a velocity is summed up to a position."""
 
 
 @dataclass(frozen=True)
@@ -133,24 +143,67 @@ def inverse_kinematics(
     return _distinct(found, turns, apart)
 
 
+def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: float, limits: bool, near: Any) -> None:
+    """Raise where poses of the tasks are out of reach, judged at a few times by multi-start inverse kinematics.
+
+    Velocities in the world's axes are summed up to positions, orientations from velocities and tasks in other axes are
+    left out. A floating base may come nearer, so that nothing is said of it.
+
+    Args:
+        machine: On a fixed base; else nothing is checked.
+        tasks: All that are done at once.
+        start: Joints at the start. Shape (joint_size,).
+        horizon: s.
+        limits: Whether the robot's position limits hold.
+        near: Joints to search from first. Shape (k, joint_size).
+
+    Raises:
+        Unreachable: Names the time and the nearest miss.
+    """
+    if machine.base_size:
+        return
+    for time in np.linspace(0.0, horizon, REACH_TIMES)[1:]:
+        poses = [pose for task in tasks if (pose := _as_pose(machine, task, start, float(time))) is not None]
+        if not poses:
+            return
+        try:
+            inverse_kinematics(machine, poses, time=float(time), near=near, limits=limits, tolerance=REACH_TOLERANCE)
+        except Unreachable as error:
+            raise Unreachable(f"at {time:.4g} s {error}", error.joints, error.misfit) from error
+
+
+def _as_pose(machine: Machine, task: TipTask, start: Array, time: float) -> TipTask | None:
+    """The pose that a task has come to at a time; None where that depends on the way, or has a gap to close."""
+    if task.is_pose:
+        return task if task.start_gap <= REACH_TOLERANCE else None
+    rows = [row for row in task.chosen if row not in ANGULAR]
+    if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
+        return None
+    equations = bind(machine, task)
+    times = np.linspace(0.0, time, SIMPSON_STEPS + 1)
+    values = np.array(equations.target_function().map(len(times))(times[None, :]))
+    weights = np.ones(SIMPSON_STEPS + 1)
+    weights[1:-1:2], weights[2:-1:2] = 4, 2
+    moved = np.zeros(3)
+    wanted = values[[task.chosen.index(row) for row in rows]]
+    moved[[row - 3 for row in rows]] = wanted @ weights * time / SIMPSON_STEPS / 3
+    first, _ = pose_in_reference(equations.bound[0], ca.DM(0, 1), ca.DM(start))
+    return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(first)).ravel() + moved)
+
+
 def _starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
-    size = machine.joint_size
-    rng = np.random.default_rng(seed)
+    size, rng = machine.joint_size, np.random.default_rng(seed)
     slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
-    span = np.where(slides, SLIDE, np.pi)
+    span = np.where(slides, SLIDE_SPREAD, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
-    random = rng.uniform(low, high, size=(count, size))
-    if near is None:
-        given = np.zeros((0, size))
-    else:
-        given = np.atleast_2d(np.asarray(near, dtype=float))
-        if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
-            raise ProblemError(f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected")
-    both = np.vstack([given, random])
+    given = np.zeros((0, size)) if near is None else np.atleast_2d(np.asarray(near, dtype=float))
+    if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
+        raise ProblemError(f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected")
+    both = np.vstack([given, rng.uniform(low, high, size=(count, size))])
     if not len(both):
         raise ProblemError("starts = 0 and near = None leave no start")
-    return np.clip(both, lower, upper)
+    return np.asarray(np.clip(both, lower, upper))
 
 
 def _residual(equations: TaskEquations, base: Array, targets: Array) -> Any:
@@ -179,9 +232,9 @@ def _gauss_newton(
         return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
 
     residual, jacobian = evaluate(q)
-    cost, damping = (residual**2).sum(axis=1), np.full(count, 1e-2)
+    cost, damping = (residual**2).sum(axis=1), np.full(count, FIRST_DAMPING)
     for _ in range(iterations):
-        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < MOST)
+        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < MOST_DAMPING)
         if not busy.any():
             break
         gradient = np.einsum("kij,ki->kj", jacobian, residual)
@@ -196,7 +249,8 @@ def _gauss_newton(
         better = busy & (new_cost < cost)
         q[better], residual[better], jacobian[better] = trial[better], new_residual[better], new_jacobian[better]
         cost[better] = new_cost[better]
-        damping = np.where(better, np.maximum(SHRINK * damping, LEAST), np.where(busy, GROW * damping, damping))
+        less, more = np.maximum(SHRINKAGE * damping, LEAST_DAMPING), GROWTH * damping
+        damping = np.where(better, less, np.where(busy, more, damping))
     return q, np.abs(residual).max(axis=1)
 
 
@@ -218,11 +272,8 @@ def _unreachable(
     machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
 ) -> Unreachable:
     names = [part.task.link or str(part.tip.robot.tip) for part in equations.bound]
-    at_limit = [
-        name
-        for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True)
-        if value <= low or value >= high
-    ]
+    stopped = np.flatnonzero((joints <= lower) | (joints >= upper))
+    at_limit = [machine.robot.joint_names[k] for k in stopped]
     where = f", with {at_limit} at their limits" if at_limit else ""
     return Unreachable(
         f"no joint positions put {names} where the task wants them: the nearest miss is {misfit:.3g} (m or rad) at "

@@ -23,7 +23,8 @@ from ocp.tasks.tip_task import TipTask, one_of
 
 __all__ = ["LocalSolution", "least_rates", "resolve"]
 
-MAX_STEPS = 20000  # of the integrator between two samples; a smooth motion takes some tens
+INTEGRATOR_STEPS = 20000
+"""Between two samples, at most; a smooth motion takes some tens."""
 
 
 @dataclass(frozen=True)
@@ -198,29 +199,16 @@ class _Model:
 
     def one_interval(self, tolerance: float) -> Callable[..., Any]:
         """From p[0] over p[1] seconds: the same integrator for every interval between samples."""
-        span = type(self.time).sym("span", 2)
-        fraction = type(self.time).sym("fraction")
+        span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         at = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = at(span[0] + fraction * span[1], self.state)
-        problem = {
-            "t": fraction,
-            "x": self.state,
-            "p": span,
-            "ode": span[1] * ode,
-            "quad": span[1] * running,
-        }
+        problem = {"t": fraction, "x": self.state, "p": span, "ode": span[1] * ode, "quad": span[1] * running}
         return self._cvodes(problem, 0.0, np.array([1.0]), tolerance)
 
     @staticmethod
     def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Callable[..., Any]:
-        options = {
-            "abstol": tolerance,
-            "reltol": tolerance,
-            "linear_multistep_method": "adams",
-            "max_num_steps": MAX_STEPS,
-            "disable_internal_warnings": True,
-            "show_eval_warnings": False,
-        }
+        options = {"abstol": tolerance, "reltol": tolerance, "linear_multistep_method": "adams"}
+        options |= {"max_num_steps": INTEGRATOR_STEPS, "disable_internal_warnings": True, "show_eval_warnings": False}
         built: Callable[..., Any] = ca.integrator("motion", "cvodes", problem, start, times.tolist(), options)
         return built
 

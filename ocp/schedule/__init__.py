@@ -2,7 +2,7 @@
 
 from ocp.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike
 from ocp.schedule.planner import Dip, Schedule, schedule
-from ocp.schedule.profile import Motion, SpeedProfile
+from ocp.schedule.profile import LineMotion, SpeedProfile
 from ocp.schedule.ramps import peak_acceleration, ramp_distance, ramp_time
 from ocp.schedule.trajectory import JointTrajectory, joint_motion, joint_trajectory
 
@@ -13,7 +13,7 @@ __all__ = [
     "JointRates",
     "JointTrajectory",
     "LineLimits",
-    "Motion",
+    "LineMotion",
     "PathLike",
     "Schedule",
     "SpeedProfile",

@@ -1,4 +1,8 @@
-"""Where the limits are looked at: a grid along the path, fine where the permitted speed changes."""
+"""The maximum velocity curve of a path: the line speed that its limits permit, on a grid that resolves it.
+
+It leaves line acceleration aside: a steady speed below it keeps the limits of centripetal acceleration and of the
+joints. The grid is fine where the curve changes and near its minima.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +13,24 @@ from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, curvature_along, line_demands, rates_along
-from ocp.schedule.profile import Array
+from ocp.schedule.profile import Array, piece_of
 
 __all__ = ["Grid", "make_grid"]
 
-SAFETY = 2e-4
+KEPT_BACK = 2e-4
 """Share of the permitted speed kept back for what lies between two points of the grid."""
-UNSEEN = 2e-4
+MINIMUM_ERROR = 2e-4
 """Largest relative error of a minimum of the permitted speed, estimated by its second difference."""
-COARSE = 0.1
+LARGEST_CHANGE = 0.1
 """Largest relative change of it between two points; the lower one counts for what lies between."""
-ROUNDS = 12
-SMALLEST = 1e-12
+HALVINGS = 12
+"""Of an interval, at most."""
+SMALLEST_INTERVAL = 1e-12
 """Intervals below this share of the path are not cut further."""
-JUST = 1e-9
+JUST_BEFORE = 1e-9
 """What "just before" means, over the length of the path."""
 PER_CELL, PER_SEGMENT = 8, 64
+"""Points of the first grid."""
 
 
 class Grid(NamedTuple):
@@ -51,55 +57,52 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     Raises:
         ProblemError: A joint limit that no speed can keep, because the path's curvature jumps.
     """
-    asked = path.by_piece(limits.speed)
-    limited = joints is not None and limits.joints is not None
-    if not limited and not np.isfinite(limits.centripetal):
-        s = np.asarray(path.bounds, dtype=float)
-        return Grid(s, np.full(len(s), np.inf), np.zeros(len(s), dtype=np.intp), asked, s[:0])
-    if limited and joints is not None:
-        _check_smooth(path, limits, len(joints.names))
-    s = path.dense(PER_CELL, PER_SEGMENT if limited else 2)
-    s = np.unique(np.concatenate([s, path.bounds]))
-    permitted, cause = _permitted(path, limits, joints if limited else None, s)
-    inner = np.asarray(path.bounds[1:-1], dtype=float)
-    before = inner - np.minimum(JUST * path.length, np.diff(path.bounds)[:-1] / 2)
+    asked, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
+    limited = joints if limits.joints is not None else None
+    if limited is None and not np.isfinite(limits.centripetal):
+        return Grid(bounds, np.full(len(bounds), np.inf), np.zeros(len(bounds), dtype=np.intp), asked, bounds[:0])
+    if limited is not None:
+        _check_smooth(path, limits, len(limited.names))
+    s = np.unique(np.concatenate([path.dense(PER_CELL, PER_SEGMENT if limited is not None else 2), bounds]))
+    permitted, cause = _permitted(path, limits, limited, s)
+    inner = bounds[1:-1]
+    before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(bounds)[:-1] / 2)
     if before.size:
-        left, why = _permitted(path, limits, joints if limited else None, before)
+        left, why = _permitted(path, limits, limited, before)
         at = np.searchsorted(s, inner)
         cause[at] = np.where(left < permitted[at], why, cause[at])
         permitted[at] = np.minimum(left, permitted[at])
-    for _ in range(ROUNDS):
+    for _ in range(HALVINGS):
         cut = np.flatnonzero(_uneven(path, s, permitted, asked))
         if not cut.size:
             break
         middle = (s[cut] + s[cut + 1]) / 2
-        more, why = _permitted(path, limits, joints if limited else None, middle)
+        more, why = _permitted(path, limits, limited, middle)
         s = np.insert(s, cut + 1, middle)
         permitted, cause = np.insert(permitted, cut + 1, more), np.insert(cause, cut + 1, why)
-    return Grid(s, permitted * (1 - SAFETY), cause, _asked(path, s, asked), before)
+    return Grid(s, permitted * (1 - KEPT_BACK), cause, _asked(path, s, asked), before)
 
 
 def _permitted(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array
 ) -> tuple[Array, NDArray[np.intp]]:
+    """Greatest steady speed at distances (M,), and the row of `cause_names` that limits it."""
     curvature = curvature_along(path, s) if np.isfinite(limits.centripetal) else None
     demand, power = line_demands(limits, curvature, None if joints is None else rates_along(joints, s))
     with np.errstate(divide="ignore"):
         speeds = (1 / demand) ** (1 / power[:, None])
-    cause = speeds.argmin(axis=0)
-    permitted = np.take_along_axis(speeds, cause[None], axis=0)[0]
-    return permitted, cause
+    return speeds.min(axis=0), speeds.argmin(axis=0)
 
 
 def _asked(path: PathLike, s: Array, asked: Array) -> Array:
-    piece = np.searchsorted(path.bounds, (s[:-1] + s[1:]) / 2, side="right") - 1
-    return np.asarray(asked[np.clip(piece, 0, len(asked) - 1)])
+    """Asked speed in each interval of a grid, from that of the pieces."""
+    return np.asarray(asked[piece_of(path.bounds, (s[:-1] + s[1:]) / 2)])
 
 
 def _uneven(path: PathLike, s: Array, permitted: Array, asked: Array) -> NDArray[np.bool_]:
-    # only where the permitted speed is near or below the asked one
+    """Which intervals do not resolve the permitted speed, where that is near or below the asked one."""
     low = np.minimum(permitted[:-1], permitted[1:])
-    matters = (low < 1.1 * _asked(path, s, asked)) & (np.diff(s) > SMALLEST * path.length)
+    matters = (low < 1.1 * _asked(path, s, asked)) & (np.diff(s) > SMALLEST_INTERVAL * path.length)
     value = np.log(np.minimum(permitted, 2 * asked.max()))
     step, slope = np.diff(s), np.diff(value) / np.diff(s)
     bend = np.zeros(len(s))
@@ -107,10 +110,11 @@ def _uneven(path: PathLike, s: Array, permitted: Array, asked: Array) -> NDArray
     least = np.zeros(len(s), dtype=bool)
     least[1:-1] = (slope[:-1] <= 0) & (slope[1:] >= 0) & (bend[1:-1] > 0)
     error = np.where(least[:-1] | least[1:], step**2 / 8 * np.maximum(bend[:-1], bend[1:]), 0.0)
-    return np.asarray(matters & ((np.abs(np.diff(value)) > COARSE) | (error > UNSEEN)))
+    return np.asarray(matters & ((np.abs(np.diff(value)) > LARGEST_CHANGE) | (error > MINIMUM_ERROR)))
 
 
 def _check_smooth(path: PathLike, limits: LineLimits, count: int) -> None:
+    """Refuse limits of joint jerk on a path whose curvature jumps."""
     if not np.isfinite(limits.of_joints(count)[2]).any():
         return
     jumps = path.curvature_jumps()

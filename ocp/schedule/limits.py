@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.profile import Array, Motion
+from ocp.schedule.profile import Array, LineMotion
 
 __all__ = [
     "JointLimits",
@@ -174,9 +174,8 @@ def line_demands(
 
     Shape (C, M) and (C,), the rows being those of cause_names: v^p demand <= 1 is the limit of a steady line speed v.
     """
-    count = len(curvature) if curvature is not None else len(rates.first) if rates is not None else 0
-    none = np.zeros((1, count))
-    rows = [none if curvature is None else curvature[None] / limits.centripetal]
+    count = 0 if rates is None else len(rates.first)
+    rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
     powers = [2.0]
     if rates is not None:
         number = rates.first.shape[1]
@@ -187,7 +186,7 @@ def line_demands(
     return np.concatenate(rows), np.array(powers)
 
 
-def joint_demands(limits: LineLimits, rates: JointRates, motion: Motion) -> tuple[Array, Array]:
+def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> tuple[Array, Array]:
     """Joint acceleration and jerk over their limits during a motion, and the part of it that a steady speed has.
 
     q'' v^2 + q' a, and q''' v^3 + 3 q'' v a + q' j. Shape (2 n, M) each.

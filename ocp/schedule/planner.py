@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import ProblemError
 from ocp.schedule.grid import make_grid
-from ocp.schedule.joints import TOLERANCE, Attempt, search
+from ocp.schedule.joints import KEPT, Attempt, search
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names
-from ocp.schedule.profile import Array, Motion, SpeedProfile
+from ocp.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
 
 __all__ = ["Dip", "Schedule", "schedule"]
 
@@ -69,16 +69,16 @@ class Schedule:
         """s."""
         return self.profile.duration
 
-    def at(self, time: ArrayLike) -> Motion:
-        """Motion at times of [0, duration]. Shape (M,), s."""
+    def at(self, time: ArrayLike) -> LineMotion:
+        """LineMotion at times of [0, duration]. Shape (M,), s."""
         return self.profile.at(time)
 
     def time_at(self, distance: ArrayLike) -> Array:
         """Times at which the path has the given distances from its start. Shape (M,), s."""
         return self.profile.at_distance(distance).t
 
-    def sample(self, period: float) -> Motion:
-        """Motion every `period` s from the start; the last sample, at the end, comes as early as the duration says.
+    def sample(self, period: float) -> LineMotion:
+        """LineMotion every `period` s from the start; the last sample, at the end, comes as early as the duration says.
 
         Raises:
             ProblemError: A period that is not positive, or nan.
@@ -113,9 +113,8 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     """
     missing = [name for name in ("length", "bounds", "by_piece", "curvature", "dense") if not hasattr(path, name)]
     if missing:
-        raise ProblemError(
-            f"the path {path!r} has no {missing[0]}; give a SmoothPath, as models.paths.smooth_path makes it"
-        )
+        hint = "give a SmoothPath, as models.paths.smooth_path makes it"
+        raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}")
     if not isinstance(limits, LineLimits):
         raise ProblemError(f"limits {limits!r} must be a LineLimits")
     if limits.joints is not None and joints is None:
@@ -128,50 +127,39 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     dips = _dips(found, limits, cause_names(limited.names if limited is not None else ()))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
-        raise ProblemError(
-            f"the asked speed breaks limits in {len(dips)} place(s); ask for less, larger blends, or "
-            f"strict=False:\n  {listed}"
-        )
+        hint = "ask for less, larger blends, or strict=False"
+        raise ProblemError(f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}")
     return Schedule(path, limits, found.profile, dips, joints)
 
 
 def _dips(state: Attempt, limits: LineLimits, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    grid = state.grid
-    cause = _causes(state, limits)
-    edges = np.flatnonzero(np.diff(cause, prepend=-1, append=-1))
+    grid, cause = state.grid, _causes(state, limits)
     dips = []
-    for first, last in pairwise(edges.tolist()):
+    for first, last in pairwise(np.flatnonzero(np.diff(cause, prepend=-1, append=-1)).tolist()):
         if cause[first] < 0:
             continue
         inside = slice(first, last)
         lowest = first + int((state.speed[inside] / grid.asked[inside]).argmin())
-        dips.append(
-            Dip(
-                float(grid.distance[first]),
-                float(grid.distance[last]),
-                names[int(cause[first])],
-                float(grid.asked[lowest]),
-                float(state.speed[lowest]),
-                float(state.acceleration[inside].min()),
-                float(state.jerk[inside].min()),
-            )
-        )
+        ends = (float(grid.distance[first]), float(grid.distance[last]))
+        speeds = (float(grid.asked[lowest]), float(state.speed[lowest]))
+        ramp = (float(state.acceleration[inside].min()), float(state.jerk[inside].min()))
+        dips.append(Dip(*ends, names[int(cause[first])], *speeds, *ramp))
     return tuple(_joined(dips, state))
 
 
 def _causes(state: Attempt, limits: LineLimits) -> NDArray[np.intp]:
     """Row of cause_names that slows each interval of the grid, -1 where nothing does. Shape (G - 1,)."""
     grid, speed = state.grid, state.speed
-    gentle = state.acceleration < limits.acceleration * (1 - TOLERANCE)
-    gentle |= state.jerk < limits.jerk * (1 - TOLERANCE)
+    gentle = state.acceleration < limits.acceleration * (1 - KEPT)
+    gentle |= state.jerk < limits.jerk * (1 - KEPT)
     cause = np.where(gentle, state.ramp_cause, -1)
-    slow = speed < grid.asked * (1 - TOLERANCE)
+    slow = speed < grid.asked * (1 - KEPT)
     # where one speed holds, the slowest place says why
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed)), [len(speed)]])
     for first, last in pairwise(starts.tolist()):
         if slow[first:last].any():
             lowest = first + int(grid.permitted[first : last + 1].argmin())
-            for_ramp = (state.ramp_cause[first:last] >= 0) & (speed[first] < grid.permitted[lowest] * (1 - TOLERANCE))
+            for_ramp = (state.ramp_cause[first:last] >= 0) & (speed[first] < grid.permitted[lowest] * (1 - KEPT))
             cause[first:last] = np.where(for_ramp, state.ramp_cause[first:last], grid.cause[lowest])
     return cause
 
@@ -181,8 +169,7 @@ def _joined(dips: list[Dip], state: Attempt) -> list[Dip]:
     peaks, grid = state.profile.peaks(), state.grid
     order = np.argsort(peaks.distance)
     places = peaks.distance[order]
-    at = np.clip(np.searchsorted(grid.distance, places, side="right") - 1, 0, len(grid.asked) - 1)
-    back = peaks.speed[order] >= grid.asked[at] * (1 - TOLERANCE)
+    back = peaks.speed[order] >= grid.asked[piece_of(grid.distance, places)] * (1 - KEPT)
     joined: list[Dip] = []
     for dip in dips:
         last = joined[-1] if joined else dip

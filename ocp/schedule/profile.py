@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import ProblemError
 
-__all__ = ["Motion", "SpeedProfile"]
+__all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "piece_of"]
 
 Array = NDArray[np.float64]
-STEPS = 60
+NEWTON_STEPS = 60
 
 
-class Motion(NamedTuple):
-    """Motion along a path at M instants.
+class LineMotion(NamedTuple):
+    """Motion of the line, along a path, at M instants.
 
     Attributes:
         t: Time. Shape (M,), s.
@@ -33,14 +33,33 @@ class Motion(NamedTuple):
     jerk: Array
 
 
-def _row(value: ArrayLike, what: str) -> Array:
+def advanced(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
+    """Way covered in a time under constant jerk, and the speed and acceleration then; numbers, arrays or casadi."""
+    s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
+    return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
+
+
+def piece_of(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
+    """Index of the piece between increasing bounds (K + 1,) that holds each place; at a bound the right or left one.
+
+    What lies beyond the ends counts for the first and the last piece.
+    """
+    return np.asarray(np.clip(np.searchsorted(bounds, places, side=side) - 1, 0, len(np.asarray(bounds)) - 2))
+
+
+def _inside(value: ArrayLike, most: float, what: str, place: str) -> Array:
+    """A row of numbers of [0, most], clipped to that; ProblemError where one lies outside by more than rounding."""
     try:
         array = np.atleast_1d(np.asarray(value, dtype=float))
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{what} {value!r} is not numeric") from error
     if array.ndim != 1:
         raise ProblemError(f"{what} has shape {array.shape}; give one number or a row")
-    return array
+    slack = 1e-9 * most
+    inside = (array >= -slack) & (array <= most + slack)
+    if not inside.all():
+        raise ProblemError(f"{what} {array[~inside][:3].tolist()} {place}")
+    return np.asarray(np.clip(array, 0.0, most))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,44 +82,34 @@ class SpeedProfile:
         """s."""
         return float(self.t[-1])
 
-    def at(self, time: ArrayLike) -> Motion:
+    def at(self, time: ArrayLike) -> LineMotion:
         """Motion at times of [0, duration], shape (M,), s. The jerk at a step is that after it.
 
         Raises:
             ProblemError: nan, or a time outside by more than rounding.
         """
-        t = _row(time, "time")
-        slack = 1e-9 * self.duration
-        if not ((t >= -slack) & (t <= self.duration + slack)).all():
-            wrong = t[~((t >= -slack) & (t <= self.duration + slack))]
-            raise ProblemError(f"time {wrong[:3].tolist()} s is outside the schedule, 0 to {self.duration:g} s")
-        t = np.clip(t, 0.0, self.duration)
-        piece = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.jerk) - 1)
-        motion = self._inside(piece, t - self.t[piece])
+        t = _inside(time, self.duration, "time", f"s is outside the schedule, 0 to {self.duration:g} s")
+        piece = piece_of(self.t, t)
+        motion = self._motion(piece, t - self.t[piece])
         # the end is known, but for rounding the pieces lead to it
         for values, last in zip(motion[:4], (self.t, self.distance, self.speed, self.acceleration), strict=True):
             values[t == self.duration] = last[-1]
         return motion
 
-    def at_distance(self, distance: ArrayLike) -> Motion:
+    def at_distance(self, distance: ArrayLike) -> LineMotion:
         """Motion where the path has the given distances from its start, shape (M,), m; the first time, at a rest.
 
         Raises:
             ProblemError: nan, or a distance off the path by more than rounding.
         """
-        s = _row(distance, "distance")
         length = float(self.distance[-1])
-        slack = 1e-9 * length
-        if not ((s >= -slack) & (s <= length + slack)).all():
-            wrong = s[~((s >= -slack) & (s <= length + slack))]
-            raise ProblemError(f"distance {wrong[:3].tolist()} m is off the path, which is {length:g} m long")
-        s = np.clip(s, 0.0, length)
-        piece = np.clip(np.searchsorted(self.distance, s, side="left") - 1, 0, len(self.jerk) - 1)
+        s = _inside(distance, length, "distance", f"m is off the path, which is {length:g} m long")
+        piece = piece_of(self.distance, s, side="left")
         inside = self._time_inside(piece, s - self.distance[piece])
         # at rest the time is the cube root of a rounding error: the end is known exactly
-        return self._inside(piece, np.where(s == length, np.diff(self.t)[-1], inside))
+        return self._motion(piece, np.where(s == length, np.diff(self.t)[-1], inside))
 
-    def peaks(self) -> Motion:
+    def peaks(self) -> LineMotion:
         """Motion wherever the speed may be largest: at the bounds of the pieces, and where one stops accelerating."""
         with np.errstate(divide="ignore", invalid="ignore"):
             turn = -self.acceleration[:-1] / self.jerk
@@ -119,34 +128,37 @@ class SpeedProfile:
         row = ca.MX(ca.DM(table))[:, piece]
         start, s, v, a, j = ca.vertsplit(row)
         t = inside - start
-        outputs = [s + t * (v + t * (a / 2 + t * j / 6)), v + t * (a + t * j / 2), a + t * j, j]
+        way, speed, acceleration = advanced(v, a, j, t)
+        outputs = [s + way, speed, acceleration, j]
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 
-    def _inside(self, piece: NDArray[np.intp], t: Array) -> Motion:
+    def _motion(self, piece: NDArray[np.intp], t: Array) -> LineMotion:
+        """At times (M,) after the start of pieces (M,)."""
         s, v, a, j = self.distance[piece], self.speed[piece], self.acceleration[piece], self.jerk[piece]
-        speed = np.maximum(v + t * (a + t * j / 2), 0.0)  # no rounding below rest
-        return Motion(self.t[piece] + t, s + t * (v + t * (a / 2 + t * j / 6)), speed, a + t * j, j)
+        way, speed, acceleration = advanced(v, a, j, t)
+        return LineMotion(self.t[piece] + t, s + way, np.maximum(speed, 0.0), acceleration, j)  # no rounding below rest
 
     def _time_inside(self, piece: NDArray[np.intp], distance: Array) -> Array:
-        v, a, j = self.speed[piece], self.acceleration[piece], self.jerk[piece]
-        low, high = np.zeros_like(distance), np.diff(self.t)[piece]
+        """Times (M,) after the start of pieces (M,) at which they have covered distances (M,)."""
+        v, a, j, high = self.speed[piece], self.acceleration[piece], self.jerk[piece], np.diff(self.t)[piece]
         even = (a == 0) & (j == 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = np.where(even, np.minimum(distance / v, high), high)
         todo = np.flatnonzero(~even)
         # Newton inside a bracket, for those that still move: the distance grows with the time
         high = high[todo]
-        whole = high * (v[todo] + high * (a[todo] / 2 + high * j[todo] / 6))
+        whole = advanced(v[todo], a[todo], j[todo], high)[0]
         t[todo] = high * np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0) ** np.where(a[todo] == 0, 0.5, 1)
         low = np.zeros_like(high)
-        for _ in range(STEPS):
+        for _ in range(NEWTON_STEPS):
             if not todo.size:
                 break
-            x, v_, a_, j_ = t[todo], v[todo], a[todo], j[todo]
-            error = x * (v_ + x * (a_ / 2 + x * j_ / 6)) - distance[todo]
+            x = t[todo]
+            covered, speed, _ = advanced(v[todo], a[todo], j[todo], x)
+            error = covered - distance[todo]
             low, high = np.where(error <= 0, x, low), np.where(error >= 0, x, high)
             with np.errstate(divide="ignore", invalid="ignore"):
-                new = x - error / (v_ + x * (a_ + x * j_ / 2))
+                new = x - error / speed
             new = np.where((new >= low) & (new <= high), new, (low + high) / 2)
             t[todo] = new
             moving = np.abs(new - x) > 4e-16 * np.abs(self.duration)

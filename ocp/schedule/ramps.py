@@ -1,6 +1,8 @@
-"""Jerk-limited changes of the line speed: their length, their reach, and the fastest motion between two of them.
+"""Jerk-limited changes of the line speed, and the profile that they make of limits that change along the path.
 
-From limits that change along the path to one line-speed profile.
+A ramp changes the speed without acceleration at both its ends: its time and distance, its inverse (the speed within
+reach), and the fastest motion from one speed to another over a distance. A zone is a stretch of one limit each of
+speed, acceleration and jerk; `plan` finds the speeds at their bounds and joins the fastest motions between them.
 """
 
 from __future__ import annotations
@@ -13,15 +15,33 @@ import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from ocp.errors import ProblemError
-from ocp.schedule.profile import Array, SpeedProfile
+from ocp.schedule.profile import Array, SpeedProfile, advanced
 
 __all__ = ["Memory", "Phases", "Zones", "fastest", "peak_acceleration", "plan", "ramp_distance", "ramp_time", "reach"]
 
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of the parts of constant jerk, in order."""
+Memory = MutableMapping[tuple[float, ...], Phases]
+"""Motions already found, by their limits and ends."""
 
-CLOSED = 1e-9
+END_ERROR = 1e-9
 """Largest error of a motion's end, relative to its length and top speed."""
+REACH_MARGIN = 1e-6
+"""Share of a zone's length kept back when its ends' speeds are chosen, so that a motion surely exists."""
+
+
+class Zones(NamedTuple):
+    """Stretches of a path with limits of their own.
+
+    Attributes:
+        bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
+        speed, acceleration, jerk: Limits in each zone. Shape (Z,).
+    """
+
+    bounds: Array
+    speed: Array
+    acceleration: Array
+    jerk: Array
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
@@ -110,30 +130,28 @@ def fastest(distance: float, first: float, last: float, top: float, acceleration
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
+    """Whether a motion ends at its distance and last speed, and stays between the speeds on the way."""
     s, v, a = 0.0, first, 0.0
-    low, high = min(first, last), top
+    error = END_ERROR * top
     for t, j in phases:
-        s += t * (v + t * (a / 2 + t * j / 6))
-        v += t * (a + t * j / 2)
-        a += t * j
-        if not low - CLOSED * top <= v <= high + CLOSED * top:
+        way, v, a = advanced(v, a, j, t)
+        s += way
+        if not min(first, last) - error <= v <= top + error:
             return False
-    return abs(s - distance) <= CLOSED * distance and abs(v - last) <= CLOSED * top
+    return abs(s - distance) <= END_ERROR * distance and abs(v - last) <= error
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+    """A ramp up to the highest speed that leaves way enough, that speed, and a ramp down."""
+
     def needed(peak: float) -> float:
         return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
 
     low, high = max(first, last), top
-    if needed(high) > distance:
-        for _ in range(200):
-            middle = (low + high) / 2
-            if middle in (low, high):
-                break
-            low, high = (middle, high) if needed(middle) <= distance else (low, middle)
-    else:
+    if needed(high) <= distance:
         low = high
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if needed(middle) <= distance else (low, middle)
     rest = max(distance - needed(low), 0.0)
     return (
         *_ramp(low - first, acceleration, jerk),
@@ -143,6 +161,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
+    """The shortest change of the speed by `change` (m/s)."""
     size, sign = abs(change), 1.0 if change > 0 else -1.0
     if size == 0:
         return ()
@@ -153,26 +172,6 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
     middle = size / acceleration - t
     flat = ((middle, 0.0),) if middle > 0 else ()
     return ((t, sign * jerk), *flat, (t, -sign * jerk))
-
-
-Memory = MutableMapping[tuple[float, ...], Phases]
-"""Motions already found, by their limits and ends."""
-MARGIN = 1e-6
-"""Share of a zone's length kept back when its ends' speeds are chosen, so that a motion surely exists."""
-
-
-class Zones(NamedTuple):
-    """Stretches of a path with limits of their own.
-
-    Attributes:
-        bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
-        speed, acceleration, jerk: Limits in each zone. Shape (Z,).
-    """
-
-    bounds: Array
-    speed: Array
-    acceleration: Array
-    jerk: Array
 
 
 def plan(zones: Zones, memory: Memory) -> SpeedProfile:
@@ -190,37 +189,30 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
     for i in reversed(range(count)):
         ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
-    durations: list[float] = []
-    jerks: list[float] = []
-    rows: list[tuple[float, float, float]] = []  # distance, speed, acceleration at the start of each phase
+    rows: list[tuple[float, ...]] = []  # duration, distance, speed, acceleration at the start and jerk of each phase
     for i, ((top, most, jerk), length) in enumerate(zip(limits, lengths, strict=True)):
         first, last = ends[i], ends[i + 1]
+        key = (length, first, last, top, most, jerk)
         if first == last == top:
             phases: Phases = ((length / top, 0.0),)
+        elif key in memory:
+            phases = memory[key]
         else:
-            key = (length, first, last, top, most, jerk)
-            known = memory.get(key)
-            if known is None:
-                known = memory[key] = fastest(*key)
-            phases = known
-        s, v, a = float(zones.bounds[i]), first, 0.0
+            phases = memory[key] = fastest(*key)
+        place, speed, rate = float(zones.bounds[i]), first, 0.0
         for t, j in phases:
-            durations.append(t)
-            jerks.append(j)
-            rows.append((s, v, a))
-            s += t * (v + t * (a / 2 + t * j / 6))
-            v = max(v + t * (a + t * j / 2), 0.0)
-            a += t * j
-            if abs(a) <= 1e-9 * most:
-                a = 0.0
-    if not durations or not np.isfinite(durations).all():
-        raise ProblemError(f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5]}")
-    state = np.array([*rows, (float(zones.bounds[-1]), 0.0, 0.0)])
-    times = np.concatenate([[0.0], np.cumsum(durations)])
-    return SpeedProfile(times, state[:, 0], state[:, 1], state[:, 2], np.array(jerks))
+            rows.append((t, place, speed, rate, j))
+            way, speed, rate = advanced(speed, rate, j, t)
+            place, speed, rate = place + way, max(speed, 0.0), rate if abs(rate) > 1e-9 * most else 0.0
+    durations, *starts, jerks = np.array(rows).reshape(-1, 5).T
+    if not durations.size or not np.isfinite(durations).all():
+        raise ProblemError(f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5].tolist()}")
+    s, v, a = (np.append(start, end) for start, end in zip(starts, (zones.bounds[-1], 0.0, 0.0), strict=True))
+    return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
 
 
 def _limited(speed: float, other: float, length: float, limits: tuple[float, float, float]) -> float:
+    """The speed at one end of a zone, lowered to what can be reached from that at the other."""
     if speed <= other:
         return speed
-    return min(speed, reach(other, length * (1 - MARGIN), *limits[1:]))
+    return min(speed, reach(other, length * (1 - REACH_MARGIN), *limits[1:]))

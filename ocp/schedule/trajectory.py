@@ -14,7 +14,7 @@ import numpy as np
 from ocp.errors import ProblemError
 from ocp.schedule.limits import JointPath, rates_along
 from ocp.schedule.planner import Schedule
-from ocp.schedule.profile import Array, Motion
+from ocp.schedule.profile import Array, LineMotion
 
 __all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
 
@@ -92,21 +92,11 @@ class JointTrajectory:
         if (np.diff(nanoseconds) <= 0).any():
             at = int((np.diff(nanoseconds) <= 0).argmax())
             raise ProblemError(f"trajectory: times {self.t[at]!r} and {self.t[at + 1]!r} s are the same nanosecond")
+        values = {kind: getattr(self, kind).tolist() for kind in KINDS}
         points = [
-            {
-                "positions": q,
-                "velocities": v,
-                "accelerations": a,
-                "effort": [],
-                "time_from_start": {"sec": ns // 10**9, "nanosec": ns % 10**9},
-            }
-            for q, v, a, ns in zip(
-                self.positions.tolist(),
-                self.velocities.tolist(),
-                self.accelerations.tolist(),
-                nanoseconds.tolist(),
-                strict=True,
-            )
+            {kind: rows[k] for kind, rows in values.items()}
+            | {"effort": [], "time_from_start": {"sec": ns // 10**9, "nanosec": ns % 10**9}}
+            for k, ns in enumerate(nanoseconds.tolist())
         ]
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
         return {"header": header, "joint_names": list(self.names), "points": points}
@@ -125,7 +115,7 @@ class JointTrajectory:
         return cls(names, t, *values)
 
 
-def joint_motion(joints: JointPath, motion: Motion) -> tuple[Array, Array, Array, Array]:
+def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
     """Joints, their velocities, accelerations and jerks during a motion along the path. Shape (M, n) each.
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.

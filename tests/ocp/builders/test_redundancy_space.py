@@ -15,11 +15,12 @@ from models.paths import Path, smooth
 from ocp import Collocation, solve
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.errors import ProblemError
-from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.rates import resolve
 from ocp.tasks.equations import bind
 from ocp.tasks.tip_task import TipTask, along
-from tests.models.robot.trees import numeric, seven_joint_arm
+from tests.models.robot.trees import numeric
+from tests.ocp.builders.test_redundancy import audited, chain
+from tests.ocp.local.test_rates import PAPER_START
 from tests.ocp.tasks.space_tasks import (
     BASE,
     PANDA_START,
@@ -37,7 +38,6 @@ from tests.ocp.tasks.space_tasks import (
 )
 
 MANIPULATOR_START = np.array([0.3, -0.6, 0.4, 1.0, -0.4, 0.8, 0.2])
-PAPER_START = np.deg2rad([45.0, 60.0, -60.0])
 FINE = Collocation(intervals=50, degree=4)
 
 
@@ -47,16 +47,14 @@ def test_a_space_manipulator_follows_a_pose_line_optimally(momentum: Any) -> Non
     machine = FreeFloating(floating_manipulator().robot, conserved_momentum=momentum)
     line = line_from(machine, BASE, MANIPULATOR_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.3, 10.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    start: dict[str, Any] = {"start_joints": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
-    solution = solve(minimum_velocity_problem(machine, task=task, **start), FINE)
-    audit = solution.audit()
-    assert audit.passed, str(audit)
+    asked: dict[str, Any] = {"task": task, "start_joints": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
+    solution = audited(machine, FINE, **asked)
     assert sum(values.shape[1] for values in solution.states.values()) == 14
     assert largest_error(machine, task, solution) < 1e-6
     scale = np.linalg.norm(momentum) if momentum else machine.robot.total_mass * np.abs(solution["rates"]).max()
     assert largest_momentum_error(machine, solution) < 1e-9 * scale
     np.testing.assert_allclose(np.linalg.norm(solution["base"][:, 3:], axis=1), 1.0, atol=1e-9)
-    assert solution.cost < resolve(machine, task=task, **start).cost[-1]
+    assert solution.cost < resolve(machine, **asked).cost[-1]
 
 
 def test_a_light_satellite_gains_by_planning_ahead() -> None:
@@ -74,16 +72,10 @@ def test_a_light_satellite_gains_by_planning_ahead() -> None:
 @pytest.mark.parametrize("kind", ["position", "direction", "orientation"])
 def test_a_cyclic_plan_closes_the_joints_of_an_arm(kind: str) -> None:
     rotation, position = pose(panda(), (), PANDA_START)
-    aims: dict[str, Any] = {
-        "position": {},
-        "direction": {"direction": rotation[:, 2]},
-        "orientation": {"orientation": rotation},
-    }
-    task = TipTask(position=circle(position, 0.1, 6.0), **aims[kind])
+    aims: dict[str, Any] = {"direction": {"direction": rotation[:, 2]}, "orientation": {"orientation": rotation}}
+    task = TipTask(position=circle(position, 0.1, 6.0), **aims.get(kind, {}))
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0}
-    solution = solve(minimum_velocity_problem(panda(), cyclic=True, **start), FINE)
-    audit = solution.audit()
-    assert audit.passed, str(audit)
+    solution = audited(panda(), FINE, cyclic=True, **start)
     assert np.abs(solution["joints"][-1] - solution["joints"][0]).max() <= 1e-8
     assert largest_error(panda(), task, solution) < 1e-6
     assert np.abs(solution["closure"]).max() < 1e-8  # what the task gave way
@@ -97,9 +89,7 @@ def test_a_cyclic_plan_may_choose_where_to_start() -> None:
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0, "cyclic": True}
     method = Collocation(intervals=30, degree=4)
     fixed = solve(minimum_velocity_problem(panda(), **start), method)
-    free = solve(minimum_velocity_problem(panda(), free_start=True, **start), method)
-    audit = free.audit()
-    assert audit.passed, str(audit)
+    free = audited(panda(), method, free_start=True, **start)
     assert free.cost < fixed.cost - 1e-4
     np.testing.assert_allclose(pose(panda(), (), free["joints"][0])[1], position, atol=1e-9)
     assert np.abs(free["joints"][-1] - free["joints"][0]).max() <= 1e-8
@@ -110,17 +100,13 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     task = TipTask(
         position=lambda t: ca.vertcat(position[0], position[1] + 0.05 * t, position[2]), direction=rotation[:, 2]
     )
-    problem = minimum_velocity_problem(ur5(), task=task, horizon=2.0, free_start=True)
-    solution = solve(problem, Collocation(intervals=15, degree=4))
-    assert solution.audit().passed
+    solution = audited(ur5(), Collocation(intervals=15, degree=4), task=task, horizon=2.0, free_start=True)
     assert largest_error(ur5(), task, solution) < 1e-6
-    machine = FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
-    start = np.deg2rad([30.0, 40.0, 50.0])
+    machine, start = chain(), np.deg2rad([30.0, 40.0, 50.0])
     asked: dict[str, Any] = {"tip_velocity": (-0.2, 0.1), "rows": (3, 4), "start_joints": start, "horizon": 3.0}
     costs = []
     for free in (False, True):
-        plan = solve(minimum_velocity_problem(machine, free_start=free, **asked), Collocation(intervals=15))
-        assert plan.audit().passed
+        plan = audited(machine, Collocation(intervals=15), free_start=free, **asked)
         np.testing.assert_allclose(pose(machine, (), plan["joints"][0])[1], pose(machine, (), start)[1], atol=1e-8)
         costs.append(plan.cost)
     assert costs[1] < costs[0]
@@ -154,9 +140,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
     _, position = pose(machine, BASE, PANDA_START)
     task = TipTask(position=circle(position, 0.05, 6.0))
     start: dict[str, Any] = {"task": task, "start_joints": PANDA_START, "horizon": 6.0, "start_base": BASE}
-    solution = solve(minimum_velocity_problem(machine, cyclic=True, **start), Collocation(intervals=20, degree=4))
-    audit = solution.audit()
-    assert audit.passed, str(audit)
+    solution = audited(machine, Collocation(intervals=20, degree=4), cyclic=True, **start)
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
     assert largest_error(machine, task, solution) < 1e-6
 
@@ -170,8 +154,7 @@ def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base(
     frame = machine.world_from_base(BASE)
     beside = numeric(frame.rotation).T @ (position - numeric(frame.position).ravel())
     task = TipTask(position=circle(beside, 0.05, 4.0), relative_to="satellite")
-    solution = solve(minimum_velocity_problem(machine, task=task, **asked), Collocation(intervals=20, degree=4))
-    assert solution.audit().passed
+    solution = audited(machine, Collocation(intervals=20, degree=4), task=task, **asked)
     assert largest_error(machine, task, solution) < 1e-6
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
 
@@ -180,37 +163,22 @@ def test_cyclic_tasks_that_are_open_are_refused() -> None:
     rotation, position = pose(panda(), (), PANDA_START)
     asked: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 2.0, "cyclic": True}
     open_path = TipTask(position=lambda time: ca.vertcat(position[0], position[1], position[2] + 0.01 * time))
-    with pytest.raises(ProblemError, match=r"not closed: it ends 0\.02 "):
-        minimum_velocity_problem(panda(), task=open_path, **asked)
-    with pytest.raises(ProblemError, match=r"not closed: it ends 0\.2 "):
-        minimum_velocity_problem(panda(), (0.1,), (4,), **asked)
-    with pytest.raises(ProblemError, match=r"not closed: it ends 0\.6 "):
-        minimum_velocity_problem(panda(), (0, 0, 0.3), (0, 1, 2), **asked)
+    straight, turned = TipTask(velocity=(0.1,), rows=(4,)), TipTask(velocity=(0, 0, 0.3), rows=(0, 1, 2))
+    for task, gap in ((open_path, r"0\.02"), (straight, r"0\.2"), (turned, r"0\.6")):
+        with pytest.raises(ProblemError, match=f"not closed: it ends {gap} "):
+            minimum_velocity_problem(panda(), task=task, **asked)
     turning = TipTask(orientation=rotation, position=position, rows=(0, 1, 2))
     minimum_velocity_problem(panda(), task=turning, **asked)
 
 
-def test_a_singular_passage_of_the_pseudo_inverse_is_planned_around() -> None:
-    """The undamped local motion passes a manipulability of 0.004 at 6.6 rad/s; the plan is audited and far cheaper."""
-    machine = FreeFloating(seven_joint_arm())
-    start: dict[str, Any] = {"tip_velocity": (-0.4068, -0.0055, -0.0092), "rows": (3, 4, 5), "horizon": 5.0}
-    start["start_joints"] = (0.087, 1.049, -0.898, -0.204, 0.404, 0.923, 1.2)
-    local = resolve(machine, **start)
-    assert local.stopped is not None or local.manipulability.min() < 0.02
-    solution = plan_minimum_velocity(machine, method=Collocation(intervals=50), **start)
-    assert solution.audit().passed
-    assert solution.cost < 0.6 * local.cost[-1]
-
-
-def test_a_path_out_of_reach_is_refused_by_name_and_its_guess_is_whole() -> None:
+def test_the_guess_of_a_motion_that_stops_early_is_whole() -> None:
+    """The tip moves 3 m in x; with 2 m of arm it is out of reach after 1.3 s."""
+    asked: dict[str, Any] = {"tip_velocity": (1.0, 0.0), "rows": (3, 4), "horizon": 3.0}
+    asked["start_joints"] = np.deg2rad([60.0, -100.0, -20.0])
     machine = FixedBase(planar_chain([1.0, 0.5, 0.5], [1.0] * 3))
-    start = np.deg2rad([60.0, -100.0, -20.0])
-    asked: dict[str, Any] = {"tip_velocity": (1.0, 0.0), "rows": (3, 4), "start_joints": start, "horizon": 3.0}
-    problem = minimum_velocity_problem(machine, guess_damping=1e-9, **asked)
-    for variable in (problem.declared.states["joints"], problem.declared.controls["rates"]):
+    declared = minimum_velocity_problem(machine, guess_damping=1e-9, **asked).declared
+    for variable in (declared.states["joints"], declared.controls["rates"]):
         assert np.isfinite([variable.guess(time) for time in np.linspace(0, 3, 31)]).all()
-    with pytest.raises(Unreachable, match=r"at 1\.\d+ s no joint positions"):
-        plan_minimum_velocity(machine, method=Collocation(intervals=15), dampings=(0.005,), **asked)
 
 
 def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
@@ -225,9 +193,7 @@ def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
         TipTask(rows=(0, 1, 2), velocity=(0, 0, 0), link="satellite"),
     ]
     asked: dict[str, Any] = {"task": task, "start_joints": start, "horizon": 3.0}
-    solution = solve(minimum_velocity_problem(machine, **asked), Collocation(intervals=10, degree=4))
-    audit = solution.audit()
-    assert audit.passed, str(audit)
+    solution = audited(machine, Collocation(intervals=10, degree=4), **asked)
     assert largest_error(machine, task, solution) < 1e-6
     np.testing.assert_allclose(solution["base"][:, 3:], np.tile(home[3:], (len(solution.t), 1)), atol=1e-8)
     assert solution.cost < resolve(machine, **asked).cost[-1] + 1e-9
@@ -247,9 +213,7 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
     pieces = [np.linspace(a, b, 7)[:-1] for a, b in pairwise(edges)]
     mesh = (*np.concatenate(pieces).tolist(), 1.0)
     method = Collocation(intervals=len(mesh) - 1, degree=4, mesh=mesh)
-    solution = solve(minimum_velocity_problem(ur5(), symbols=ca.MX, **asked), method)
-    audit = solution.audit()
-    assert audit.passed, str(audit)
+    solution = audited(ur5(), method, symbols=ca.MX, **asked)
     assert largest_error(ur5(), task, solution) < 1e-6
     assert solution.cost <= local.cost[-1] * (1 + 1e-7)
     fine = solution.at(np.linspace(0, horizon, 1001))["joints"]
@@ -258,17 +222,11 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
 
 def test_weights_and_momentum_have_one_optimum_in_both_formulations() -> None:
     machine = FreeFloating(paper_example().robot, "planar", conserved_momentum=(5.0, -4.0, 2.0))
-    weights = (1.0, 3.0, 0.5)
-    costs = []
-    names: tuple[Any, ...] = ("rates", "null_space")
-    for name in names:
-        problem = minimum_velocity_problem(
-            machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=weights, formulation=name
-        )
-        solution = solve(problem, Collocation(intervals=20, degree=4))
-        assert solution.audit().passed
-        costs.append(solution.cost)
+    asked: dict[str, Any] = {"tip_velocity": (-0.4, -0.3), "rows": (3, 4), "start_joints": PAPER_START, "horizon": 2.0}
+    asked["weights"] = (1.0, 3.0, 0.5)
+    method = Collocation(intervals=20, degree=4)
+    costs = [audited(machine, method, **asked, formulation=name).cost for name in ("rates", "null_space")]
     assert costs[0] == pytest.approx(costs[1], abs=1e-9)
-    assert costs[0] < resolve(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=weights).cost[-1]
+    assert costs[0] < resolve(machine, **asked).cost[-1]
     with pytest.raises(ProblemError, match="must be positive"):
-        minimum_velocity_problem(machine, (-0.4, -0.3), (3, 4), PAPER_START, 2.0, weights=(1.0, 0.0, 1.0))
+        minimum_velocity_problem(machine, **{**asked, "weights": (1.0, 0.0, 1.0)})

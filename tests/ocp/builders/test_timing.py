@@ -9,16 +9,17 @@ import pytest
 
 from models.machines.scara import Scara
 from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import Line, Path, SmoothPath, smooth
+from models.paths import Path, SmoothPath, smooth
 from ocp import Collocation, ProblemError, solve
-from ocp.builders import timing_tables as path_reference
+from ocp.builders import timing_tables
 from ocp.builders.timing import Fastest, minimum_time_problem, plan_minimum_time
 from ocp.builders.timing_tables import largest_demand, table
 from ocp.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
+from tests.ocp.schedule.test_schedule import line
+from tests.ocp.schedule.test_schedule_joints import SLOW, BrokenJoints
 
 INTERVALS = 100
-JOINTS = JointLimits([3.0, 3.0, 1.0, 6.0], [15.0, 15.0, 5.0, 30.0], [300.0, 300.0, 200.0, 800.0])
 ACCELERATION = peak_acceleration(5.0, 1.0, 200.0)
 
 
@@ -30,18 +31,19 @@ class Case(NamedTuple):
     best: Fastest
 
 
-def straight(length: float = 1.0) -> SmoothPath:
-    return smooth(Path((Line((0.0, 0.0, 0.0), (length, 0.0, 0.0)),)), 0.1)
-
-
 def random_path(seed: int) -> tuple[SmoothPath, LineLimits]:
     rng = np.random.default_rng(seed)
     points = np.cumsum(rng.normal(size=(int(rng.integers(3, 8)), 3)) * 10.0 ** rng.uniform(-3, 0), axis=0)
     path = smooth(Path.through(points), 0.3 * float(np.linalg.norm(np.diff(points, axis=0), axis=1).min()))
     speed, acceleration = path.length * 10 ** rng.uniform(-0.5, 0.5), path.length * 10 ** rng.uniform(-0.5, 1)
-    return path, LineLimits(
-        speed, acceleration, path.length * 10 ** rng.uniform(0, 3), acceleration * rng.uniform(0.3, 2)
-    )
+    jerk, bend = path.length * 10 ** rng.uniform(0, 3), acceleration * rng.uniform(0.3, 2)
+    return path, LineLimits(speed, acceleration, jerk, bend)
+
+
+def case(path: SmoothPath, limits: LineLimits, joints: ScaraPath | None = None, intervals: int = INTERVALS) -> Case:
+    """The minimum time from the schedule of the same path."""
+    plan = schedule(path, limits, joints=joints)
+    return Case(path, limits, joints, plan, plan_minimum_time(path, limits, joints, guess=plan, intervals=intervals))
 
 
 @pytest.fixture(scope="module")
@@ -52,30 +54,24 @@ def arm() -> ScaraPath:
 @pytest.fixture(scope="module")
 def limited(arm: ScaraPath) -> Case:
     """The paper's example with a SCARA's limits."""
-    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0, JOINTS)
-    plan = schedule(arm.path, limits, joints=arm)
-    return Case(arm.path, limits, arm, plan, plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=INTERVALS))
+    return case(arm.path, LineLimits(1.0, ACCELERATION, 200.0, 5.0, SLOW), arm)
 
 
-def worst(case: Case) -> float:
+def worst(solved: Case) -> float:
     """Largest demand at ten times the grid and more, the demands being those of the test's own formulas."""
-    profile = case.best.schedule.profile
+    profile = solved.best.schedule.profile
     inside = (np.arange(30) + 0.5) / 30
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
-    limits, s = case.limits, motion.distance
-    found = [
-        float((motion.speed / np.max(limits.speed)).max()),
-        float(np.abs(motion.acceleration).max() / limits.acceleration),
-        float(np.abs(motion.jerk).max() / limits.jerk),
-        float((motion.speed**2 * case.path.curvature(s)).max() / limits.centripetal),
+    limits, s = solved.limits, motion.distance
+    found: list[Any] = [
+        motion.speed / np.max(limits.speed),
+        motion.speed**2 * solved.path.curvature(s) / limits.centripetal,
     ]
-    if case.joints is not None:
-        moved = joint_motion(case.joints, motion)[1:]
-        found += [float((np.abs(v) / b).max()) for v, b in zip(moved, limits.of_joints(4), strict=True)]
-    return max(found)
-
-
-# ---- closed forms --------------------------------------------------------------------------------------------
+    found += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
+    if solved.joints is not None:
+        moved = joint_motion(solved.joints, motion)[1:]
+        found += [np.abs(v) / b for v, b in zip(moved, limits.of_joints(4), strict=True)]
+    return max(float(value.max()) for value in found)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +85,7 @@ def worst(case: Case) -> float:
 def test_a_line_takes_the_closed_form_whatever_the_guess(
     speed: float, acceleration: float, jerk: float, duration: float
 ) -> None:
-    path, limits = straight(), LineLimits(speed, acceleration, jerk)
+    path, limits = line(1.0), LineLimits(speed, acceleration, jerk)
     assert schedule(path, limits).duration == pytest.approx(duration, rel=1e-9)
     best = plan_minimum_time(path, limits, intervals=INTERVALS)
     assert best.duration == pytest.approx(duration, rel=1e-6)
@@ -102,7 +98,7 @@ def test_a_line_takes_the_closed_form_whatever_the_guess(
 
 
 def test_without_a_jerk_limit_to_speak_of_a_line_takes_bang_bang_acceleration() -> None:
-    best = plan_minimum_time(straight(), LineLimits(10.0, 5.0, 1e6), intervals=INTERVALS)
+    best = plan_minimum_time(line(1.0), LineLimits(10.0, 5.0, 1e6), intervals=INTERVALS)
     assert best.duration == pytest.approx(2 * np.sqrt(1 / 5.0), rel=1e-4)
     assert best.demand < 1.001
 
@@ -117,9 +113,6 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     assert best(scale) == pytest.approx(best(1.0), rel=1e-6)
 
 
-# ---- limits and schedules ------------------------------------------------------------------------------------
-
-
 def test_the_example_keeps_every_limit_between_the_points(limited: Case) -> None:
     assert worst(limited) < 1.001
     assert limited.best.demand < 1.001
@@ -129,7 +122,8 @@ def test_the_example_keeps_every_limit_between_the_points(limited: Case) -> None
     assert np.median(demands) > 0.98
 
 
-def test_the_motion_of_the_example_is_a_motion(limited: Case) -> None:
+def test_the_motion_of_the_example_is_a_motion_never_slower_than_the_schedule(limited: Case) -> None:
+    assert limited.best.duration < limited.plan.duration * (1 + 1e-6)
     profile = limited.best.schedule.profile
     t = np.diff(profile.t)
     v, a, j = profile.speed[:-1], profile.acceleration[:-1], profile.jerk
@@ -141,17 +135,13 @@ def test_the_motion_of_the_example_is_a_motion(limited: Case) -> None:
     assert profile.duration == pytest.approx(limited.best.solution.cost, rel=1e-6)
 
 
-def test_the_schedule_is_never_faster_than_the_optimum(limited: Case) -> None:
-    assert limited.best.duration < limited.plan.duration * (1 + 1e-6)
-
-
 def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     def none_with_joints(path: Any, limits: LineLimits, *, joints: Any = None) -> Schedule:
         if limits.joints is not None:
             raise ProblemError("no schedule found")
         return schedule(path, limits, joints=joints)
 
-    monkeypatch.setattr(path_reference, "schedule", none_with_joints)
+    monkeypatch.setattr(timing_tables, "schedule", none_with_joints)
     other = plan_minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
     # held jerks lose time in proportion to the intervals' width
     assert other.duration == pytest.approx(limited.best.duration, rel=3e-3)
@@ -160,19 +150,13 @@ def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, mon
 
 @pytest.mark.parametrize("kind", ["cubic", "quintic"])
 def test_centripetal_acceleration_is_kept_where_the_curvature_jumps_too(kind: str) -> None:
-    path = example(kind)
-    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0)
-    plan = schedule(path, limits)
-    case = Case(path, limits, None, plan, plan_minimum_time(path, limits, guess=plan, intervals=INTERVALS))
-    assert worst(case) < 1.001
-    assert case.best.duration < plan.duration
+    bent = case(example(kind), LineLimits(1.0, ACCELERATION, 200.0, 5.0))
+    assert worst(bent) < 1.001
+    assert bent.best.duration < bent.plan.duration
 
 
 def test_speeds_of_segments_are_kept() -> None:
-    path = example("quintic")
-    limits = LineLimits(np.array([1.0, 0.4, 0.7]), 5.0, 200.0)
-    plan = schedule(path, limits)
-    best = plan_minimum_time(path, limits, guess=plan, intervals=INTERVALS)
+    path, limits, _, plan, best = case(example("quintic"), LineLimits(np.array([1.0, 0.4, 0.7]), 5.0, 200.0))
     motion = best.schedule.sample(1e-3)
     assert largest_demand(path, limits, None, motion).max() < 1.001
     assert best.duration < plan.duration * (1 + 1e-6)
@@ -182,23 +166,17 @@ def test_speeds_of_segments_are_kept() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_random_paths_are_solved_and_bracketed(seed: int) -> None:
     path, limits = random_path(seed)
-    plan = schedule(path, limits)
-    best = plan_minimum_time(path, limits, guess=plan, intervals=60)
-    assert worst(Case(path, limits, None, plan, best)) < 1.001
+    solved = case(path, limits, intervals=60)
+    assert worst(solved) < 1.001
     # no motion beats the line alone, without its curvature
     alone = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).duration
-    assert alone * (1 - 1e-6) < best.duration < plan.duration * (1 + 1e-6)
+    assert alone * (1 - 1e-6) < solved.best.duration < solved.plan.duration * (1 + 1e-6)
 
 
 def test_tight_joint_limits_far_below_the_asked_speed_are_solved(arm: ScaraPath) -> None:
-    limits = LineLimits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0))
-    plan = schedule(arm.path, limits, joints=arm)
-    case = Case(arm.path, limits, arm, plan, plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=60))
-    assert worst(case) < 1.001
-    assert case.best.duration < plan.duration
-
-
-# ---- audit ---------------------------------------------------------------------------------------------------
+    tight = case(arm.path, LineLimits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0)), arm, 60)
+    assert worst(tight) < 1.001
+    assert tight.best.duration < tight.plan.duration
 
 
 def test_the_audit_confirms_the_plan_but_not_the_stationarity_of_held_jerks(limited: Case) -> None:
@@ -218,9 +196,6 @@ def test_free_jerks_at_the_points_are_faster_than_held_ones_and_break_limits_bet
         timing.profile(free)
 
 
-# ---- tables and errors ---------------------------------------------------------------------------------------
-
-
 def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
     def columns(x: Any) -> Any:
         return np.column_stack([np.sin(20 * x) + (x >= 0.3), 1e6 / (1e-3 + (x - 0.7) ** 2), np.abs(x - 0.3)])
@@ -233,26 +208,13 @@ def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
     assert np.array(function(0.3 - 1e-12))[0, 0] == pytest.approx(np.sin(6.0), abs=4e-8)
 
 
-class Joints(NamedTuple):
-    """Two joints that are the same broken array everywhere."""
-
-    value: float
-    number: int
-    names: tuple[str, ...] = ("a", "b")
-
-    def at(self, distance: Any) -> Any:
-        values = np.ones((len(distance), self.number))
-        values[distance > 0.5] = self.value
-        return type("Rates", (), dict.fromkeys(("position", "first", "second", "third"), values))()
-
-
 @pytest.mark.parametrize(
     ("joints", "words"),
     [
         (None, "joint limits need"),
-        (Joints(np.nan, 2), "not finite"),
-        (Joints(np.inf, 2), "not finite"),
-        (Joints(1.0, 3), "shape"),
+        (BrokenJoints("second", np.nan), "not finite"),
+        (BrokenJoints("first", np.inf), "not finite"),
+        (BrokenJoints("third", np.ones((1, 3))), "shape"),
     ],
 )
 def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
@@ -263,16 +225,15 @@ def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
 def test_a_joint_jerk_limit_on_a_path_whose_curvature_jumps_is_refused() -> None:
     path = example("cubic")
     along = scara_along(Scara(0.4, 0.4), path, "right")
-    limits = LineLimits(1.0, 5.0, 200.0, joints=JOINTS)
-    with pytest.raises(ProblemError, match="curvature jumps"):
-        plan_minimum_time(path, limits, along)
-    with pytest.raises(ProblemError, match="curvature jumps"):
-        plan_minimum_time(path, limits, along, guess=schedule(path, LineLimits(1.0, 5.0, 200.0)))
+    limits = LineLimits(1.0, 5.0, 200.0, joints=SLOW)
+    for guess in (None, schedule(path, LineLimits(1.0, 5.0, 200.0))):
+        with pytest.raises(ProblemError, match="curvature jumps"):
+            plan_minimum_time(path, limits, along, guess=guess)
 
 
 def test_a_guess_of_another_path_and_too_few_intervals_are_refused() -> None:
     limits = LineLimits(1.0, 5.0, 200.0)
     with pytest.raises(ProblemError, match="guess is for a path"):
-        minimum_time_problem(straight(), limits, guess=schedule(straight(2.0), limits))
+        minimum_time_problem(line(1.0), limits, guess=schedule(line(2.0), limits))
     with pytest.raises(ProblemError, match="intervals"):
-        minimum_time_problem(straight(), limits, intervals=5)
+        minimum_time_problem(line(1.0), limits, intervals=5)

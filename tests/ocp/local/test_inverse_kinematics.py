@@ -1,3 +1,5 @@
+"""Inverse kinematics: all postures of known arms, limits, the nearest miss, and what is refused."""
+
 from __future__ import annotations
 
 from typing import Any
@@ -7,12 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import FixedBase, Joint, Link, Robot, planar_chain
+from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
 from ocp.errors import ProblemError
 from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seeds
 from tests.ocp.tasks.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
+
+POINT = TipTask(position=(0.0, 0.0, 0.0))
+
+
+def assert_poses(machine: Machine, joints: Any, rotation: Any, position: Any, base: Any = ()) -> None:
+    """The tip is there; of the turn only the tool axis where `rotation` is one direction."""
+    turn, place = pose(machine, base, joints)
+    np.testing.assert_allclose(place, position, atol=1e-9)
+    np.testing.assert_allclose(turn if np.ndim(rotation) == 2 else turn[:, 2], rotation, atol=1e-9)
 
 
 def test_a_six_joint_arm_has_its_eight_postures() -> None:
@@ -21,9 +32,7 @@ def test_a_six_joint_arm_has_its_eight_postures() -> None:
     assert len(found) == 8
     assert [posture.quality for posture in found] == sorted((p.quality for p in found), reverse=True)
     for posture in found:
-        turn, place = pose(ur5(), (), posture.joints)
-        np.testing.assert_allclose(place, position, atol=1e-9)
-        np.testing.assert_allclose(turn, rotation, atol=1e-9)
+        assert_poses(ur5(), posture.joints, rotation, position)
     nearest = min(np.abs(np.sin((posture.joints - UR5_START) / 2)).max() for posture in found)
     assert nearest < 1e-9
 
@@ -45,15 +54,10 @@ def test_what_an_arm_can_do_is_found_within_its_limits(seed: int, free_roll: boo
     joints = rng.uniform(robot.lower, robot.upper)
     rotation, position = pose(panda(), (), joints)
     asked: dict[str, Any] = {"direction": rotation[:, 2]} if free_roll else {"orientation": rotation}
-    found = inverse_kinematics(panda(), TipTask(position=position, **asked))
-    for posture in found:
+    for posture in inverse_kinematics(panda(), TipTask(position=position, **asked)):
         assert (posture.joints >= robot.lower).all()
         assert (posture.joints <= robot.upper).all()
-        turn, place = pose(panda(), (), posture.joints)
-        np.testing.assert_allclose(place, position, atol=1e-8)
-        np.testing.assert_allclose(turn[:, 2], rotation[:, 2], atol=1e-8)
-        if not free_roll:
-            np.testing.assert_allclose(turn, rotation, atol=1e-8)
+        assert_poses(panda(), posture.joints, rotation[:, 2] if free_roll else rotation, position)
 
 
 def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
@@ -112,10 +116,10 @@ def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
     ("task", "changes", "message"),
     [
         (TipTask(rows=(3,), velocity=(0.0,)), {}, "need a pose"),
-        (TipTask(position=(0.0, 0.0, 0.0)), {"starts": -1}, "starts must be a whole number"),
-        (TipTask(position=(0.0, 0.0, 0.0)), {"starts": 0}, "no start"),
-        (TipTask(position=(0.0, 0.0, 0.0)), {"tolerance": 0.0}, "tolerance must be a positive"),
-        (TipTask(position=(0.0, 0.0, 0.0)), {"near": (0.0, 0.0)}, r"near has shape \(1, 2\)"),
+        (POINT, {"starts": -1}, "starts must be a whole number"),
+        (POINT, {"starts": 0}, "no start"),
+        (POINT, {"tolerance": 0.0}, "tolerance must be a positive"),
+        (POINT, {"near": (0.0, 0.0)}, r"near has shape \(1, 2\)"),
         (TipTask(position=(0.0, 0.0, np.nan)), {}, "position .* not finite"),
         (TipTask(position=(0.0, 0.0)), {}, r"position has shape \(2, 1\)"),
         (TipTask(position=(0.0, 0.0, 0.0), link="tool1"), {}, "tool1"),

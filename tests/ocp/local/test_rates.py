@@ -17,10 +17,6 @@ from tests.models.robot.trees import Array, numeric, random_base, random_robot, 
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])
 
 
-def spatial_machine(seed: int = 3) -> FreeFloating:
-    return FreeFloating(random_robot(np.random.default_rng(seed), 9), "spatial")
-
-
 def assert_identical_law(
     machine: Machine, local: LocalSolution, rows: list[int], velocity: Any, damping: float
 ) -> None:
@@ -82,9 +78,7 @@ def test_all_six_rows_of_a_spatial_machine_on_a_floating_base_are_followed() -> 
 def test_the_rates_are_those_of_the_damped_pseudo_inverse(seed: int, damping: float, kind: str) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, 6, "planar" if kind == "planar" else "spatial")
-    machine: Any = (
-        FixedBase(robot) if kind == "fixed" else FreeFloating(robot, "planar" if kind == "planar" else "spatial")
-    )
+    machine: Any = FixedBase(robot) if kind == "fixed" else FreeFloating(robot, kind)  # type: ignore[arg-type]
     base = None if kind == "fixed" else random_base(rng, machine.base)
     start, speed = rng.normal(size=machine.joint_size), float(rng.normal())
     local = resolve(machine, lambda t: speed * ca.cos(t), (3,), start, 0.2, start_base=base, damping=damping, samples=4)
@@ -187,25 +181,32 @@ def test_least_rates_do_the_task_and_have_no_part_in_the_null_space(seed: int, r
     assert np.linalg.norm(damped) < np.linalg.norm(rates)
 
 
+ASKED: dict[str, Any] = {"tip_velocity": (-1.0, -1.0), "rows": (3, 4), "start_joints": PAPER_START, "horizon": 1.0}
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"rows": ()}, "rows is empty"),
+    ({"rows": (3, 3)}, "more than once"),
+    ({"rows": (3, 7)}, "twist rows 0..5"),
+    ({"rows": (0, 1, 3, 4)}, "fixes 4 rows .* only 3 joints"),
+    ({"rows": (0, 3)}, r"rows \[0, 3\]: no joint moves the tip in rows \[0\]"),
+    ({"tip_velocity": (1.0,)}, r"tip_velocity has shape \(1, 1\), expected \(2, 1\)"),
+    ({"tip_velocity": (1.0, np.nan)}, "tip_velocity .* not finite"),
+    ({"tip_velocity": lambda t: [t, ca.SX.sym("stranger")]}, r"depends on \['stranger'\]"),
+    ({"tip_velocity": lambda t: "fast"}, "tip_velocity gives 'fast'"),
+    ({"start_joints": (0.0, 1.0)}, "start_joints has 2 entries, expected 3"),
+    ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
+    ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
+    ({"start_base": (0.0,) * 7}, "start_base has 7 entries, expected 3"),
+    ({"horizon": 0.0}, "horizon must be a positive number"),
+    ({"horizon": np.inf}, "horizon must be a positive number"),
+]
+"""What is wrong with a request of any motion of the paper's machine, and what the error says."""
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rows": ()}, "rows is empty"),
-        ({"rows": (3, 3)}, "more than once"),
-        ({"rows": (3, 7)}, "twist rows 0..5"),
-        ({"rows": (0, 1, 3, 4)}, "fixes 4 rows .* only 3 joints"),
-        ({"rows": (0, 3)}, r"rows \[0, 3\]: no joint moves the tip in rows \[0\]"),
+        *REFUSED,
         ({"start_joints": (0.0, 0.0, 0.0)}, r"rows \[3, 4\] is singular at the start"),
-        ({"tip_velocity": (1.0,)}, r"tip_velocity has shape \(1, 1\), expected \(2, 1\)"),
-        ({"tip_velocity": (1.0, np.nan)}, "tip_velocity .* not finite"),
-        ({"tip_velocity": lambda t: [t, ca.SX.sym("stranger")]}, r"depends on \['stranger'\]"),
-        ({"tip_velocity": lambda t: "fast"}, "tip_velocity gives 'fast'"),
-        ({"start_joints": (0.0, 1.0)}, "start_joints has 2 entries, expected 3"),
-        ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
-        ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
-        ({"start_base": (0.0,) * 7}, "start_base has 7 entries, expected 3"),
-        ({"horizon": 0.0}, "horizon must be a positive number"),
-        ({"horizon": np.inf}, "horizon must be a positive number"),
         ({"damping": -1.0}, "damping must be a finite number"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
         ({"samples": 1}, "at least 2 points"),
@@ -214,19 +215,12 @@ def test_least_rates_do_the_task_and_have_no_part_in_the_null_space(seed: int, r
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {
-        "tip_velocity": (-1.0, -1.0),
-        "rows": (3, 4),
-        "start_joints": PAPER_START,
-        "horizon": 1.0,
-        **changes,
-    }
     with pytest.raises(ProblemError, match=message):
-        resolve(paper_example(), **arguments)
+        resolve(paper_example(), **{**ASKED, **changes})
 
 
 def test_a_quaternion_that_is_none_is_refused() -> None:
-    machine = spatial_machine()
+    machine = FreeFloating(random_robot(np.random.default_rng(3), 9), "spatial")
     base = np.array([0.0, 0, 0, 1, 1, 0, 0])
     with pytest.raises(ProblemError, match="not of unit length"):
         resolve(machine, (1.0,), (3,), np.zeros(machine.joint_size), 1.0, start_base=base)

@@ -8,13 +8,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Robot, planar_chain
+from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain
 from models.spatial import rotation
 from ocp import Collocation, SolveError
 from ocp.builders.redundancy import plan_minimum_velocity
-from ocp.local.inverse_kinematics import Unreachable
+from ocp.local.inverse_kinematics import Unreachable, check_reach
 from ocp.local.rates import resolve
-from ocp.local.reach import check_reach, leaves_limits
 from ocp.tasks.tip_task import TipTask
 from tests.models.robot.trees import seven_joint_arm
 
@@ -51,14 +50,11 @@ def test_a_plan_out_of_reach_says_when_and_by_how_much(kind: str) -> None:
 
 
 def slides(speed: float) -> FixedBase:
-    limit = f'<limit lower="0" upper="0.5" velocity="{speed}"/>'
-    return FixedBase(
-        Robot.from_urdf(
-            f"""<robot name="slide"><link name="a"/><link name="b"/><link name="c"/>
-            <joint name="one" type="prismatic"><parent link="a"/><child link="b"/>{limit}</joint>
-            <joint name="two" type="prismatic"><parent link="b"/><child link="c"/>{limit}</joint></robot>"""
-        )
-    )
+    """Two slides along x, one on the other, 0 to 0.5 m each."""
+    names = [("one", "a", "b"), ("two", "b", "c")]
+    limits = {"axis": (1.0, 0.0, 0.0), "lower": 0.0, "upper": 0.5, "velocity": speed}
+    joints = tuple(Joint(name, "prismatic", parent, child, **limits) for name, parent, child in names)  # type: ignore[arg-type]
+    return FixedBase(Robot((Link("a"), Link("b"), Link("c")), joints))
 
 
 def test_a_plan_that_is_too_fast_is_refused_with_what_would_have_to_give_way() -> None:
@@ -74,7 +70,7 @@ def test_a_plan_that_is_too_fast_is_refused_with_what_would_have_to_give_way() -
 def test_limits_decide_what_is_within_reach_only_where_they_hold() -> None:
     machine = slides(10.0)
     asked: dict[str, Any] = {"tip_velocity": (0.5,), "rows": (3,), "start_joints": (0.1, 0.2), "horizon": 2.0}
-    assert leaves_limits(machine, resolve(machine, **asked))
+    assert (resolve(machine, **asked).joints > machine.robot.upper).any()
     with pytest.raises(Unreachable, match=r"at 1\.5 s .*\['one', 'two'\] at their limits"):
         plan_minimum_velocity(machine, method=SHORT, **asked)
     plan = plan_minimum_velocity(machine, method=SHORT, limits=False, **asked)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,23 @@ from numpy.typing import NDArray
 from models import ModelError
 from models.paths import Path, SmoothPath, smooth
 from ocp import ProblemError
-from ocp.schedule import JointLimits, LineLimits, Schedule, peak_acceleration, ramp_distance, ramp_time, schedule
+from ocp.schedule import (
+    JointLimits,
+    LineLimits,
+    Schedule,
+    SpeedProfile,
+    peak_acceleration,
+    ramp_distance,
+    ramp_time,
+    ramps,
+    schedule,
+)
+from ocp.schedule.grid import make_grid
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 
-few = settings(max_examples=40)
 NAN = float("nan")
+LIMITS = LineLimits(1.0, 5.0, 200.0)
 
 
 def line(length: float) -> SmoothPath:
@@ -32,23 +44,23 @@ def ladder(count: int = 4) -> SmoothPath:
     return smooth(Path.through([(float(i), 1e-4 * (i % 2), 0) for i in range(count + 1)]), 0.05)
 
 
-def test_the_example_takes_the_time_checked_with_mean_acceleration() -> None:
+@pytest.mark.parametrize(
+    ("acceleration", "duration", "events"),
+    [
+        (peak_acceleration(5.0, 1.0, 200.0), 1.868825, [0.3500, 0.6203, 0.9722, 1.2419]),  # 5 m/s^2 in the mean
+        (5.0, 1.893825, [0.3625, 0.6328, 0.9847, 1.2544]),
+    ],
+)
+def test_the_example_takes_the_time_checked_and_keeps_its_speed_between_the_ramps(
+    acceleration: float, duration: float, events: list[float]
+) -> None:
     path = example("cubic")
-    limits = LineLimits(speed=1.0, acceleration=peak_acceleration(5.0, 1.0, 200.0), jerk=200.0)
-    plan = schedule(path, limits)
-    assert plan.duration == pytest.approx(1.868825, abs=1e-6)
-    events = np.cumsum(np.asarray(path.piece_lengths))[:4]
-    assert plan.time_at(events) == pytest.approx([0.3500, 0.6203, 0.9722, 1.2419], abs=5e-5)
-    assert not plan.dips
-
-
-def test_the_example_takes_the_time_checked_with_peak_acceleration() -> None:
-    path = example("cubic")
-    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
-    assert plan.duration == pytest.approx(1.893825, abs=1e-6)
-    assert plan.time_at(path.bounds[1:5]) == pytest.approx([0.3625, 0.6328, 0.9847, 1.2544], abs=5e-5)
+    plan = schedule(path, replace(LIMITS, acceleration=acceleration))
+    assert plan.duration == pytest.approx(duration, abs=1e-6)
+    assert plan.time_at(path.bounds[1:5]) == pytest.approx(events, abs=5e-5)
     inside = (plan.time_at(path.bounds[1])[0], plan.time_at(path.bounds[4])[0])
     assert plan.at(np.linspace(*inside, 999)).speed == pytest.approx(1.0, abs=1e-14)
+    assert not plan.dips
 
 
 @pytest.mark.parametrize("length", [1e-6, 1e-3, 0.05, 0.2, 1.0, 1e3])
@@ -76,35 +88,126 @@ def test_the_peak_acceleration_has_the_mean_asked(mean: float, speed: float, jer
     assert speed / ramp_time(speed, peak, jerk) == pytest.approx(mean, rel=1e-9)
 
 
+def after(state: tuple[Any, ...], jerk: Any, time: Any) -> tuple[Any, ...]:
+    """Distance, speed and acceleration after a time of constant jerk."""
+    s, v, a = state
+    return s + time * v + time**2 * a / 2 + time**3 * jerk / 6, v + time * a + time**2 * jerk / 2, a + time * jerk
+
+
+changes = st.tuples(*[st.floats(0, 1)] * 2, st.floats(0.05, 2), *[st.floats(-1, 1)] * 2)
+"""First and last speed over the top one, distance over that of the ramps by the top speed; 10^x of the limits."""
+
+
+def change(drawn: tuple[float, ...]) -> tuple[float, ...]:
+    """Distance, first, last, top speed, acceleration and jerk: a distance that is enough, if barely."""
+    first, last, share, x, y = drawn
+    acceleration, jerk = 10**x, 10 ** (x + y)
+    least = ramp_distance(first, last, acceleration, jerk)
+    most = ramp_distance(first, 1, acceleration, jerk) + ramp_distance(1, last, acceleration, jerk)
+    return max(least * (1 + 1e-9), share * most, 1e-3), first, last, 1.0, acceleration, jerk
+
+
+@given(changes)
+def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
+    asked = change(drawn)
+    distance, first, last, top, acceleration, jerk = asked
+    found = ramps.fastest(*asked)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(ramps, "Ruckig", lambda _: SimpleNamespace(calculate=lambda *_: None))
+        made = ramps.fastest(*asked)
+    for phases in (found, made):
+        s, v, a = 0.0, first, 0.0
+        for t, j in phases:
+            assert t > 0
+            assert abs(j) <= jerk * (1 + 1e-9)
+            s, v, a = after((s, v, a), j, t)
+            assert abs(a) <= acceleration * (1 + 1e-9)
+            assert min(first, last) - 1e-9 <= v <= top + 1e-9
+        assert (s, v, a) == pytest.approx((distance, last, 0.0), abs=1e-8 * (1 + acceleration + distance))
+    assert sum(t for t, _ in made) == pytest.approx(sum(t for t, _ in found), rel=1e-6)
+
+
+@given(st.floats(0, 5), st.floats(1e-3, 5), st.floats(-1, 2), st.floats(-1, 3))
+def test_the_speed_within_reach_is_the_inverse_of_the_ramps_distance(
+    speed: float, gain: float, x: float, y: float
+) -> None:
+    distance = ramp_distance(speed, speed + gain, 10**x, 10**y)
+    assert ramps.reach(speed, distance, 10**x, 10**y) == pytest.approx(speed + gain, rel=1e-9)
+
+
+@given(seeds, st.integers(1, 6))
+def test_pieces_of_any_jerk_have_their_extreme_speeds_among_the_peaks_and_times_and_distances_are_inverse(
+    seed: int, count: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    t, jerk = np.concatenate([[0.0], np.cumsum(rng.uniform(0.1, 1, count))]), rng.normal(size=count)
+    states = [(0.0, 20.0, rng.normal())]
+    for step, j in zip(np.diff(t), jerk, strict=True):
+        states.append(after(states[-1], j, step))
+    s, v, a = np.array(states).T
+    profile = SpeedProfile(t, s, v, a, jerk)
+    times = np.sort(np.append(rng.uniform(0, t[-1], 40), t))
+    motion, peaks = profile.at(times), profile.peaks()
+    fine = profile.at(np.linspace(0, t[-1], 4001)).speed
+    assert peaks.speed.max() == pytest.approx(fine.max(), abs=1e-6)
+    assert peaks.speed.min() == pytest.approx(fine.min(), abs=1e-6)
+    assert profile.at_distance(motion.distance).t == pytest.approx(times, abs=1e-12 * (1 + t[-1]))
+    for value, expected in zip(profile.function().map(len(times))(times[None]), motion[1:4], strict=False):
+        assert np.array(value).ravel() == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(2, 6), st.sampled_from(["cubic", "quintic"]))
+def test_the_grid_resolves_the_maximum_velocity_curve_wherever_it_is_below_the_asked_speed(
+    seed: int, count: int, kind: Any
+) -> None:
+    rng = np.random.default_rng(seed)
+    path = smooth(random_path(rng, count), 10 ** rng.uniform(-3, -0.5), kind=kind)
+    limits = LineLimits(10 ** rng.uniform(-1, 1), 5.0, 200.0, centripetal=10 ** rng.uniform(-1, 1.5))
+
+    def most(distance: Any) -> Any:
+        with np.errstate(divide="ignore"):
+            return np.sqrt(limits.centripetal / path.curvature(np.ravel(distance))).reshape(np.shape(distance))
+
+    grid = make_grid(path, limits, None)
+    at = np.searchsorted(grid.distance, path.bounds)
+    assert (grid.distance[at] == path.bounds).all()
+    back = path.bounds[1:-1] - grid.before
+    assert ((back > 0) & (back <= 1.001e-9 * path.length)).all()
+    for side in (-1e-9, 1e-9):
+        beside = np.clip(path.bounds + side * path.length, 0, path.length)
+        assert (np.minimum(grid.permitted[at], grid.asked.max()) <= most(beside) * (1 + 1e-3)).all()
+    low = np.minimum(grid.permitted[:-1], grid.permitted[1:])
+    slow = low < grid.asked
+    inside = grid.distance[:-1, None] + np.diff(grid.distance)[:, None] * np.linspace(0, 1, 9)
+    assert (low[slow, None] <= most(inside)[slow] * (1 + 2e-4)).all()  # and no more is kept back than that
+    assert (grid.permitted >= most(grid.distance) * (1 - 3e-4))[np.setdiff1d(np.arange(len(grid.distance)), at)].all()
+
+
 def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001) -> None:
     """Rest to rest, continuous to the acceleration, within the limits of the line: ten times finer than 1 ms."""
     profile, limits = plan.profile, plan.limits
     step = np.diff(profile.t)
     assert (step > 0).all()
-    s, v, a, j = profile.distance[:-1], profile.speed[:-1], profile.acceleration[:-1], profile.jerk
-    for end, reached, scale in (
-        (profile.distance, s + step * (v + step * (a / 2 + step * j / 6)), plan.path.length),
-        (profile.speed, v + step * (a + step * j / 2), asked.max()),
-        (profile.acceleration, a + step * j, limits.acceleration),
-    ):
-        assert end[1:] == pytest.approx(reached, abs=1e-9 * scale)
-    t = np.linspace(0, plan.duration, times)
-    motion = plan.at(t)
+    ends = (profile.distance, profile.speed, profile.acceleration)
+    reached = after(tuple(end[:-1] for end in ends), profile.jerk, step)
+    for end, there, scale in zip(ends, reached, (plan.path.length, asked.max(), limits.acceleration), strict=True):
+        assert end[1:] == pytest.approx(there, abs=1e-9 * scale)
+    motion = plan.at(np.linspace(0, plan.duration, times))
     assert [motion.speed[0], motion.speed[-1]] == [0, 0]
     assert motion.distance[-1] == pytest.approx(plan.path.length, rel=1e-12)
     assert (np.diff(motion.distance) >= -1e-12 * plan.path.length).all()
-    piece = np.searchsorted(plan.path.bounds, motion.distance, side="right") - 1
-    of_piece = np.append(asked, asked[-1])[np.maximum(piece, 0)]
-    near = np.append(asked, asked[-1])[np.maximum(piece - 1, 0)]
-    on_bound = np.abs(plan.path.bounds[np.maximum(piece, 0)] - motion.distance) < 1e-9 * plan.path.length
-    assert (motion.speed <= np.where(on_bound, np.maximum(of_piece, near), of_piece) * (1 + 1e-9)).all()
+    # on a bound between two pieces the faster one counts
+    sides = motion.distance + np.array([[-1e-9], [1e-9]]) * plan.path.length
+    piece = np.clip(np.searchsorted(plan.path.bounds, sides, side="right") - 1, 0, len(asked) - 1)
+    assert (motion.speed <= asked[piece].max(axis=0) * (1 + 1e-9)).all()
     assert np.abs(motion.acceleration).max() <= limits.acceleration * (1 + 1e-9)
     assert np.abs(motion.jerk).max() <= limits.jerk * (1 + 1e-9)
     if np.isfinite(limits.centripetal):
         assert (motion.speed**2 * plan.path.curvature(motion.distance)).max() <= limits.centripetal * 1.001
 
 
-@few
+@settings(max_examples=40)
 @given(seeds, st.integers(1, 9), st.sampled_from(["cubic", "quintic"]), st.booleans())
 def test_random_paths_never_exceed_asked_speed_or_limits(seed: int, count: int, kind: Any, each: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -143,7 +246,7 @@ def test_any_sequence_of_speeds_is_reached_between_its_ramps() -> None:
 
 def test_centripetal_acceleration_slows_the_blends_only() -> None:
     path = example("quintic")
-    plan = schedule(path, LineLimits(speed=1.0, acceleration=5.0, jerk=200.0, centripetal=5.0))
+    plan = schedule(path, replace(LIMITS, centripetal=5.0))
     motion = plan.sample(1e-3)
     assert np.max(motion.speed**2 * path.curvature(motion.distance)) < 5.0 * 1.001
     assert np.max(motion.speed) == pytest.approx(1.0, abs=1e-6)
@@ -171,11 +274,11 @@ def test_a_slower_asked_speed_needs_no_dip() -> None:
 
 def test_strict_refuses_and_says_where() -> None:
     with pytest.raises(ProblemError, match=r"2 place\(s\).*\n.* m: centripetal acceleration permits"):
-        schedule(example("quintic"), LineLimits(1.0, 5.0, 200.0, centripetal=5.0), strict=True)
+        schedule(example("quintic"), replace(LIMITS, centripetal=5.0), strict=True)
 
 
 def test_the_last_sample_is_the_end() -> None:
-    plan = schedule(line(1.0), LineLimits(1.0, 5.0, 200.0))
+    plan = schedule(line(1.0), LIMITS)
     t = plan.sample(2e-3).t
     assert t[-1] == plan.duration
     assert np.diff(t)[:-1] == pytest.approx(2e-3, rel=1e-9)
@@ -186,7 +289,7 @@ def test_the_last_sample_is_the_end() -> None:
 def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> None:
     for name in ("speed", "acceleration", "jerk", "centripetal"):
         with pytest.raises(ProblemError, match=f"{name} limit"):
-            replace(LineLimits(1.0, 5.0, 200.0), **{name: bad})  # type: ignore[arg-type]
+            replace(LIMITS, **{name: bad})  # type: ignore[arg-type]
     for values in ((bad, 1.0, 200.0), (5.0, bad, 200.0), (5.0, 1.0, bad)):
         with pytest.raises(ProblemError, match="positive"):
             peak_acceleration(*values)
@@ -209,11 +312,11 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
 )
 def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ProblemError, match=message):
-        LineLimits(**{"speed": 1.0, "acceleration": 5.0, "jerk": 200.0, **given})
+        replace(LIMITS, **given)
 
 
 def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
-    plan = schedule(line(1.0), LineLimits(1.0, 5.0, 200.0))
+    plan = schedule(line(1.0), LIMITS)
     for wrong in (-0.1, 9.0, NAN):
         with pytest.raises(ProblemError, match="outside the schedule"):
             plan.at(wrong)
@@ -229,21 +332,16 @@ def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
 @pytest.mark.parametrize("wrong", ["x", None, {}, 1j, [[0.1]]])
 def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
     path = smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1)
-    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
-    calls: tuple[Callable[[Any], Any], ...] = (
-        plan.sample,
-        lambda value: schedule(path, value),
-        lambda value: schedule(value, LineLimits(1.0, 5.0, 200.0)),
-        lambda value: peak_acceleration(value, 1.0, 200.0),
-    )
-    for call in calls:
-        with pytest.raises(ProblemError):
-            call(wrong)
+    plan = schedule(path, LIMITS)
+    calls: list[tuple[Callable[[Any], Any], type[Exception], str]] = [
+        (plan.sample, ProblemError, "sample period"),
+        (lambda value: schedule(path, value), ProblemError, "must be a LineLimits"),
+        (lambda value: schedule(value, LIMITS), ProblemError, "has no length"),
+        (lambda value: peak_acceleration(value, 1.0, 200.0), ProblemError, "must be positive"),
+    ]
     if wrong is not None:  # numpy reads it as nan, refused elsewhere
-        for call in (plan.at, plan.time_at):
-            with pytest.raises(ProblemError, match=r"not numeric|shape"):
-                call(wrong)
-        with pytest.raises(ModelError):
-            path.at(wrong)
-        with pytest.raises(ModelError):
-            path.blend(wrong)
+        calls += [(call, ProblemError, r"not numeric|shape") for call in (plan.at, plan.time_at)]
+        calls += [(path.at, ModelError, "distance"), (path.blend, ModelError, "vertex")]
+    for call, error, message in calls:
+        with pytest.raises(error, match=message):
+            call(wrong)

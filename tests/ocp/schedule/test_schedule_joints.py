@@ -35,7 +35,7 @@ from ocp.schedule import (
 )
 from ocp.schedule.grid import Grid, make_grid
 from ocp.schedule.joints import Attempt, Broken, broken_ramps, ease_ramps, relax_ramps, slow_down
-from ocp.schedule.limits import cause_names
+from ocp.schedule.limits import cause_names, line_demands
 from ocp.schedule.ramps import plan as planned
 from tests.models.paths.task_paths import random_arm_path, seeds
 from tests.models.paths.test_paths import example
@@ -43,6 +43,7 @@ from tests.ocp.problems import Array
 
 ARM = Scara(0.4, 0.4)
 SLOW = JointLimits([3.0, 3.0, 1.0, 6.0], [15.0, 15.0, 5.0, 30.0], [300.0, 300.0, 200.0, 800.0])
+FREE = LineLimits(1.0, 5.0, 200.0)
 
 
 def example_arm(kind: str = "quintic") -> ScaraPath:
@@ -68,9 +69,8 @@ def test_random_arms_keep_all_limits_between_samples(seed: int, jerks: bool, cen
     joints = JointLimits(10 ** rng.uniform(-0.3, 1, 4), 10 ** rng.uniform(0.5, 1.7, 4), jerk)
     bend = 10 ** rng.uniform(-1, 1.5) if centripetal else np.inf
     speed = 10 ** rng.uniform(-1, 0.5)
-    plan = schedule(
-        arm.path, LineLimits(speed, 10 ** rng.uniform(0, 1.3), 10 ** rng.uniform(1, 3), bend, joints), joints=arm
-    )
+    limits = LineLimits(speed, 10 ** rng.uniform(0, 1.3), 10 ** rng.uniform(1, 3), bend, joints)
+    plan = schedule(arm.path, limits, joints=arm)
     assert (largest(plan, arm) <= 1.001).all()
     motion = plan.at(np.linspace(0, plan.duration, 20001))
     assert motion.speed.max() <= speed * (1 + 1e-9)
@@ -88,7 +88,7 @@ def test_random_arms_keep_all_limits_between_samples(seed: int, jerks: bool, cen
 
 def test_joint_motion_has_the_derivatives_of_the_joints_by_time() -> None:
     arm = example_arm()
-    plan = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=SLOW), joints=arm)
+    plan = schedule(arm.path, replace(FREE, joints=SLOW), joints=arm)
     steps = np.concatenate([plan.profile.t, plan.time_at(arm.path.bounds)])
     t = np.linspace(0.01, plan.duration - 0.01, 400)
     t = t[np.abs(t[:, None] - steps).min(axis=1) > 1e-4]
@@ -109,8 +109,8 @@ def test_joint_motion_has_the_derivatives_of_the_joints_by_time() -> None:
 )
 def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind: str) -> None:
     arm = example_arm()
-    free = schedule(arm.path, LineLimits(1.0, 5.0, 200.0))
-    asked = LineLimits(1.0, 5.0, 200.0, joints=limits)
+    free = schedule(arm.path, FREE)
+    asked = replace(FREE, joints=limits)
     plan = schedule(arm.path, asked, joints=arm)
     assert plan.duration > free.duration
     used = largest(plan, arm).max()
@@ -123,11 +123,11 @@ def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind
 def test_the_curvature_of_the_joints_counts_at_a_steady_speed_too() -> None:
     """q'' v^2 alone, where the line acceleration is zero."""
     arm = example_arm()
-    plan = schedule(arm.path, LineLimits(1.0, 5.0, 200.0), joints=arm)
+    plan = schedule(arm.path, FREE, joints=arm)
     s = np.linspace(0.3, 1.3, 2001) * arm.path.length / 1.7
     steady = np.abs(arm.at(s).second).max(axis=0)
     limits = JointLimits(acceleration=0.5 * steady)
-    slowed = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=limits), joints=arm)
+    slowed = schedule(arm.path, replace(FREE, joints=limits), joints=arm)
     assert slowed.duration > plan.duration
     assert largest(slowed, arm)[1] <= 1.001
 
@@ -135,20 +135,41 @@ def test_the_curvature_of_the_joints_counts_at_a_steady_speed_too() -> None:
 def test_limits_that_do_not_bind_change_nothing() -> None:
     arm = example_arm()
     loose = schedule(arm.path, LineLimits(1.0, 5.0, 200.0, 1e3, JointLimits(1e3, 1e4, 1e6)), joints=arm, strict=True)
-    assert loose.duration == schedule(arm.path, LineLimits(1.0, 5.0, 200.0)).duration
+    assert loose.duration == schedule(arm.path, FREE).duration
 
 
 def test_what_cannot_be_scheduled_is_a_named_error() -> None:
     arm = example_arm()
-    limits = LineLimits(1.0, 5.0, 200.0, joints=SLOW)
+    limits = replace(FREE, joints=SLOW)
     with pytest.raises(ProblemError, match="joint limits need the joints"):
         schedule(arm.path, limits)
     with pytest.raises(ProblemError, match="the arm has 4 joints"):
-        schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=JointLimits([1.0, 2.0])), joints=arm)
+        schedule(arm.path, replace(FREE, joints=JointLimits([1.0, 2.0])), joints=arm)
     bent = Path((Line((0.3, 0, 0), (0.5, 0, 0)), Arc.through((0.5, 0, 0), (0.5, 0.2, 0), (0.3, 0.4, 0))))
     cubic = scara_along(ARM, smooth(bent, 0.05, kind="cubic"))
     with pytest.raises(ProblemError, match=r"curvature jumps.*quintic"):
         schedule(cubic.path, limits, joints=cubic)
+
+
+def test_where_the_curvature_jumps_the_slower_side_is_permitted_and_names_the_cause() -> None:
+    bent = Path((Arc.through((0.3, 0.4, 0), (0.5, 0.2, 0), (0.5, 0, 0)), Line((0.5, 0, 0), (0.5, -0.4, 0))))
+    arm = scara_along(ARM, smooth(bent, 0.02, kind="cubic"))
+    limits = LineLimits(9.0, 5.0, 200.0, 2.0, JointLimits(2.0))
+
+    def steady(distance: NDArray[np.float64]) -> tuple[Any, Any]:
+        demand, power = line_demands(limits, arm.path.curvature(distance), arm.at(distance))
+        speeds = (1 / np.maximum(demand, 1e-99)) ** (1 / power[:, None])
+        return speeds.min(axis=0), speeds.argmin(axis=0)
+
+    grid, bounds = make_grid(arm.path, limits, arm), arm.path.bounds[1:-1]
+    at = np.searchsorted(grid.distance, bounds)
+    (before, why), (after, because) = steady(grid.before), steady(bounds)
+    assert (before < 0.99 * after)[why != because].any()
+    assert grid.permitted[at] == pytest.approx(np.minimum(before, after), rel=1e-3)
+    assert (grid.cause[at] == np.where(before < after, why, because)).all()
+    inside = np.setdiff1d(np.arange(len(grid.distance)), at)
+    assert (grid.cause[inside] == steady(grid.distance[inside])[1]).all()
+    assert len(np.unique(grid.cause)) > 1
 
 
 class BrokenJoints:
@@ -180,9 +201,9 @@ class BrokenJoints:
 )
 def test_joints_that_are_no_numbers_are_a_named_error(kind: str, value: Any, message: str) -> None:
     path, joints = example("quintic"), BrokenJoints(kind, value)
-    plan = schedule(path, LineLimits(1.0, 5.0, 200.0))
+    plan = schedule(path, FREE)
     with pytest.raises(ProblemError, match=message):
-        schedule(path, LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0)), joints=joints)
+        schedule(path, replace(FREE, joints=JointLimits(1.0)), joints=joints)
     with pytest.raises(ProblemError, match=message):
         joint_trajectory(plan, joints, 1e-3)
 
@@ -216,7 +237,7 @@ def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: 
 @pytest.fixture(scope="module")
 def sampled() -> JointTrajectory:
     arm = example_arm()
-    return joint_trajectory(schedule(arm.path, LineLimits(1.0, 5.0, 200.0, joints=SLOW), joints=arm), arm, 1e-3)
+    return joint_trajectory(schedule(arm.path, replace(FREE, joints=SLOW), joints=arm), arm, 1e-3)
 
 
 def equal(first: JointTrajectory, second: JointTrajectory) -> bool:
@@ -263,34 +284,36 @@ def test_names_with_commas_come_back_from_csv(tmp_path: File) -> None:
     assert equal(JointTrajectory.read_csv(tmp_path / "t.csv"), made)
 
 
-def test_a_trajectory_that_is_none_is_a_named_error(sampled: JointTrajectory, tmp_path: File) -> None:
-    good: dict[str, Any] = {"names": ("a",), "t": np.array([0.0, 1.0])}
-    good.update({kind: np.zeros((2, 1)) for kind in ("positions", "velocities", "accelerations")})
-    JointTrajectory(**good)
-    for wrong, message in (
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
         ({"names": ("a", "a")}, "differ"),
         ({"t": np.array([0.0, 0.0])}, "increasing"),
         ({"t": np.array([0.0, np.nan])}, "finite"),
         ({"positions": np.zeros((2, 2))}, "shape"),
         ({"velocities": np.full((2, 1), np.nan)}, "not all finite"),
-    ):
-        with pytest.raises(ProblemError, match=message):
-            JointTrajectory(**{**good, **wrong})
-    with pytest.raises(ProblemError, match="same nanosecond"):
-        JointTrajectory(**{**good, "t": np.array([0.0, 1e-10])}).to_ros()
+        ({"t": np.array([0.0, 1e-10])}, "same nanosecond"),  # which numbers may be, but no message
+    ],
+)
+def test_a_trajectory_that_is_none_is_a_named_error(wrong: dict[str, Any], message: str) -> None:
+    good: dict[str, Any] = {kind: np.zeros((2, 1)) for kind in ("positions", "velocities", "accelerations")}
+    good |= {"names": ("a",), "t": np.array([0.0, 1.0])}
+    JointTrajectory(**good).to_ros()
+    with pytest.raises(ProblemError, match=message):
+        JointTrajectory(**{**good, **wrong}).to_ros()
+
+
+def test_a_file_or_message_that_is_no_trajectory_is_a_named_error(sampled: JointTrajectory, tmp_path: File) -> None:
     broken = copy.deepcopy(sampled.to_ros())
     del broken["points"][3]["velocities"]
     with pytest.raises(ProblemError, match="velocities"):
         JointTrajectory.from_ros(broken)
     file = tmp_path / "t.csv"
-    for text, message in (("a,b\n1,2\n", "head"), ("", "head")):
+    sampled.write_csv(file)
+    for text, message in (("a,b\n1,2\n", "head"), ("", "head"), (file.read_text() + "1,2\n", "not complete")):
         file.write_text(text)
         with pytest.raises(ProblemError, match=message):
             JointTrajectory.read_csv(file)
-    sampled.write_csv(file)
-    file.write_text(file.read_text() + "1,2\n")
-    with pytest.raises(ProblemError, match="not complete"):
-        JointTrajectory.read_csv(file)
 
 
 # ---- ramps made gentler, and given back ----------------------------------------------------------------------------
