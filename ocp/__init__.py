@@ -4,8 +4,8 @@ from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate, certificate
 from ocp.builders.cts import roll_problem, spline_targets
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
-from ocp.builders.standing.options import FreeTime, Limits, Weights
-from ocp.builders.standing.plan import standing_problem
+from ocp.builders.standing.plan import plan_standing
+from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
@@ -19,6 +19,7 @@ from ocp.methods import prepare, solve
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Solution
+from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.tightening import tighten
@@ -54,6 +55,7 @@ __all__ = [
     "minimum_velocity_problem",
     "plan_minimum_time",
     "plan_minimum_velocity",
+    "plan_standing",
     "prepare",
     "refine",
     "resolve",

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array
 from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
-from models.robot.indices import joint_excess, joint_limit_index
+from models.robot.indices import joint_excess, joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass
+from models.spatial import Expression
+
+Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
+"""Whose manipulability is reported: rows of the tip's twist, or any Jacobian as a function of q, (m, n)."""
 
 ROUNDING_SLACK = 1e-9
 """How far beyond a limit rounding may carry a motion that stands exactly at it; m, rad, N."""
@@ -126,7 +130,7 @@ class StandingMotion:
         return "\n".join(lines)
 
 
-def motion_function(machine: Standing, external: External | None = None, rows: Sequence[int] = (3, 4, 5)) -> Any:
+def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
     """What a motion takes at one instant: (time, q, q', q'') -> the attributes of a StandingMotion after those.
 
     A casadi Function of the names time, q, qd, qdd; of MX symbols where `external` needs them.
@@ -144,7 +148,7 @@ def standing_motion(
     joint_velocities: ArrayInput,
     joint_accelerations: ArrayInput,
     external: External | None = None,
-    rows: Sequence[int] = (3, 4, 5),
+    rows: Rows = (3, 4, 5),
 ) -> StandingMotion:
     """Evaluate a motion.
 
@@ -153,7 +157,7 @@ def standing_motion(
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
         external: Wrenches as a function of time and tip position.
-        rows: Of the tip's twist, whose manipulability is reported.
+        rows: Whose manipulability is reported.
 
     Raises:
         ModelError: No times, shapes that do not match, nan.
@@ -175,7 +179,7 @@ def evaluate(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[s
     return {name: value[:, 0] if name in numbers else value for name, value in values.items()}
 
 
-def _motion_function(machine: Standing, external: External | None, rows: Sequence[int], symbols: Any) -> Any:
+def _motion_function(machine: Standing, external: External | None, rows: Rows, symbols: Any) -> Any:
     n, robot, placement = machine.joint_size, machine.robot, machine.world_from_base()
     time, q, qd, qdd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("qdd", n)
     tip = machine.tip_pose((), q).position
@@ -194,7 +198,7 @@ def _motion_function(machine: Standing, external: External | None, rows: Sequenc
         "foot_margin": machine.support.margin(point),
         "joint_excess": joint_excess(robot, q),
         "joint_limit_index": joint_limit_index(robot, q),
-        "manipulability": machine.manipulability((), q, rows),
+        "manipulability": manipulability_of(rows(q)) if callable(rows) else machine.manipulability((), q, rows),
     }
     inputs = ["time", "q", "qd", "qdd"]
     values = [ca.densify(value) for value in outputs.values()]

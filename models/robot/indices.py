@@ -13,6 +13,7 @@ from models.robot.robot import Robot
 from models.spatial import Expression, determinant, expression, on_scalars
 
 TWIST_SIZE = 6
+EXPANDED_ROWS = 7  # of a determinant without divisions
 
 
 def joint_limit_index(robot: Robot, q: Expression) -> Expression:
@@ -49,8 +50,21 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
     Raises:
         ModelError: Rows out of range, repeated, or none.
     """
-    task = ca.densify(expression(jacobian))[checked_rows(rows), :]
-    return ca.sqrt(ca.fmax(determinant(ca.mtimes(task, task.T)), 0))  # rounding can make a zero negative
+    return manipulability_of(ca.densify(expression(jacobian))[checked_rows(rows), :])
+
+
+@on_scalars
+def manipulability_of(task: Expression) -> Expression:
+    """sqrt(det(G G')) of the Jacobian G of any task, shape (m, n). Shape (1, 1)."""
+    square = ca.mtimes(task, task.T)
+    if square.shape[0] <= EXPANDED_ROWS:
+        volume = determinant(square)
+    else:  # of two arms, say: an expansion would be long
+        diagonal, _, _ = ca.ldl(ca.densify(square), False)
+        volume = 1
+        for entry in ca.vertsplit(ca.vec(diagonal)):
+            volume = volume * entry
+    return ca.sqrt(ca.fmax(volume, 0))  # rounding can make a zero negative
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:

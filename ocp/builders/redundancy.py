@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
+from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
@@ -26,10 +27,16 @@ from ocp.local.rates import LocalSolution, least_rates, resolve
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.tasks.checks import check_closed, checked_tasks, dependent_rows
+from ocp.tasks.checks import (
+    check_closed,
+    checked_configuration,
+    checked_horizon,
+    checked_tasks,
+    checked_weights,
+    dependent_rows,
+)
 from ocp.tasks.equations import TaskEquations, bind
-from ocp.tasks.start import Array, Velocity, checked_configuration, checked_horizon, checked_weights
-from ocp.tasks.tip_task import TipTask, one_of
+from ocp.tasks.tip_task import TipTask, Velocity, one_of
 
 __all__ = ["minimum_velocity_problem", "plan_minimum_velocity"]
 

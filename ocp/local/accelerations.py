@@ -15,18 +15,20 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array
 from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
 from ocp.errors import ProblemError
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
-from ocp.tasks.start import Array, checked_start
-from ocp.tasks.tip_path import Path, check_path, linear_rows, path_derivatives
+from ocp.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
+from ocp.tasks.equations import bind, on_symbols
+from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import checked_place, is_finite
 
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]
 
 CHUNK = 50  # steps between two looks at the motion
-TIP_TOLERANCE = 1e-3  # m
+TIP_TOLERANCE = 1e-3  # m and rad
 CVODES_STEPS = 5000  # of the integrator between two samples
 
 
@@ -55,7 +57,7 @@ class AccelerationSolution:
         law: What made it.
         motion: Positions, velocities, accelerations and what they take, at every step up to the end or the stop, the
             instant of which is the last where it has finite numbers.
-        tip_error: Distance of the tip from its path in the task's rows. Shape (M,), m.
+        tip_error: Norm of the pose errors in the tasks' rows, m and rad; zero for velocities. Shape (M,).
         stopped: Why it ends before the horizon; None when it does not.
     """
 
@@ -69,7 +71,7 @@ class AccelerationSolution:
         """What is wrong with the motion, () if nothing: a reason to stop, or one of those that do not end it.
 
         ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point does;
-        ``joint_limits``; ``leaves_path``: the tip does, by more than 1 mm.
+        ``joint_limits``; ``leaves_path``: a tip leaves its pose, by more than 1e-3 (m or rad).
         """
         motion = self.motion
         wrong = {
@@ -94,8 +96,7 @@ class AccelerationSolution:
 
 def resolve_accelerations(
     machine: Standing,
-    tip_path: Path,
-    rows: Sequence[int],
+    tasks: TipTask | Sequence[TipTask],
     start_joints: Any,
     horizon: float,
     *,
@@ -116,8 +117,7 @@ def resolve_accelerations(
 
     Args:
         machine: A Standing machine.
-        tip_path: Position of the tip in the task's rows as a function of a casadi time, m, world axes.
-        rows: Linear rows of the tip's twist that the task fixes, 3..5.
+        tasks: A TipTask, or several that are done at once.
         start_joints: Shape (n,), rad or m.
         horizon: Final time, s.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
@@ -135,27 +135,21 @@ def resolve_accelerations(
         speed_limit: Joint speed, rad/s or m/s, above which the motion counts as diverged.
 
     Raises:
-        ProblemError: Something does not fit the machine, or the task cannot be done even at the start.
+        ProblemError: Something does not fit the machine, or the tasks cannot be done even at the start.
     """
-    start = checked_start(machine, rows, start_joints, horizon, None)
-    rows = start.rows
-    linear_rows(rows)
-    checked_law(machine, rows, law, layers, null_damping)
+    equations, duration = bind(machine, tasks), checked_horizon(horizon)
+    joints, base = checked_configuration(machine, start_joints, None)
+    checked_law(machine, equations.size, law, layers, null_damping)
     for what, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
         if not (is_finite(number) and number > 0):
             raise ProblemError(f"{what} must be a positive number, not {number!r}")
     if integrator not in ("rk4", "cvodes"):
         raise ProblemError(f"unknown integrator {integrator!r}; use 'rk4' or 'cvodes'")
-    check_path(machine, tip_path, rows, start.joints, start.base, start.horizon)
+    checked_tasks(equations, base, joints, duration)
+    check_length(equations, base, duration)
     n = machine.joint_size
-    velocities = np.zeros(n)
-    if start_velocities is not None:
-        try:
-            velocities = np.array(start_velocities, dtype=float).ravel()
-        except (TypeError, ValueError):
-            velocities = np.zeros(0)
-        if velocities.shape != (n,) or not np.isfinite(velocities).all():
-            raise ProblemError(f"start_velocities must be {n} numbers, one for each joint, not {start_velocities!r}")
+    given = np.zeros(n) if start_velocities is None else start_velocities
+    velocities = checked_numbers(given, n, "start_velocities", "one entry for each joint")
     if not isinstance(stabiliser, Stabiliser | None):
         raise ProblemError(f"stabiliser must be a Stabiliser(...), not {stabiliser!r}")
     place = _target(machine.most_stable_point if zmp is None else zmp)
@@ -163,36 +157,23 @@ def resolve_accelerations(
     def law_function(symbols: Any) -> Any:
         time, q, qd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)
         qdd = accelerations(
-            machine,
-            tip_path,
-            rows,
-            law,
-            time,
-            q,
-            qd,
-            zmp=place,
-            external=external,
-            layers=layers,
-            stabiliser=stabiliser,
-            null_damping=null_damping,
-        )
-        tip = ca.densify(machine.tip_pose((), q).position)[linear_rows(rows)]
-        gap = ca.norm_2(tip - path_derivatives(tip_path, time, len(rows))[0])
+            machine, equations, law, time, q, qd, zmp=place, external=external, layers=layers,
+            stabiliser=stabiliser, null_damping=null_damping,
+        )  # fmt: skip
+        gap = ca.norm_2(equations.error(ca.DM(0, 1), q, equations.targets(time)))
         return ca.Function("law", [time, q, qd], [ca.densify(qdd), gap], {"cse": True})
 
-    try:
-        function = law_function(ca.SX)
-    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-        function = law_function(ca.MX)
-    if not np.isfinite(np.array(function(0.0, start.joints, velocities)[0])).all():
+    function = on_symbols(law_function)
+    if not np.isfinite(np.array(function(0.0, joints, velocities)[0])).all():
         raise ProblemError(
-            f"law {law!r} has no accelerations at the start joints {start.joints.tolist()}: a task, the zero moment "
+            f"law {law!r} has no accelerations at the start joints {joints.tolist()}: a task, the zero moment "
             "point or a layer cannot be moved there; start elsewhere or ask for less"
         )
-    steps = max(int(np.ceil(start.horizon / step - 1e-9)), 1)
-    simulate = _Simulation(function, n, start.horizon / steps, integrator, tolerance)
-    watch = _Watch(motion_function(machine, external, rows), function, stop_at_lift_off, speed_limit)
-    state, done = np.concatenate([start.joints, velocities]), 0
+    steps = max(int(np.ceil(duration / step - 1e-9)), 1)
+    simulate = _Simulation(function, n, duration / steps, integrator, tolerance)
+    reported = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
+    watch = _Watch(reported, function, stop_at_lift_off, speed_limit)
+    state, done = np.concatenate([joints, velocities]), 0
     stopped = watch.look(np.zeros(1), state[None, :])
     while done < steps and stopped is None:
         count = min(CHUNK, steps - done)

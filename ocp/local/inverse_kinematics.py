@@ -14,10 +14,11 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
+from models.arrays import Array
 from ocp.errors import ProblemError
+from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
-from ocp.tasks.start import Array, checked_configuration
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics"]

@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 
 from models.machines.standing import External, Standing, wrenches_at
-from models.robot.indices import jacobian_manipulability, joint_limit_index
+from models.robot.indices import joint_limit_index, manipulability_of
 from models.robot.motion import center_of_mass_motion, momentum
 from ocp.errors import ProblemError
 from ocp.local.rates import least_rates
-from ocp.tasks.tip_path import Path, path_derivatives
+from ocp.tasks.equations import TaskEquations
 from ocp.tasks.zmp_rules import is_finite
 
 __all__ = ["Law", "Layer", "Stabiliser", "accelerations", "checked_law"]
@@ -31,7 +31,7 @@ class Layer:
     """A posture index that spare freedom drives, below the task and the zero moment point.
 
     Attributes:
-        index: ``joint_limits``, p1 (23), to be kept small; ``manipulability`` of the task's rows, p2 (27), to be kept
+        index: ``joint_limits``, p1 (23), to be kept small; ``manipulability`` of the tasks' rows, p2 (27), to be kept
             large.
         demand: What is asked: negative makes p1 fall, positive makes p2 grow.
         form: ``assigned``: the second derivative of the index is the demand, (25)-(26), (29)-(33); takes one degree of
@@ -97,8 +97,12 @@ class _Stack:
         self.accelerations = self.accelerations + ca.mtimes(self.free, direction)
 
 
-def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequence[Layer], damping: float) -> None:
-    """Raise ProblemError for an unknown law, or one that asks for more than the machine has joints."""
+def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer], damping: float) -> None:
+    """Raise ProblemError for an unknown law, or one that asks for more than the machine has joints.
+
+    Args:
+        size: Rows of all tasks.
+    """
     if law not in get_args(Law):
         raise ProblemError(f"unknown law {law!r}; use one of {', '.join(get_args(Law))}")
     if not (is_finite(damping) and damping >= 0):
@@ -106,7 +110,7 @@ def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequen
     if not isinstance(layers, list | tuple) or not all(isinstance(layer, Layer) for layer in layers):
         raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}")
     axes = len(machine.moving_directions)
-    tasks = {"the tip": len(rows), "the zero moment point": 0 if law == "pseudo_inverse" else axes}
+    tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
     tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
     tasks |= {"the assigned layers": sum(layer.form == "assigned" for layer in layers)}
     if sum(tasks.values()) > machine.joint_size:
@@ -116,8 +120,7 @@ def checked_law(machine: Standing, rows: Sequence[int], law: Law, layers: Sequen
 
 def accelerations(
     machine: Standing,
-    tip_path: Path,
-    rows: Sequence[int],
+    equations: TaskEquations,
     law: Law,
     time: Any,
     q: Any,
@@ -132,22 +135,19 @@ def accelerations(
     """Joint accelerations of a law. Shape (n, 1).
 
     Args:
-        tip_path: Position of the tip in the task's rows as a function of time, m.
-        rows: Linear rows of the tip's twist that the task fixes, 3..5.
-        law: ``pseudo_inverse``: the task alone. ``augmented``: task and zero moment point together, (20).
-            ``null_space``: the zero moment point in the null space of the task, (21)-(22). ``stabilised``: as
+        equations: What the tips do.
+        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, (20).
+            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: as
             augmented, with the centre of mass commanded in their null space.
         time, q, qd: Symbols of one kind.
         zmp: Where the zero moment point is to be, (x, y) of the time, m, in the directions in which motion moves it.
         layers: Applied in this order after the law.
         null_damping: Of the joint velocities in the freedom that is left at last, 1/s.
     """
-    chosen, directions = list(rows), ca.DM(machine.moving_directions)
-    tip = machine.tip_pose((), q).position
-    wrenches = wrenches_at(external, time, tip)
-    jacobian = ca.densify(machine.tip_jacobian((), q))[chosen, :]
-    bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
-    task = path_derivatives(tip_path, time, len(chosen))[2] - bias
+    directions, none = ca.DM(machine.moving_directions), ca.DM(0, 1)
+    wrenches = wrenches_at(external, time, machine.tip_pose((), q).position)
+    jacobian = equations.jacobian(none, q)
+    task = -equations.acceleration(none, q, qd, ca.DM(machine.joint_size, 1), time)
     place = zmp(time)
     zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
@@ -173,7 +173,7 @@ def accelerations(
 def _index(layer: Layer, machine: Standing, jacobian: Any, q: Any) -> Any:
     if layer.index == "joint_limits":
         return joint_limit_index(machine.robot, q)
-    return jacobian_manipulability(jacobian, range(jacobian.shape[0]))
+    return manipulability_of(jacobian)
 
 
 def _apply(layer: Layer, stack: _Stack, index: Any, q: Any, qd: Any) -> None:

@@ -14,12 +14,12 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
+from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.errors import ProblemError
-from ocp.tasks.checks import checked_tasks, dependent_rows
+from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
 from ocp.tasks.equations import TaskEquations, bind
-from ocp.tasks.start import Array, Velocity, checked_configuration, checked_horizon, checked_weights
-from ocp.tasks.tip_task import TipTask, one_of
+from ocp.tasks.tip_task import TipTask, Velocity, one_of
 
 __all__ = ["LocalSolution", "least_rates", "resolve"]
 

@@ -1,28 +1,94 @@
-"""Checks of tasks against a machine and a start, before anything is solved."""
+"""Checks of tasks against a machine and a start, before anything is solved: for builders and local resolution alike."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from models import Machine
+from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.tasks.equations import TaskEquations
-from ocp.tasks.geometry import is_holonomic, target_size
-from ocp.tasks.start import Array
+from ocp.tasks.geometry import Bound, is_holonomic, target_size
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["check_closed", "checked_tasks", "dependent_rows"]
+__all__ = [
+    "check_closed",
+    "check_length",
+    "check_rest",
+    "checked_configuration",
+    "checked_horizon",
+    "checked_numbers",
+    "checked_tasks",
+    "checked_weights",
+    "dependent_rows",
+]
 
-SAMPLES = 201
-FINE = 2001
+TRACK_SAMPLES = 201
+CLOSURE_SAMPLES = 2001
 CLOSED = 1e-6
 """Largest gap of a closed path, m and rad."""
+STILL = 1e-6
+"""Largest velocity asked for where the joints are to rest, m/s and rad/s."""
+
+
+def checked_horizon(horizon: Any) -> float:
+    """The horizon; ProblemError unless it is a positive, finite number."""
+    try:
+        duration = float(horizon)
+    except (TypeError, ValueError):
+        duration = np.nan
+    if not 0 < duration < np.inf:
+        raise ProblemError(f"horizon must be a positive number of seconds, not {horizon!r}")
+    return duration
+
+
+def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
+    """Joints (joint_size,) and base (base_size,) at the start; the machine's base_home() if None.
+
+    Raises:
+        ProblemError: Wrong sizes, not finite; a quaternion that is not of unit length.
+    """
+    if joints is None:
+        raise ProblemError("start_joints are missing; inverse_kinematics(machine, task) finds some for a pose")
+    angles = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
+    home = machine.base_home() if base is None else base
+    place = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
+    if machine.base_size == 7 and abs(np.linalg.norm(place[3:]) - 1) > 1e-9:
+        raise ProblemError(f"start_base has the quaternion {place[3:].tolist()}, which is not of unit length")
+    return angles, place
+
+
+def checked_weights(weights: Any, size: int) -> Array:
+    """Weights of the squared joint rates, ones if None; ProblemError unless they are positive. Shape (size,)."""
+    if weights is None:
+        return np.ones(size)
+    given = checked_numbers(weights, size, "weights", "one for each joint")
+    if not (given > 0).all():
+        raise ProblemError(f"weights {given.tolist()} must be positive")
+    return given
+
+
+def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
+    """Finite numbers as a flat array; ProblemError, with their name and meaning, unless there are `size` of them."""
+    try:
+        array = np.asarray(value, dtype=float).ravel()
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{what} {value!r} is not numeric") from error
+    if array.shape != (size,):
+        raise ProblemError(f"{what} has {array.size} entries, expected {size}: {meaning}")
+    if not np.isfinite(array).all():
+        raise ProblemError(f"{what} {array.tolist()} is not finite")
+    return array
 
 
 def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon: float, *, start: bool = True) -> None:
     """Raise ProblemError where tasks ask for what no joint moves, what cannot be asked at once, or a jump at the start.
 
     Args:
+        horizon: Where the tasks end, s; 1 for those of a path parameter.
         start: Whether the pose at the start is checked.
     """
     place, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
@@ -43,8 +109,7 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
         )
     if not any(part.task.is_pose for part in equations.bound):
         return
-    times = np.linspace(0.0, horizon, SAMPLES)
-    values = np.array(equations.target_function().map(SAMPLES)(times[None, :]))
+    times, values = _sampled(equations, horizon, TRACK_SAMPLES)
     if not (finite := np.isfinite(values).all(axis=0)).all():
         raise ProblemError(f"the task's targets are not finite at {times[~finite][0]:g} s")
     _check_rotations(equations, values, times)
@@ -56,10 +121,9 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
             misfit = np.array(alone.misfit(base, joints, alone.target_function()(0.0)))
             gap = float(np.abs(misfit).max())
             if gap > part.task.start_gap:
-                name = part.task.link or part.tip.robot.tip
                 raise ProblemError(
-                    f"at the start joints {joints.tolist()} the frame of {name!r} is {gap:.3g} (m or rad) away from "
-                    f"where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
+                    f"at the start joints {joints.tolist()} the frame of {_frame(part)!r} is {gap:.3g} (m or rad) away "
+                    f"from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
                     "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
                 )
 
@@ -78,17 +142,31 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
     return list(range(equations.size))
 
 
+def _frame(part: Bound) -> str:
+    """The name of the link that a task moves."""
+    return part.task.link or str(part.tip.robot.tip)
+
+
+def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
+    """Equal times (count,) and the targets there, one column each."""
+    times = np.linspace(0.0, horizon, count)
+    return times, np.array(equations.target_function().map(count)(times[None, :]))
+
+
+def _parts(equations: TaskEquations, values: Array) -> list[tuple[Bound, Array]]:
+    """Each task with its rows of the targets."""
+    ends = np.cumsum([target_size(part.task) for part in equations.bound])
+    return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
+
+
 def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> None:
-    at = 0
-    for part in equations.bound:
+    for part, mine in _parts(equations, values):
         if part.task.orientation is not None:
-            first = at + (6 if part.task.position is not None else 0)
-            turn = values[first : first + 9].T.reshape(-1, 3, 3)
+            turn = mine[-12:-3].T.reshape(-1, 3, 3)
             wrong = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
             wrong |= np.linalg.det(turn) < 0
             if wrong.any():
                 raise ProblemError(f"orientation is no rotation at {times[wrong][0]:g} s: {turn[wrong][0].T.tolist()}")
-        at += target_size(part.task)
 
 
 def _has_full_rank(jacobian: Array) -> bool:
@@ -101,27 +179,72 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
     Poses by their targets, velocities by their integrals.
     """
-    times = np.linspace(0.0, horizon, FINE)
-    values = np.array(equations.target_function().map(FINE)(times[None, :]))
-    at = 0
-    for part in equations.bound:
-        task, size = part.task, target_size(part.task)
-        mine, at = values[at : at + size], at + size
+    times, values = _sampled(equations, horizon, CLOSURE_SAMPLES)
+    for part, mine in _parts(equations, values):
+        task = part.task
         if task.is_pose:
-            rates = _rate_rows(task)
-            gap = np.abs(np.delete(mine[:, -1] - mine[:, 0], rates)).max()
+            gap = np.abs(np.delete(mine[:, -1] - mine[:, 0], _rate_rows(task))).max()
         else:
             closes = is_holonomic(part)
-            whole = [mine[list(task.chosen).index(row)] if row in task.chosen else np.zeros(FINE) for row in ANGULAR]
+            none = np.zeros(CLOSURE_SAMPLES)
+            whole = [mine[list(task.chosen).index(row)] if row in task.chosen else none for row in ANGULAR]
             linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and closes[i]]
             moved = _integral(mine[linear], times[1])
             turned = _turn(np.array(whole), times[1]) if closes[[row in ANGULAR for row in task.chosen]].any() else 0.0
             gap = max(float(np.abs(moved).max(initial=0.0)), turned)
         if gap > CLOSED:
             raise ProblemError(
-                f"cyclic: the task of {task.link or part.tip.robot.tip!r} is not closed: it ends {gap:.3g} (m or rad) "
+                f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
                 "from where it began, and the joints cannot return; close the path"
             )
+
+
+def check_rest(equations: TaskEquations, *times: float | None) -> None:
+    """Raise ProblemError where a task moves at a time at which the joints are to rest; None: no time."""
+    targets = equations.target_function()
+    for time in times:
+        if time is None:
+            continue
+        for part, mine in _parts(equations, np.array(targets(time)).ravel()):
+            asked = mine[_rate_rows(part.task)] if part.task.is_pose else mine
+            if np.linalg.norm(asked) > STILL:
+                raise ProblemError(
+                    f"the task of {_frame(part)!r} moves at {asked.tolist()} (m/s or rad/s) at {time:g} s, where the "
+                    "joints are to be at rest; let it come to rest there, or say 'free' for that end"
+                )
+
+
+def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
+    """Raise ProblemError where positions in world are further from the first joint than the arm is long."""
+    for part in equations.bound:
+        task = part.task
+        if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
+            continue
+        times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, TRACK_SAMPLES)
+        wanted = values[task.linear].T
+        shoulder, reach = _reach(part.tip, base)
+        far = np.linalg.norm(wanted - shoulder[task.linear], axis=1)
+        worst = int(far.argmax())
+        if far[worst] > reach:
+            raise ProblemError(
+                f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
+                f"{times[worst]:.4g}, to {wanted[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
+            )
+
+
+def _reach(machine: Machine, base: Array) -> tuple[Array, float]:
+    """Where the first moving joint stands in the world, (3,), and how far from there the tip can be at most."""
+    robot = machine.robot
+    chain = robot.path_to(str(robot.tip))
+    first = next((i for i, joint in enumerate(chain) if joint.moves), len(chain) - 1)
+    frame = machine.world_from_base(base)
+    turn, shoulder = np.array(ca.DM(frame.rotation)), np.array(ca.DM(frame.position)).ravel()
+    for joint in chain[: first + 1]:
+        shoulder, turn = shoulder + turn @ joint.translation, turn @ joint.rotation
+    reach = float(np.linalg.norm(robot.tip_translation))
+    reach += sum(float(np.linalg.norm(joint.translation)) for joint in chain[first + 1 :])
+    reach += sum(max(abs(joint.lower), abs(joint.upper)) for joint in chain if joint.kind == "prismatic")
+    return shoulder, reach
 
 
 def _rate_rows(task: TipTask) -> list[int]:
@@ -136,16 +259,16 @@ def _rate_rows(task: TipTask) -> list[int]:
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Simpson's rule over an odd number of samples. Shapes (k, FINE) to (k,)."""
-    weights = np.ones(FINE)
+    """Simpson's rule over an odd number of samples. Shapes (k, CLOSURE_SAMPLES) to (k,)."""
+    weights = np.ones(CLOSURE_SAMPLES)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
 def _turn(spin: Array, step: float) -> float:
-    """Angle (rad) by which an angular velocity in world axes, shape (3, FINE), turns a body in all."""
+    """Angle (rad) by which an angular velocity in world axes, shape (3, CLOSURE_SAMPLES), turns a body in all."""
     turn = np.eye(3)
-    for k in range(0, FINE - 1, 2):  # Magnus' expansion of fourth order over two steps by Simpson's rule
+    for k in range(0, CLOSURE_SAMPLES - 1, 2):  # Magnus' expansion of fourth order over two steps by Simpson's rule
         first, middle, last = spin[:, k], spin[:, k + 1], spin[:, k + 2]
         width = 2 * step
         vector = width / 6 * (first + 4 * middle + last) + width**2 / 12 * np.cross(last, first)

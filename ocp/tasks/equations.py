@@ -1,4 +1,5 @@
-"""Tasks of a machine's tips as equations of its joint rates: J u = b, the drift and the feedback in b.
+"""Tasks of a machine's tips as equations of its joint rates, J u = b, the drift and the feedback in b, or of their
+derivatives, J u' = c, which are the same equations differentiated along the motion.
 
 Everything that depends on the time alone is the column of targets; everything else is a function of configuration and
 targets, written element by element on SX symbols.
@@ -6,15 +7,18 @@ targets, written element by element on SX symbols.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, ModelError, center_of_mass
+from models.arrays import Array
 from models.machines.machine import with_tip
+from models.robot.indices import manipulability_of
 from models.spatial import on_scalars, skew
 from ocp.errors import ProblemError
 from ocp.tasks.geometry import (
@@ -36,10 +40,11 @@ from ocp.tasks.geometry import (
     turning_rows,
     wanted_twist,
 )
-from ocp.tasks.start import Array, track_expression
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["TaskEquations", "bind", "task_errors"]
+__all__ = ["TaskEquations", "bind", "on_symbols", "task_errors", "track_expression"]
+
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +64,20 @@ class TaskEquations:
     def size(self) -> int:
         return sum(part.task.size for part in self.bound)
 
-    def targets(self, time: Any) -> Any:
+    @property
+    def posed(self) -> NDArray[np.bool_]:
+        """Which rows are of poses. Shape (size,), bool."""
+        return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
+
+    def targets(self, time: Any, pace: Any = 1) -> Any:
         """What the tasks ask at a time, a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or position and velocity (3, 3), rotation and angular velocity (9, 3),
         direction and angular velocity (3, 3), as far as given, in its reference.
+
+        Args:
+            time: The symbol that the tracks are functions of: the time, s, or a path parameter.
+            pace: Its rate, 1/s, where it is a path parameter.
 
         Raises:
             ProblemError: Wrong sizes, not finite, or an expression of anything but the time.
@@ -71,22 +85,21 @@ class TaskEquations:
         parts = []
         for task in (part.task for part in self.bound):
             if task.velocity is not None:
-                parts.append(track_expression(task.velocity, time, (task.size, 1), "tip_velocity"))
+                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "tip_velocity"))
             if task.position is not None:
-                value = track_expression(task.position, time, (3, 1), "position")
+                value = _whole(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
-                given = (
-                    derivative(value, time) if rate is None else track_expression(rate, time, (3, 1), "position rate")
-                )
-                parts += [value, given]
+                given = derivative(value, time) if rate is None else _whole(task, rate, time, "position rate")
+                parts += [value, pace * given]
             if task.orientation is not None:
                 value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation")
                 turn = rotation_of(value) if value.shape == (4, 1) else value
-                parts += [ca.vec(turn), angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))]
+                spin = angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))
+                parts += [ca.vec(turn), pace * spin]
             if task.direction is not None:
                 value = track_expression(task.direction, time, (3, 1), "direction")
                 unit = value / ca.norm_2(value)
-                parts += [unit, cross_product(unit, derivative(unit, time))]
+                parts += [unit, pace * cross_product(unit, derivative(unit, time))]
         return ca.densify(ca.vertcat(*parts))
 
     @on_scalars
@@ -115,6 +128,33 @@ class TaskEquations:
                 rows.append(rows_of(part, base, joints, twist - wanted_twist(part, base, joints, wanted)))
         return ca.densify(ca.vertcat(*rows))
 
+    def acceleration(
+        self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
+    ) -> Any:
+        """J u' - c, by differentiating `residual` along the motion, with the feedback of its own. Shape (size, 1).
+
+        d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
+
+        Args:
+            base, joints, rates: Symbols.
+            second: Joint accelerations u', (joint_size, 1).
+            time, pace: As of `targets`; a pace other than 1 is a symbol too.
+            change: Rate of the pace, 1/s^2.
+        """
+        residual = self.residual(base, joints, rates, self.targets(time, pace))
+        at, moving = [joints, rates, time], [rates, second, 1]
+        if self.machine.base_size:
+            at, moving = [base, *at], [self.machine.base_rate(base, joints, rates), *moving]
+        if isinstance(pace, ca.SX | ca.MX):
+            at, moving = [*at, pace], [*moving[:-1], pace, change]
+        gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])
+        return ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*moving)) + ca.sparsify(ca.DM(gains)) * residual
+
+    @on_scalars
+    def manipulability(self, base: Any, joints: Any) -> Any:
+        """sqrt(det(J J')) of the rows of all tasks (Yoshikawa 1985). Shape (1, 1)."""
+        return manipulability_of(self.jacobian(base, joints))
+
     @on_scalars
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
         """Pose wanted less pose found, in the tasks' rows, m and rad; zero for velocities. Shape (size, 1)."""
@@ -125,6 +165,11 @@ class TaskEquations:
             else:
                 rows.append(rows_of(part, base, joints, pose_error(part, base, joints, wanted)))
         return ca.densify(ca.vertcat(*rows))
+
+    def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
+        """Pose found less pose wanted in the rows of poses, `residual` in those of velocities. Shape (size, 1)."""
+        error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
+        return ca.vertcat(*((-error if posed else residual)[i] for i, posed in enumerate(self.posed)))
 
     @on_scalars
     def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
@@ -190,14 +235,12 @@ class TaskEquations:
 
     def target_function(self) -> Any:
         """Casadi Function time -> targets, on MX symbols where a track needs them."""
-        for symbols in (ca.SX, ca.MX):
+
+        def made(symbols: Any) -> Any:
             time = symbols.sym("time")
-            try:
-                return ca.Function("targets", [time], [self.targets(time)])
-            except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-                if symbols is ca.MX:
-                    raise
-        raise AssertionError
+            return ca.Function("targets", [time], [self.targets(time)])
+
+        return on_symbols(made)
 
     def closing(self, base: Array, joints: Array) -> Array:
         """Directions of the task rows that a closed task closes without the joints returning. Shape (size, k).
@@ -235,6 +278,63 @@ class TaskEquations:
         free = np.zeros((self.size, closes.shape[1]))
         free[chosen] = closes
         return free
+
+
+def on_symbols(make: Callable[[Any], _Made]) -> _Made:
+    """What `make` makes of SX symbols, or of MX symbols where interpolants and external functions take no others."""
+    try:
+        return make(ca.SX)
+    except (RuntimeError, NotImplementedError):
+        return make(ca.MX)
+
+
+def track_expression(
+    track: Any, time: Any, shapes: tuple[int, int] | tuple[tuple[int, int], ...], what: str = "track"
+) -> Any:
+    """A constant or a function of time as a dense matrix of expressions of the symbol `time`.
+
+    Args:
+        track: A constant, or a function: casadi time -> casadi matrix, array, or a list of expressions.
+        time: The symbol.
+        shapes: The shape it has, or several that it may have.
+        what: Its name in errors.
+
+    Raises:
+        ProblemError: Another shape, not finite, or an expression of anything but the time.
+    """
+    allowed = (shapes,) if isinstance(shapes[0], int) else shapes
+    value = track(time) if callable(track) else track
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = list(value.ravel())
+    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
+        value = ca.vertcat(*value)
+    wanted = " or ".join(map(str, allowed))
+    if not isinstance(value, ca.SX | ca.MX | ca.DM):
+        try:
+            value = ca.DM(np.asarray(value, dtype=float))
+        except (TypeError, ValueError, NotImplementedError) as error:
+            raise ProblemError(f"{what} gives {value!r}, not numbers or expressions of shape {wanted}") from error
+    if value.shape not in allowed:
+        hint = ": one entry for each row of the task" if what == "tip_velocity" else ""
+        raise ProblemError(f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}")
+    if isinstance(value, ca.DM):
+        if not np.isfinite(np.array(value)).all():
+            raise ProblemError(f"{what} {np.array(value).ravel().tolist()} is not finite")
+    elif strange := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
+        raise ProblemError(f"{what} depends on {strange}, but only the time it is called with may occur")
+    return ca.densify(value)
+
+
+def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
+    """A track of positions with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
+    short = task.along_reference and len(task.linear) < 3
+    shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
+    value = track_expression(track, time, shapes, what)
+    if value.shape[0] == 3:
+        return value
+    whole = type(value)(3, 1)
+    whole[task.linear] = value
+    return ca.densify(whole)
 
 
 def _combinations(by_base: Array, count: int) -> Array:

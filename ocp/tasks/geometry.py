@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
+from models.arrays import Array
 from models.spatial import Frame, on_scalars, rotation_from_quaternion, skew
-from ocp.tasks.start import Array
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
 
@@ -138,7 +138,7 @@ def is_holonomic(part: Bound) -> Array:
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
     whole = set(turning_rows(part)) <= set(task.chosen)  # all turning that there is
-    fixed_axes = task.axes == "world" or (task.axes == "reference")
+    fixed_axes = task.axes in ("world", "reference")
     return np.array([whole and fixed_axes if row in ANGULAR else fixed_axes for row in task.chosen], dtype=bool)
 
 

@@ -7,26 +7,27 @@ Poses become velocities by differentiation, with the pose error fed back so that
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
 
 from models import ModelError
-from models.arrays import ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array
 from models.paths.functions import path_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.robot.indices import checked_rows
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError
-from ocp.tasks.start import Array, Velocity
 
-__all__ = ["Axes", "PoseLine", "TipTask", "Track", "along", "one_of", "pose_line"]
+__all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "quintic", "timed"]
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
+Velocity: TypeAlias = Any
+"""A track with one entry for each row of the task."""
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
 
 ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
@@ -46,7 +47,8 @@ class TipTask:
             otherwise all that the pose defines if None. A `direction` always fixes the two rows of the tilt, and `rows`
             those of the position.
         velocity: In the rows, along `axes`: constant or function of time (s). Shape (len(rows),).
-        position: Of the frame's origin, in the reference: constant or function of time. Shape (3,), m.
+        position: Of the frame's origin, in the reference: constant or function of time. Shape (3,), m; or only its
+            entries in the linear `rows`, in their order, where these are taken along the axes of the reference.
         orientation: Of the frame, in the reference: constant or function of time; quaternion [w, x, y, z], shape (4,),
             or matrix, shape (3, 3).
         direction: Of the tool axis, in the reference; the roll about it is free. Constant or function of time, of any
@@ -58,7 +60,8 @@ class TipTask:
         point: Origin of the frame in the link's frame. Shape (3,), m. Only with `link`.
         relative_to: Name of the reference, a link relative to which the motion and the pose are meant; None for the
             world.
-        gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves.
+        gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves. Where
+            accelerations are asked for it damps critically, and velocities decay to what a `velocity` asks.
         start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
 
     Raises:
@@ -128,6 +131,16 @@ class TipTask:
         return tuple(self.rows or ())
 
     @property
+    def linear(self) -> list[int]:
+        """Coordinates 0..2 of the position that the rows fix, in their order."""
+        return [row - 3 for row in self.chosen if row in LINEAR]
+
+    @property
+    def along_reference(self) -> bool:
+        """Whether the rows are taken along the axes in which the pose is given."""
+        return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
+
+    @property
     def size(self) -> int:
         """Number of rows, with those of the tilt."""
         return len(self.chosen) + (2 if self.direction is not None else 0)
@@ -144,6 +157,11 @@ def one_of(
     if tip_velocity is not None or rows is not None:
         raise ProblemError("give either tip_velocity and rows, or task, not both")
     return [task] if isinstance(task, TipTask) else list(task)
+
+
+def quintic(fraction: Any) -> Any:
+    """From 0 to 1, at rest and without acceleration at both ends."""
+    return fraction**3 * (10 + fraction * (-15 + 6 * fraction))
 
 
 class PoseLine(NamedTuple):
@@ -191,8 +209,7 @@ def pose_line(
         s = time / duration
         if pace == "constant":
             return s
-        s = ca.fmin(ca.fmax(s, 0), 1)
-        return s**3 * (10 + s * (-15 + 6 * s))
+        return quintic(ca.fmin(ca.fmax(s, 0), 1))
 
     def position(time: Any) -> Any:
         return ca.DM(place) + share(time) * ca.DM(there - place)
@@ -226,6 +243,38 @@ def along(path: SmoothPath, speed: float) -> Callable[[Any], Any]:
     if not (isinstance(speed, int | float | np.number) and 0 < speed < np.inf):
         raise ProblemError(f"speed must be a positive number of m/s, not {speed!r}")
     return _Along(path, float(speed))
+
+
+class _Timed:
+    """Track over a path parameter, run through by a clock; asked for its velocity where the track is."""
+
+    def __init__(self, track: Callable[[Any], Any], clock: Callable[[Any], Any]) -> None:
+        self._track, self._clock = track, clock
+        if hasattr(track, "rate"):
+            self.rate = lambda time: ca.jacobian(clock(time), time) * track.rate(clock(time))
+
+    def __call__(self, time: Any) -> Any:
+        return self._track(self._clock(time))
+
+
+def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
+    """A task over a path parameter as one over time.
+
+    Args:
+        task: Its tracks are functions of the parameter, its velocity is per unit of it.
+        clock: Casadi time (s) -> parameter.
+    """
+
+    def velocity(time: Any) -> Any:
+        at = clock(time)
+        given = task.velocity(at) if callable(task.velocity) else task.velocity
+        return ca.jacobian(at, time) * expression(given)
+
+    tracks = {name: getattr(task, name) for name in ("position", "orientation", "direction")}
+    changed: dict[str, Any] = {name: _Timed(track, clock) for name, track in tracks.items() if callable(track)}
+    if task.velocity is not None:
+        changed["velocity"] = velocity
+    return replace(task, **changed)
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], what: str) -> tuple[Array, Array]:

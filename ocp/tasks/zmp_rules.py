@@ -10,10 +10,10 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
+from models.arrays import Array
 from models.machines.standing import Standing
 from models.spatial import expression
 from ocp.errors import ProblemError
-from ocp.tasks.start import Array
 
 __all__ = [
     "Anywhere",
@@ -34,7 +34,7 @@ PARALLEL = 1e-12
 """Cosine below which an edge of the support is parallel to a direction."""
 
 ROUNDING = 1e-9  # m
-SAMPLES = 201  # times at which a reference is looked at
+REFERENCE_SAMPLES = 201  # times at which a reference is looked at
 
 
 def is_finite(value: Any) -> bool:
@@ -206,7 +206,7 @@ def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:
     if not isinstance(zmp, Pinned | Following):
         return
     name = type(zmp).__name__
-    for time in np.linspace(0.0, horizon, SAMPLES if isinstance(zmp, Following) else 1):
+    for time in np.linspace(0.0, horizon, REFERENCE_SAMPLES if isinstance(zmp, Following) else 1):
         place = np.array(ca.DM(zmp.place(machine, ca.DM(time)))).ravel()
         if not np.isfinite(place).all():
             raise ProblemError(f"{name}: the zero moment point is to be at {place.tolist()} at {time:.4g} s")

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from models import Robot
 from models.arrays import Array
 from ocp import Audit
+from ocp.tasks.equations import task_errors
+from ocp.tasks.tip_task import TipTask
 from scripts.robots import standing
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.frames import frames_along
@@ -29,22 +30,21 @@ class StandingExample:
     Attributes:
         name: Of the robot, with what it carries.
         results: The plan, and the local motion of the same task.
-        hand: Where the hand has to be, m, world, as a function of time, s.
+        task: What the hand does.
         audit: Of the plan. tolerances: Those of the audit that are not the default.
     """
 
     name: str
     results: standing.Results
-    hand: standing.HandPath
+    task: TipTask
     audit: Audit
     tolerances: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
         found = self.results
-        time, motion = ca.SX.sym("time"), found.motion
-        hand = ca.Function("hand", [time], [ca.vertcat(*self.hand(time))])
-        wanted = np.array(hand.map(len(motion.t))(motion.t[None, :])).T
+        motion = found.motion
+        errors = task_errors(found.machine, self.task, motion.t, None, motion.joints)
         return {
             "robot": self.name,
             "dof": found.robot.dof,
@@ -52,7 +52,7 @@ class StandingExample:
             "duration_s": found.solution.horizon,
             "cost_local": None,
             "cost_optimal": float(found.solution.cost),
-            "tip_error": float(np.abs(motion.tip_in_world - wanted).max()),
+            "tip_error": float(np.abs(errors).max()),
             "momentum_drift_relative": None,
             "joint_return_rad": joint_return(found.solution),
             "audit_passed": self.audit.passed,
@@ -66,8 +66,8 @@ def plan(coarse: bool = False) -> StandingExample:
     """The plan and its audit; it has one mesh only, `coarse` or not."""
     found = standing.plan()
     audit = found.solution.audit(tolerances=standing.TOLERANCES)
-    hand = standing.timed(standing.circle(found.machine))
-    return StandingExample("TIAGo with a load in its hand", found, hand, audit, standing.TOLERANCES)
+    task = standing.from_rest(standing.circle(found.machine))
+    return StandingExample("TIAGo with a load in its hand", found, task, audit, standing.TOLERANCES)
 
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:

@@ -19,15 +19,16 @@ from models import Footprint, Robot, Standing, Wrench, footprint, with_load
 from models.arrays import Array
 from models.machines.standing import External
 from ocp import Collocation, Problem, solve
-from ocp.builders.standing.plan import InFoot, Limits, standing_problem
+from ocp.builders.standing import InFoot, Limits, standing_problem
 from ocp.local.accelerations import resolve_accelerations
+from ocp.tasks.tip_task import TipTask
 from scripts.robots import standing
 from scripts.robots.frames import frames_along
 from scripts.robots.mobile_manipulator import StandingExample, animated
 from scripts.robots.robots import RobotFile
 from scripts.viewer.plan import save_plan
 
-__all__ = ["anymal", "draw", "plan", "problem", "reach", "reaction", "timed"]
+__all__ = ["anymal", "draw", "plan", "problem", "reach", "reaction", "task"]
 
 FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
 LEGS = {  # of the file's own standing posture
@@ -42,7 +43,6 @@ ANYMAL = RobotFile(
     "anymal_b_simple_description/robots/anymal-kinova.urdf",
     {"tip": "j2s6s200_end_effector", "inertia": "as_given", "lock": LEGS},
 )
-ROWS = (3, 4, 5)
 START = np.array([-2.294, 3.884, 1.744, 2.895, 1.013, -1.85])
 STEP = (-0.2, 0.2, 0.1)  # of the hand, m
 SECONDS = 2.5
@@ -70,15 +70,15 @@ def reaction(machine: Standing) -> External:
     return acting
 
 
-def reach(machine: Standing) -> standing.HandPath:
-    """The hand's place, m, world, when a share 0..1 of its straight way is done."""
+def reach(machine: Standing) -> TipTask:
+    """The hand on its straight way, over the share 0..1 of it that is done."""
     begin = np.array(ca.DM(machine.tip_pose((), START).position)).ravel()
-    return lambda share: [value + step * share for value, step in zip(begin, STEP, strict=True)]
+    return TipTask(position=lambda share: ca.DM(begin) + share * ca.DM(STEP), gain=0.0)
 
 
-def timed(machine: Standing) -> standing.HandPath:
-    """The same path as a function of time, s."""
-    return standing.timed(reach(machine), SECONDS)
+def task(machine: Standing) -> TipTask:
+    """The same over the time, s."""
+    return standing.from_rest(reach(machine), SECONDS)
 
 
 def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Problem:
@@ -94,8 +94,8 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
         "tip_level": "acceleration",
         **changes,
     }
-    path = timed(machine) if along == "time" else reach(machine)
-    return standing_problem(machine, path, ROWS, START, SECONDS, along=along, **options)
+    hand = task(machine) if along == "time" else reach(machine)
+    return standing_problem(machine, hand, START, SECONDS, along=along, **options)
 
 
 def plan(coarse: bool = False) -> StandingExample:
@@ -103,12 +103,12 @@ def plan(coarse: bool = False) -> StandingExample:
     machine, ground = anymal()
     pressed = reaction(machine)
     local = resolve_accelerations(
-        machine, timed(machine), ROWS, START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
+        machine, task(machine), START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
     ).motion
     solution = solve(problem(machine), METHOD)
     motion = standing.sampled(machine, solution, pressed)
     found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
-    return StandingExample(ANYMAL.name, found, timed(machine), solution.audit())
+    return StandingExample(ANYMAL.name, found, task(machine), solution.audit())
 
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:

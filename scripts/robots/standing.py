@@ -7,11 +7,11 @@ moment point leaves the footprint and joints pass their limits; planned as a who
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,8 +21,9 @@ from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import Collocation, Problem, Solution, solve
-from ocp.builders.standing.plan import InFoot, Limits, Weights, standing_problem
+from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
 from ocp.local.accelerations import resolve_accelerations
+from ocp.tasks.tip_task import TipTask, quintic, timed
 from scripts.drawing import COLORS, DASHES, sheet
 
 __all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]
@@ -43,9 +44,6 @@ WEIGHTS = Weights(acceleration=0.02, velocity=0.2, joint_limits=0.5, manipulabil
 METHOD = Collocation(30, degree=3, scheme="legendre")
 TOLERANCES = {"tip": 0.06, "velocities": 1e-3}
 """Of the audit, m/s^2 and m/s (rad/s): how far polynomials stray between the points of the grid."""
-
-
-HandPath: TypeAlias = Callable[[Any], list[Any]]
 
 
 @dataclass(frozen=True)
@@ -108,8 +106,8 @@ def rope(machine: Standing) -> External:
     return acting
 
 
-def circle(machine: Standing) -> HandPath:
-    """The hand's place, m, world, when a share 0..1 of the tilted circle is done."""
+def circle(machine: Standing) -> TipTask:
+    """The hand on the tilted circle, over the share 0..1 of it that is done."""
     x, y, z = np.array(ca.DM(machine.tip_pose((), START).position)).ravel()
 
     def place(share: Any) -> list[Any]:
@@ -117,17 +115,12 @@ def circle(machine: Standing) -> HandPath:
         lift = (1 - ca.cos(angle)) / 2
         return [x + 2 * RADIUS * lift, y + RADIUS * ca.sin(angle), z + RISE * lift]
 
-    return place
+    return TipTask(position=place, gain=0.0)
 
 
-def smooth(share: Any) -> Any:
-    """From 0 to 1, at rest and without acceleration at both ends."""
-    return share**3 * (10 - 15 * share + 6 * share**2)
-
-
-def timed(hand: HandPath, seconds: float = SECONDS) -> HandPath:
-    """The same path as a function of time, s."""
-    return lambda time: hand(smooth(time / seconds))
+def from_rest(task: TipTask, seconds: float = SECONDS) -> TipTask:
+    """The same over the time, s, from rest to rest."""
+    return timed(task, lambda time: quintic(time / seconds))
 
 
 def problem(machine: Standing, *, along: Any = "time") -> Problem:
@@ -135,8 +128,7 @@ def problem(machine: Standing, *, along: Any = "time") -> Problem:
     robot, hand = machine.robot, circle(machine)
     return standing_problem(
         machine,
-        timed(hand) if along == "time" else hand,
-        ROWS,
+        from_rest(hand) if along == "time" else hand,
         START,
         SECONDS,
         zmp=InFoot(MARGIN),
@@ -162,8 +154,7 @@ def plan() -> Results:
     pulled = rope(machine)
     local = resolve_accelerations(
         machine,
-        timed(circle(machine)),
-        ROWS,
+        from_rest(circle(machine)),
         START,
         SECONDS,
         external=pulled,

@@ -113,10 +113,9 @@ def test_what_acts_on_the_pushing_hand_is_the_reaction_of_its_push() -> None:
     (wrench,) = gallery_pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
     np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + gallery_pushing.PUSH, 0.0)
     # by hand: pushing to its right presses its left feet
-    path = gallery_pushing.timed(machine)
-    task = (gallery_pushing.ROWS, gallery_pushing.START, gallery_pushing.SECONDS)
+    task = (gallery_pushing.task(machine), gallery_pushing.START, gallery_pushing.SECONDS)
     pressed, free = (
-        resolve_accelerations(machine, path, *task, external=external, step=1e-2, stop_at_lift_off=False).motion
+        resolve_accelerations(machine, *task, external=external, step=1e-2, stop_at_lift_off=False).motion
         for external in (gallery_pushing.reaction(machine), None)
     )
     aside = pressed.zero_moment_point[0, 1] - free.zero_moment_point[0, 1]

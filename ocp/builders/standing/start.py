@@ -1,21 +1,28 @@
-"""Whether a standing machine can start at all where it is asked to: limits of the joints, and what the ground bears."""
+"""Where a standing plan starts: whether the machine can start there at all, and a first guess of the motion from there.
+
+Limits of the joints, and what the ground bears; the guess is the task done locally, with the spare freedom damped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models.machines.standing import Standing
+from models.arrays import Array
+from models.machines.standing import External, Standing
 from models.robot.dynamics import Wrench
+from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.tasks.start import Array
-from ocp.tasks.tip_path import Path, path_derivatives
+from ocp.local.accelerations import resolve_accelerations
+from ocp.tasks.equations import TaskEquations, on_symbols
+from ocp.tasks.limits import JointBounds
+from ocp.tasks.tip_task import quintic, timed
 from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
-__all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "tip_demand"]
+__all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "local_guess", "task_demand"]
 
 ROUNDING = 1e-8
 """How far beyond a limit a start may be, rad or m: what rounding and inverse kinematics leave."""
@@ -25,6 +32,10 @@ MISSED = 1e-6
 
 FAR = 1e6
 """Greatest acceleration that is thought of, rad/s^2 or m/s^2."""
+
+DAMPING = 2.0  # 1/s, of the joint velocities in the null space of the guess
+GUESS_STEPS = 400
+RACING = 100.0  # rad/s or m/s, of a local motion near a singularity
 
 
 def inside_limits(machine: Standing, joints: Array, lower: Array, upper: Array) -> Array:
@@ -41,14 +52,17 @@ def inside_limits(machine: Standing, joints: Array, lower: Array, upper: Array) 
     return np.clip(joints, lower, upper)
 
 
-def check_freedom(machine: Standing, rows: Sequence[int], zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:
-    """Raise ProblemError where tip and zero moment point ask for all joints, and these are to come to rest besides."""
+def check_freedom(machine: Standing, size: int, zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:
+    """Raise ProblemError where tasks and zero moment point ask for all joints, and these are to come to rest besides.
+
+    Args:
+        size: Rows of all tasks.
+    """
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
-    fixed = len(rows) + pinned - (along == "parameter")
-    left = machine.joint_size - fixed
+    left = machine.joint_size - (size + pinned - (along == "parameter"))
     follows = tip_level == "acceleration" and not pinned  # joints that the tip takes along to its rest
     if left < 0 or (left == 0 and end == "rest" and not follows):
-        asked = f"the tip's {len(rows)} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
+        asked = f"the tip's {size} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
         if left < 0:
             raise ProblemError(f"{asked} are more than {machine.joint_size} joints can do; ask for less")
         raise ProblemError(
@@ -57,11 +71,11 @@ def check_freedom(machine: Standing, rows: Sequence[int], zmp: ZmpRule, along: s
         )
 
 
-def check_slope(machine: Standing, rows: Sequence[int], joints: Array, weight: float) -> None:
-    """Raise ProblemError where the manipulability has no slope at the start, which the cost needs."""
-    q = ca.SX.sym("q", machine.joint_size)
-    slope = ca.Function("slope", [q], [ca.gradient(machine.manipulability((), q, rows), q)])
-    if weight and not np.isfinite(np.array(slope(joints))).all():
+def check_slope(equations: TaskEquations, joints: Array) -> None:
+    """Raise ProblemError where the manipulability, which the cost needs, has no slope at the start."""
+    q = ca.SX.sym("q", len(joints))
+    slope = ca.Function("slope", [q], [ca.gradient(equations.manipulability(ca.DM(0, 1), q), q)])
+    if not np.isfinite(np.array(slope(joints))).all():
         raise ProblemError(
             f"start_joints {np.round(joints, 4).tolist()}: the task's rows are singular there, and the manipulability "
             "in the cost has no slope; start elsewhere, or say Weights(manipulability=0)"
@@ -74,8 +88,8 @@ def check_loads(
     wrenches: Sequence[Wrench],
     zmp: ZmpRule,
     least_force: float,
-    bounds: Mapping[str, Any],
-    tip: tuple[Array, Array] | None,
+    bounds: JointBounds,
+    demand: tuple[Array, Array] | None,
 ) -> None:
     """Raise ProblemError where no joint accelerations at all would do at the start, from rest.
 
@@ -83,14 +97,14 @@ def check_loads(
 
     Args:
         machine, joints, wrenches: At the start.
-        zmp, least_force, bounds: What may be, see standing_problem; bounds as Limits.bounds.
-        tip: Rows T and values a of what the tip asks of them, T q'' = a; None where it asks nothing.
+        zmp, least_force, bounds: What may be, see standing_problem.
+        demand: Rows T and values a of what the tasks ask of them, T q'' = a; None where they ask nothing.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)
     qdd = ca.SX.sym("qdd", n)
     reaction = machine.ground_reaction(joints, rest, qdd, wrenches)
     torques = machine.joint_torques(joints, rest, qdd, wrenches)
-    effort = np.asarray(bounds["torques"])
+    effort = bounds.torque
     rows = [
         (torques[i] / effort[i], f"the torque of {name!r}, at most {effort[i]:g} N m (N)")
         for i, name in enumerate(machine.robot.joint_names)
@@ -101,16 +115,15 @@ def check_loads(
     low.append(1.0)
     for normal, offset in _edges(machine, zmp):
         moment = normal[0] * -reaction[1] + normal[1] * reaction[0] - offset * reaction[5]
-        sides.append(
-            (moment / (machine.weight * machine.support.half_widths.max()), "the place of the zero moment point")
-        )
+        scale = machine.weight * machine.support.half_widths.max()
+        sides.append((moment / scale, "the place of the zero moment point"))
         low.append(0.0)
     high += [np.inf] * len(sides)
     rows += sides
     values = ca.vertcat(*(value for value, _ in rows))
     function = ca.Function("start", [qdd], [ca.densify(values), ca.densify(ca.jacobian(values, qdd))])
     at_rest, slopes = (np.array(part) for part in function(rest))
-    missed = _least_missed(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds["accelerations"], tip)
+    missed = _least_missed(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
     if missed is None or missed.max(initial=0.0) <= MISSED:
         return
     words = [f"{what}, by {100 * share:.3g} %" for (_, what), share in zip(rows, missed, strict=True) if share > MISSED]
@@ -120,23 +133,27 @@ def check_loads(
     )
 
 
-def tip_demand(
-    machine: Standing, tip_path: Path, rows: Sequence[int], joints: Array, along_parameter: bool
-) -> tuple[Array, Array]:
-    """Rows and values of the accelerations that the path asks for at its start, from rest.
+def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
+    """Rows and values of the accelerations that the tasks ask for at their start, from rest.
 
     Along a parameter the tip may move along the path's direction as fast as it likes: what remains is across it.
     """
-    jacobian = np.array(ca.DM(machine.tip_jacobian((), joints)))[list(rows)]
-    symbol = ca.MX.sym("progress")
-    function = ca.Function("path", [symbol], list(path_derivatives(tip_path, symbol, len(jacobian))[1:]))
-    slope, bend = (np.array(part).ravel() for part in function(0.0))
-    if not along_parameter:
-        return jacobian, bend
+    n = len(joints)
+
+    def made(symbols: Any) -> Any:
+        q, qd, time = symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("time")
+        pace, change = symbols.sym("pace"), symbols.sym("change")
+        rates = (pace, change) if along_parameter else (1, 0)
+        asked = -equations.acceleration(ca.DM(0, 1), q, qd, ca.DM(n, 1), time, *rates)
+        return ca.Function("asked", [q, qd, time, pace, change], [asked])
+
+    jacobian, asked = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints))), on_symbols(made)
+    wanted, pushed = (np.array(asked(joints, 0, 0, 0, change)).ravel() for change in (0, 1))
+    slope = pushed - wanted
     length = np.linalg.norm(slope)
     direction = slope / length if length > 0 else slope
     across = np.eye(len(slope)) - np.outer(direction, direction)
-    return across @ jacobian, np.zeros(len(slope))
+    return across @ jacobian, across @ wanted
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
@@ -156,22 +173,21 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 
 
 def _least_missed(
-    at_rest: Array, slopes: Array, low: Array, high: Array, most: Any, tip: tuple[Array, Array] | None
+    at_rest: Array, slopes: Array, low: Array, high: Array, most: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """By how much each row is missed, the sum being least; None where the tip's demand cannot be met anyway."""
+    """By how much each row is missed, the sum being least; None where the tasks' demand cannot be met anyway."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
-    if inside.all() and (tip is None or not np.any(tip[1])):
+    if inside.all() and (demand is None or not np.any(demand[1])):
         return np.zeros(m)
-    demand, wanted = (np.zeros((0, n)), np.zeros(0)) if tip is None else tip
-    matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [demand, np.zeros((len(demand), 2 * m))]])
+    rows, wanted = (np.zeros((0, n)), np.zeros(0)) if demand is None else demand
+    matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [rows, np.zeros((len(rows), 2 * m))]])
     lower, upper = np.concatenate([low - at_rest, wanted]), np.concatenate([high - at_rest, wanted])
-    reach = np.minimum(np.broadcast_to(np.asarray(most, dtype=float), (n,)), FAR)
+    reach = np.minimum(most, FAR)
     sizes = np.concatenate([np.zeros(n), np.ones(2 * m)])
     settings = {"error_on_fail": False, "highs": {"output_flag": False}}
-    solver = ca.conic(
-        "start", "highs", {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}, settings
-    )
+    shape = {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}
+    solver = ca.conic("start", "highs", shape, settings)
     found = solver(
         a=ca.DM(matrix), g=sizes, lba=lower, uba=upper,
         lbx=np.concatenate([-reach, np.zeros(2 * m)]), ubx=np.concatenate([reach, np.full(2 * m, np.inf)]),
@@ -180,3 +196,41 @@ def _least_missed(
         return None
     slack = np.array(found["x"]).ravel()[n:]
     return np.asarray(slack[:m] + slack[m:])
+
+
+def local_guess(
+    machine: Standing,
+    equations: TaskEquations,
+    joints: Array,
+    horizon: float,
+    by_parameter: bool,
+    external: External | None,
+) -> dict[str, Any]:
+    """Guesses by name; where the local motion breaks down or races, the last posture before that is kept."""
+    tasks = [part.task for part in equations.bound]
+    if by_parameter:
+        tasks = [timed(task, lambda time: quintic(time / horizon)) for task in tasks]
+    times, still = np.zeros(1), np.zeros((1, joints.size))
+    parts = [joints[None, :], still, still]
+    try:
+        found = resolve_accelerations(
+            machine, tasks, joints, horizon, null_damping=DAMPING, external=external,
+            step=horizon / GUESS_STEPS, stop_at_lift_off=False, speed_limit=RACING,
+        ).motion  # fmt: skip
+    except ProblemError:  # the task and the start are checked: the start is singular, which a plan may still leave
+        pass
+    else:
+        racing = np.asarray((np.abs(found.joint_velocities) > RACING / 2).any(axis=1))
+        sound = int(racing.argmax()) if racing.any() else len(racing)
+        times = found.t[:sound]
+        parts = [part[:sound] for part in (found.joints, found.joint_velocities, found.joint_accelerations)]
+    if times[-1] < horizon * (1 - 1e-9):
+        parts = [np.vstack([part, more]) for part, more in zip(parts, (parts[0][-1:], still, still), strict=True)]
+        times = np.append(times, times[-1] + horizon / GUESS_STEPS)
+    names = ("joints", "velocities", "accelerations")
+    guess: dict[str, Any] = {name: Samples(times, part) for name, part in zip(names, parts, strict=True)}
+    at = np.linspace(0.0, 1.0, GUESS_STEPS + 1)
+    along = (quintic(at), 30 * (at * (1 - at)) ** 2 / horizon, (60 * at - 180 * at**2 + 120 * at**3) / horizon**2)
+    for name, values in zip(("path", "path_rate", "path_acceleration"), along, strict=True):
+        guess[name] = Samples(at * horizon, values[:, None])
+    return guess

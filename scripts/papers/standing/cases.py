@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from models.machines.standing import External, Standing, tip_spring
 from models.machines.standing_motion import StandingMotion
 from models.papers import STANDING_STARTS, standing_example
-from ocp.builders.standing.plan import motion_cost
+from ocp.builders.standing import motion_cost
 from ocp.local.accelerations import Layer, Stabiliser, resolve_accelerations
+from ocp.tasks.tip_task import TipTask
 from scripts.drawing import Row
 from scripts.papers.standing.printed import printed_law
 
@@ -34,7 +35,7 @@ __all__ = [
     "machine",
     "spring",
     "stabiliser_rows",
-    "table_path",
+    "table_task",
 ]
 
 Array: TypeAlias = NDArray[np.float64]
@@ -161,12 +162,17 @@ def start_tip(table: int) -> Array:
     return np.array(ca.DM(machine().tip_pose((), STANDING_STARTS[table]).position)).ravel()
 
 
-def table_path(table: int) -> Callable[[Any], list[Any]]:
-    """Position (y, z) over time: zdot = 0.4 sin t (Table 1) or ydot = 0.2 sin t (Table 2), the other one held."""
+def led(position: Callable[[Any], list[Any]]) -> TipTask:
+    """The tip on a path (y, z), without feedback, as in the paper."""
+    return TipTask(position=position, rows=ROWS, gain=0.0)
+
+
+def table_task(table: int) -> TipTask:
+    """zdot = 0.4 sin t (Table 1) or ydot = 0.2 sin t (Table 2), the other coordinate held."""
     _, y, z = start_tip(table)
     if table == 1:
-        return lambda t: [y, z + 0.4 * (1 - ca.cos(t))]
-    return lambda t: [y + 0.2 * (1 - ca.cos(t)), z]
+        return led(lambda t: [y, z + 0.4 * (1 - ca.cos(t))])
+    return led(lambda t: [y + 0.2 * (1 - ca.cos(t)), z])
 
 
 def spring() -> External:
@@ -176,14 +182,14 @@ def spring() -> External:
 
 def run_case(case: Case) -> Local:
     """Simulate one law."""
-    path, start = table_path(case.table), STANDING_STARTS[case.table]
+    task, start = table_task(case.table), STANDING_STARTS[case.table]
     if case.printed:
-        motion, gap = printed_law(machine(), path, ROWS, start, HORIZON)
+        motion, gap = printed_law(machine(), task, start, HORIZON)
         return Local(case, motion, motion, motion_cost(motion), gap, *fails(motion), None)
     external = spring() if case.spring else None
 
     def run(**settings: Any) -> Any:
-        return resolve_accelerations(machine(), path, ROWS, start, HORIZON, external=external, **settings)
+        return resolve_accelerations(machine(), task, start, HORIZON, external=external, **settings)
 
     found = run(**case.settings)
     beyond = run(**case.settings, stop_at_lift_off=False) if found.stopped else found

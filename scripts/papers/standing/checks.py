@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.machines.standing_motion import StandingMotion
-from ocp.builders.standing.options import ZmpRule
-from ocp.builders.standing.plan import Anywhere, IndexAtLeast, InFoot, Pinned
+from ocp.builders.standing import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
 from scripts.drawing import Row
 from scripts.papers.standing.cases import machine
 from scripts.papers.standing.plans import FINER, LIFT_LIMITS, LIMITS, METHOD_NAMES, Plan
@@ -27,7 +26,7 @@ ALLOWED = {
 
 STATIONARITY = "stationarity, relative"
 """The finding that a plan of held accelerations may miss: a constraint of the ground or a torque is active at one end
-of an interval only, where its multiplier belongs, and the audit looks inside it (ocp.builders.standing.plan)."""
+of an interval only, where its multiplier belongs, and the audit looks inside it (ocp.builders.standing.problem)."""
 
 
 def check(key: str, plan: Plan) -> Row:
@@ -43,9 +42,9 @@ def check(key: str, plan: Plan) -> Row:
     found = {
         "zmp_excess_m": region_excess(request.rule, motion),
         "joint_excess_rad": max(0.0, float(motion.joint_excess.max())),
-        "velocity_excess_rad_s": beyond(motion.joint_velocities, bounds["velocities"]),
-        "acceleration_excess_rad_s2": beyond(motion.joint_accelerations, bounds["accelerations"]),
-        "torque_excess_n_m": beyond(motion.joint_torques, bounds["torques"]),
+        "velocity_excess_rad_s": beyond(motion.joint_velocities, bounds.velocity),
+        "acceleration_excess_rad_s2": beyond(motion.joint_accelerations, bounds.acceleration),
+        "torque_excess_n_m": beyond(motion.joint_torques, bounds.torque),
         "friction_excess": max(0.0, float(motion.friction.max()) - limits.friction),
         "tip_error_m": plan.tip_error,
         "vertical_force_missing_n": max(0.0, least - float(motion.ground_force[:, 2].min())),

@@ -65,7 +65,7 @@ def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
         line = curve_of(plan, *STYLES[plan.request.title])
         shown.append(Curve(f"{line.label}: {plan.solution.horizon:.4f} s", line.motion, line.color, line.dash))
     longest = max(one.motion.t[-1] for one in shown)
-    effort = LIFT_LIMITS.bounds(machine())["torques"]
+    effort = LIFT_LIMITS.bounds(machine()).torque
     kinds: tuple[tuple[str, Callable[[StandingMotion], Array]], ...] = (
         ("zero moment point y, m", lambda m: m.zero_moment_point[:, 1]),
         ("tip height, m", lambda m: m.tip_in_world[:, 2]),

@@ -11,8 +11,7 @@ import numpy as np
 from models.machines.standing_motion import StandingMotion, standing_motion
 from models.papers import STANDING_STARTS
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.builders.standing.options import ZmpRule
-from ocp.builders.standing.plan import (
+from ocp.builders.standing import (
     Anywhere,
     FreeTime,
     IndexAtLeast,
@@ -20,10 +19,13 @@ from ocp.builders.standing.plan import (
     Limits,
     Pinned,
     Weights,
+    ZmpRule,
     standing_problem,
 )
+from ocp.tasks.equations import task_errors
+from ocp.tasks.tip_task import TipTask
 from scripts.drawing import Row
-from scripts.papers.standing.cases import HORIZON, ROWS, Array, machine, spring, start_tip, table_path
+from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 
 __all__ = [
     "LIFT_LIMITS",
@@ -131,10 +133,12 @@ LIFT_MESHES = (25, 50, 100)
 METHOD_NAMES: Mapping[Transcription, str] = {"held": "shooting, held", "points": "Legendre 3, points"}
 
 
-def lift_path() -> Callable[[Any], list[Any]]:
-    """Position (y, z) over the path parameter."""
+def task_of(request: Request) -> TipTask:
+    """Over time, or over the path parameter for the lift."""
     _, y, z = start_tip(1)
-    return lambda s: [y, z + LIFT * s]
+    if request.task == "minimum_time":
+        return led(lambda s: [y, z + LIFT * s])
+    return table_task(1 if request.task == "table1" else 2)
 
 
 def plan_problem(request: Request) -> Problem:
@@ -144,10 +148,10 @@ def plan_problem(request: Request) -> Problem:
         settings["tip_level"] = "acceleration"
     if request.task == "minimum_time":
         settings |= {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter"}
-        return standing_problem(machine(), lift_path(), ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
+        return standing_problem(machine(), task_of(request), STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
     table = 1 if request.task == "table1" else 2
     settings |= {"limits": LIMITS, "external": spring() if table == 2 else None}
-    return standing_problem(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
+    return standing_problem(machine(), task_of(request), STANDING_STARTS[table], HORIZON, **settings)
 
 
 def method(transcription: Transcription, intervals: int) -> Any:
@@ -161,9 +165,8 @@ def make(request: Request) -> Plan:
     """Solve, evaluate between the nodes and audit."""
     solution = solve(plan_problem(request), method(request.transcription, request.intervals))
     motion, progress = fine_motion(request, solution)
-    path = lift_path() if request.task == "minimum_time" else table_path(1 if request.task == "table1" else 2)
-    wanted = np.array([np.array([float(x) for x in path(s)]) for s in progress])
-    error = float(np.linalg.norm(motion.tip_in_world[:, [row - 3 for row in ROWS]] - wanted, axis=1).max())
+    errors = task_errors(machine(), task_of(request), progress, None, motion.joints)
+    error = float(np.linalg.norm(errors, axis=1).max())
     limits = {"joints": 1e-6, "velocities": 1e-6, "accelerations": 1e-6}
     if not isinstance(request.rule, Anywhere):
         limits["zero moment point"] = 1e-3

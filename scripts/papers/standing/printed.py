@@ -6,15 +6,14 @@ to be, and the machine does not fall.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 
 from models.machines.standing import Standing
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp.local.rates import least_rates
-from ocp.tasks.tip_path import Path, linear_rows, path_derivatives
+from ocp.tasks.equations import bind
+from ocp.tasks.tip_task import TipTask
 
 __all__ = ["printed_law"]
 
@@ -22,7 +21,7 @@ STEP = 1e-3  # s
 
 
 def printed_law(
-    machine: Standing, tip_path: Path, rows: Sequence[int], start_joints: np.ndarray, horizon: float, sign: float = -1.0
+    machine: Standing, task: TipTask, start_joints: np.ndarray, horizon: float, sign: float = -1.0
 ) -> tuple[StandingMotion, float]:
     """Simulate q'' = J^+ (u'' - h) + P [J_m P]^+ (sign C - J_m J^+ (u'' - h) - q'^T H_m q') from rest by RK4.
 
@@ -34,17 +33,17 @@ def printed_law(
     """
     n, axes = machine.joint_size, list(machine.moving_axes)
     time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
-    jacobian = ca.densify(machine.tip_jacobian((), q))[list(rows), :]
-    position, _, acceleration = path_derivatives(tip_path, time, len(rows))
-    task = acceleration - ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
-    inverse = least_rates(jacobian, ca.DM.eye(len(rows)))
+    equations, none = bind(machine, task), ca.DM(0, 1)
+    jacobian = equations.jacobian(none, q)
+    wanted = -equations.acceleration(none, q, qd, ca.DM(n, 1), time)
+    inverse = least_rates(jacobian, ca.DM.eye(task.size))
     free = ca.DM.eye(n) - ca.mtimes(inverse, jacobian)
     balance = machine.zmp_rows(q, qd, machine.most_stable_point)
     motion_rows, constant = balance.jacobian[axes, :], balance.right[axes]
     needed = balance.needed(qd)[axes] + (sign - 1) * constant
-    first = ca.mtimes(inverse, task)
+    first = ca.mtimes(inverse, wanted)
     second = least_rates(ca.mtimes(motion_rows, free), needed - ca.mtimes(motion_rows, first))
-    gap = ca.norm_2(machine.tip_pose((), q).position[linear_rows(rows)] - position)
+    gap = ca.norm_2(equations.error(none, q, equations.targets(time)))
     law = ca.Function("printed", [time, q, qd], [first + second, gap], {"cse": True})
 
     steps = int(np.ceil(horizon / STEP))
@@ -64,5 +63,5 @@ def printed_law(
     states = np.vstack([start, np.array(step.mapaccum("steps", steps)(start, times[None, :-1])).T])
     joints, velocities = states[:, :n], states[:, n:]
     accelerations, gaps = law.map(steps + 1)(times[None, :], joints.T, velocities.T)
-    motion = standing_motion(machine, times, joints, velocities, np.array(accelerations).T, rows=rows)
+    motion = standing_motion(machine, times, joints, velocities, np.array(accelerations).T, rows=task.chosen)
     return motion, float(np.max(np.array(gaps)))

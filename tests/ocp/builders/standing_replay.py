@@ -76,6 +76,21 @@ def replay(
     return times, tilts
 
 
+def assert_stands(machine: Standing, motion: StandingMotion, external: External | None = None) -> None:
+    """The foot stays flat on the floor to the end."""
+    times, tilts = replay(machine, motion, external=external)
+    assert times[-1] > 0.985 * motion.t[-1]
+    assert tilts.max() < 1e-3
+
+
+def assert_tips(machine: Standing, motion: StandingMotion, tilt: float, external: External | None = None) -> float:
+    """The foot tips by more than `tilt`, still falling, but not before the zero moment point leaves it; how long."""
+    times, tilts = replay(machine, motion, external=external)
+    assert tilts[-1] == tilts.max() > tilt
+    assert tilts[times < motion.t[motion.foot_margin < 0][0]].max() < 2e-3
+    return float(times[-1])
+
+
 def _quaternion(matrix: Array) -> Array:
     found = np.zeros(4)
     mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 
+from models.machines.machine import with_tip
 from models.machines.standing import External, Standing, tip_spring
 from models.machines.standing_motion import StandingMotion, standing_motion
 from models.papers import STANDING_STARTS, standing_example
 from models.robot.dynamics import Wrench
 from ocp import Problem, Solution
-from ocp.builders.standing.plan import FreeTime, Limits, Weights, standing_problem
-from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm
+from ocp.builders.standing import FreeTime, Limits, Weights, standing_problem
+from ocp.tasks.equations import task_errors
+from ocp.tasks.tip_task import TipTask, quintic
+from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm, two_armed
 from tests.models.robot.trees import Array
 
 HORIZON = 2 * np.pi
@@ -41,12 +44,17 @@ def tip_at(standing: Standing, joints: Array) -> Array:
     return np.array(ca.DM(standing.tip_pose((), joints).position)).ravel()
 
 
-def table_path(table: int) -> Any:
+def led(position: Any, rows: Any = ROWS) -> TipTask:
+    """The tip on a path in these rows, without feedback."""
+    return TipTask(position=position, rows=rows, gain=0.0)
+
+
+def table_task(table: int) -> TipTask:
     """zdot = 0.4 sin t (Table 1) or ydot = 0.2 sin t (Table 2); the other coordinate is held."""
     _, y, z = tip_at(machine(), STANDING_STARTS[table])
     if table == 1:
-        return lambda t: [y, z + 0.4 * (1 - ca.cos(t))]
-    return lambda t: [y + 0.2 * (1 - ca.cos(t)), z]
+        return led(lambda t: [y, z + 0.4 * (1 - ca.cos(t))])
+    return led(lambda t: [y + 0.2 * (1 - ca.cos(t)), z])
 
 
 def spring() -> External:
@@ -56,34 +64,44 @@ def spring() -> External:
 
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
     settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
-    return standing_problem(machine(), table_path(table), ROWS, STANDING_STARTS[table], HORIZON, **settings)
+    return standing_problem(machine(), table_task(table), STANDING_STARTS[table], HORIZON, **settings)
+
+
+def straight(forward: float, up: float) -> TipTask:
+    """The tip of the paper's machine on a straight line, over a path parameter."""
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
+    return led(lambda s: [y + forward * s, z + up * s])
 
 
 def lift_plan(zmp: Any, **changes: Any) -> Problem:
     """The tip 0.8 m straight up in the least time."""
-    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}
-    return standing_problem(
-        machine(), lambda s: [y, z + 0.8 * s], ROWS, STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), zmp=zmp, **settings
-    )
+    horizon = settings.pop("horizon", FreeTime(0.2, 3.0, 1.0))
+    return standing_problem(machine(), straight(0.0, 0.8), STANDING_STARTS[1], horizon, zmp=zmp, **settings)
 
 
-def arm_path(t: Any) -> list[Any]:
+def moved_task(standing: Standing, start: Array, by: Any, seconds: float, **fields: Any) -> TipTask:
+    """A tip by so many m along the axes in which it is moved at all, from rest to rest, without feedback.
+
+    Args:
+        fields: Further ones of the task: link and point, what it does with its orientation.
+    """
+    if "link" in fields:
+        standing = cast(Standing, with_tip(standing, fields["link"], fields.get("point", np.zeros(3))))
+    axes = [0, 1, 2] if len(by) == 3 else [1, 2]
+    place, step = ca.DM(tip_at(standing, start)[axes]), ca.DM(by)
+    rows = None if len(by) == 3 else ROWS
+    return TipTask(position=lambda t: place + step * quintic(t / seconds), rows=rows, gain=0.0, **fields)
+
+
+def arm_task() -> TipTask:
     """0.25 m forward and aside and 0.1 m down, from rest to rest."""
-    x, y, z = tip_at(arm(), ARM_START)
-    s = t / ARM_HORIZON
-    share = s**3 * (10 - 15 * s + 6 * s**2)
-    return [x + 0.25 * share, y + 0.25 * share, z - 0.1 * share]
+    return moved_task(arm(), ARM_START, (0.25, 0.25, -0.1), ARM_HORIZON)
 
 
 def tool(time: Any, tip: Any) -> list[Wrench]:
     """A load that grows, and a constant moment, at the arm's tip."""
     return [arm().tip_wrench((0, 0, -25 - 20 * time), (1.0, 2.0, 0.5))]
-
-
-def quintic(s: Any) -> Any:
-    """From 0 to 1 at rest and without acceleration at both ends."""
-    return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 PLANAR_HORIZON = 2.0
@@ -94,10 +112,9 @@ def planar_start(size: int) -> Array:
     return np.array([np.pi / 2 + 0.5, -1.4, 1.2, *[-0.3] * (size - 3)])
 
 
-def planar_path(size: int, ahead: float = 0.35, up: float = -0.5) -> Any:
+def planar_task(size: int, ahead: float = 0.35, up: float = -0.5) -> TipTask:
     """The tip of planar_machine(size) forward and down, from rest to rest."""
-    _, y, z = tip_at(planar_machine(size), planar_start(size))
-    return lambda t: [y + ahead * quintic(t / PLANAR_HORIZON), z + up * quintic(t / PLANAR_HORIZON)]
+    return moved_task(planar_machine(size), planar_start(size), (ahead, up), PLANAR_HORIZON)
 
 
 @cache
@@ -105,15 +122,30 @@ def six() -> Standing:
     return six_joint_arm()
 
 
-def six_path(t: Any) -> list[Any]:
+def six_task() -> TipTask:
     """0.3 m aside and 0.15 m down in 1 s, from rest to rest."""
-    x, y, z = tip_at(six(), SIX_START)
-    return [x + 0.02 * quintic(t), y + 0.3 * quintic(t), z - 0.15 * quintic(t)]
+    return moved_task(six(), SIX_START, (0.02, 0.3, -0.15), 1.0)
 
 
 def six_tool(time: Any, tip: Any) -> list[Wrench]:
     """A load that grows and swings, and a moment, at the tip of the six-joint arm."""
     return [six().tip_wrench((3 * ca.sin(3 * time), 5, -40 - 40 * time), (1.0, -2.0, 0.5))]
+
+
+TWO_START = np.array([0.2, -0.1, -0.5, 1.9, 0.6, 0.5, 1.7, -0.6])
+TWO_HORIZON = 0.7
+GRIP = (0.0, 0.0, 0.15)  # in the hand, m
+
+
+@cache
+def two() -> Standing:
+    return two_armed()
+
+
+def two_tasks(left: Any, right: Any) -> list[TipTask]:
+    """The hands of the two-armed machine by so many m."""
+    ways = {"left_hand": left, "right_hand": right}
+    return [moved_task(two(), TWO_START, by, TWO_HORIZON, link=name, point=GRIP) for name, by in ways.items()]
 
 
 def sampled(
@@ -132,8 +164,6 @@ def sampled(
     )
 
 
-def tip_error(motion: StandingMotion, path: Any, rows: Any = ROWS) -> float:
-    """Greatest distance from the path, m."""
-    axes = [row - 3 for row in rows]
-    wanted = np.array([np.array(ca.DM(ca.vertcat(*path(float(t))))).ravel() for t in motion.t])
-    return float(np.linalg.norm(motion.tip_in_world[:, axes] - wanted, axis=1).max())
+def tip_error(standing: Standing, motion: StandingMotion, task: Any) -> float:
+    """Greatest norm of the pose errors, m and rad."""
+    return float(np.linalg.norm(task_errors(standing, task, motion.t, None, motion.joints), axis=1).max())

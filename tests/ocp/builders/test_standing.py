@@ -13,7 +13,7 @@ from models.machines.standing_motion import standing_motion
 from models.machines.support import Support, rectangle
 from models.papers import STANDING_STARTS
 from ocp import Collocation, MultipleShooting, Solution, solve, tighten
-from ocp.builders.standing.plan import (
+from ocp.builders.standing import (
     Anywhere,
     Following,
     FreeTime,
@@ -27,9 +27,10 @@ from ocp.builders.standing.plan import (
 )
 from ocp.errors import ProblemError, SolveError
 from ocp.local.accelerations import Stabiliser, resolve_accelerations
+from ocp.tasks.tip_task import TipTask
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
-from tests.ocp.builders.standing_replay import replay
+from tests.ocp.builders.standing_replay import assert_stands, assert_tips
 from tests.ocp.builders.standing_tasks import (
     ARM_HORIZON,
     ARM_START,
@@ -40,18 +41,20 @@ from tests.ocp.builders.standing_tasks import (
     ROWS,
     SIX_START,
     arm,
-    arm_path,
+    arm_task,
+    led,
     lift_plan,
     machine,
-    planar_path,
     planar_start,
+    planar_task,
     sampled,
     six,
-    six_path,
+    six_task,
     six_tool,
     spring,
-    table_path,
+    straight,
     table_plan,
+    table_task,
     tip_at,
     tip_error,
     tool,
@@ -88,7 +91,7 @@ def test_plans_of_table_1_cost_what_they_should(zmp: Any, cost: float, index: fl
     assert motion.index.min() == pytest.approx(index, abs=0.01)
     assert np.abs(solution["velocities"]).max() == pytest.approx(speed, abs=0.01)
     assert np.abs(solution["accelerations"]).max() == pytest.approx(push, abs=0.05)
-    assert tip_error(motion, table_path(1)) < 1e-5
+    assert tip_error(machine(), motion, table_task(1)) < 1e-5
     assert motion.joint_excess.max() < 1e-6
     assert np.abs(motion.joint_velocities).max() <= 6 + 1e-6
     assert motion.ground_force[:, 2].min() > 60
@@ -108,7 +111,7 @@ def test_plans_of_table_2_against_the_spring_cost_what_they_should(zmp: Any, cos
     assert solution.cost == pytest.approx(cost, rel=1e-3)
     motion = sampled(machine(), solution, spring())
     assert motion.stands
-    assert tip_error(motion, table_path(2)) < 1e-5
+    assert tip_error(machine(), motion, table_task(2)) < 1e-5
     stretch = motion.tip_in_world[:, 1] - tip_at(machine(), STANDING_STARTS[2])[1]
     np.testing.assert_allclose(motion.external_force[:, 1], -150 * stretch, atol=1e-9)
 
@@ -128,7 +131,7 @@ def test_a_plan_at_collocation_points_passes_its_audit(zmp: Any) -> None:
     assert coarse.cost == pytest.approx(fine.cost, rel=1e-3)
     audit = fine.audit(tolerances={"zero moment point": MILLIMETRE, "joints": 1e-6, "velocities": 1e-6, "tip": 0.02})
     assert audit.passed, str(audit)
-    assert tip_error(sampled(machine(), fine), table_path(1)) < 1e-5
+    assert tip_error(machine(), sampled(machine(), fine), table_task(1)) < 1e-5
 
 
 def test_the_audit_of_a_held_plan_finds_its_motion_sound() -> None:
@@ -160,7 +163,7 @@ def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_mor
         "stabilised": {"law": "stabilised", "stabiliser": Stabiliser((3.5, 3.5, 3.5), gradient=1.8)},
     }
     for name, law in laws.items():
-        found = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], HORIZON, step=1e-2, **law)
+        found = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=1e-2, **law)
         costs[name] = motion_cost(found.motion)
         assert costs[name] > solution.cost
     assert costs["plain"] == pytest.approx(2.49, rel=0.01)
@@ -188,22 +191,8 @@ def test_the_fastest_lift_takes_longer_the_less_the_zero_moment_point_may_move(z
 
 def test_the_fastest_lift_does_not_depend_on_the_first_guess() -> None:
     problem = lift_plan(IN_RANGE)
-    slow = held(replace_horizon(2.0), 50)
+    slow = held(lift_plan(IN_RANGE, horizon=2.0, weights=None), 50)
     assert held(problem, 50, guess=slow).horizon == pytest.approx(held(problem, 50).horizon, rel=1e-6)
-
-
-def replace_horizon(seconds: float) -> Any:
-    _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    return standing_problem(
-        machine(),
-        lambda s: [y, z + 0.8 * s],
-        ROWS,
-        STANDING_STARTS[1],
-        seconds,
-        zmp=IN_RANGE,
-        limits=LIFT_LIMITS,
-        along="parameter",
-    )
 
 
 def test_the_zero_moment_point_follows_a_reference() -> None:
@@ -223,7 +212,7 @@ def test_held_jerks_keep_the_zero_moment_point_at_its_place_between_the_points(a
     zmp: Any = Following(reference) if amplitude else Pinned()
     motion = sampled(machine(), held(table_plan(1, zmp, control="jerk"), 80))
     np.testing.assert_allclose(motion.zero_moment_point[:, 1], amplitude * np.sin(motion.t), atol=MILLIMETRE)
-    assert tip_error(motion, table_path(1)) < 1e-5
+    assert tip_error(machine(), motion, table_task(1)) < 1e-5
 
 
 def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
@@ -231,7 +220,7 @@ def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
     assert solution.cost == pytest.approx(-0.703, abs=5e-3)
     motion = sampled(machine(), solution)
     assert motion.stands
-    assert tip_error(motion, table_path(1)) < 1e-5
+    assert tip_error(machine(), motion, table_task(1)) < 1e-5
     steps = np.abs(np.diff(motion.joint_accelerations, axis=0)).max()
     assert steps < 1.1 * np.abs(solution["jerks"]).max() * HORIZON / 600
 
@@ -251,65 +240,39 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
     knots = np.linspace(-0.1, HORIZON + 0.1, 61)
     rise = ca.interpolant("rise", "bspline", [knots], 0.4 * (1 - np.cos(knots)))
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    offset = float(rise(0.0))
+    task = led(lambda t: ca.vertcat(y, z + rise(t) - float(rise(0.0))))
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "end": "free", "start": "free"}
-    problem = standing_problem(
-        machine(),
-        lambda t: ca.vertcat(y, z + rise(t) - offset),
-        ROWS,
-        STANDING_STARTS[1],
-        HORIZON,
-        symbols=ca.MX,
-        **settings,
-    )
+    problem = standing_problem(machine(), task, STANDING_STARTS[1], HORIZON, symbols=ca.MX, **settings)
     exact = table_plan(1, IN_RANGE, start="free", end="free")
     assert held(problem, 20).cost == pytest.approx(held(exact, 20).cost, abs=1e-4)
 
 
-def test_a_spatial_arm_stands_where_the_local_method_tips() -> None:
-    local = resolve_accelerations(arm(), arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, external=tool, step=2e-3).motion
+@pytest.mark.parametrize(
+    ("standing", "task", "start", "external", "index"),
+    [(arm(), arm_task(), ARM_START, tool, -0.3), (six(), six_task(), SIX_START, six_tool, -0.01)],
+    ids=["seven joints", "six joints"],
+)
+def test_a_spatial_arm_stands_where_the_local_method_tips(
+    standing: Standing, task: TipTask, start: Any, external: Any, index: float
+) -> None:
+    horizon = ARM_HORIZON if standing is arm() else 1.0
+    local = resolve_accelerations(standing, task, start, horizon, external=external, step=2e-3).motion
     assert not local.stands
-    problem = standing_problem(
-        arm(),
-        arm_path,
-        (3, 4, 5),
-        ARM_START,
-        ARM_HORIZON,
-        zmp=InFoot(0.005),
-        external=tool,
-        limits=Limits(friction=0.7, acceleration=100.0),
-        tip_level="acceleration",
-    )
+    assert local.index.min() < index
+    limits = Limits(friction=0.7, acceleration=100.0)
+    settings: dict[str, Any] = {"zmp": InFoot(0.005), "external": external, "limits": limits}
+    problem = standing_problem(standing, task, start, horizon, tip_level="acceleration", **settings)
     assert problem.declared.path["zero moment point"].size == 4  # both coordinates
-    solution = points(problem, 12)
-    motion = sampled(arm(), solution, tool, (3, 4, 5))
+    motion = sampled(standing, points(problem, 12), external, (3, 4, 5))
     assert motion.stands
     assert motion.index.min() >= 0
     assert motion.stays_in_limits
     assert motion.friction.max() <= 0.7
     assert np.abs(motion.joint_torques).max() <= 300
-    assert tip_error(motion, arm_path, (3, 4, 5)) < 1e-5
-
-    times, tilts = replay(arm(), motion, external=tool)  # in a contact simulation too
-    assert times[-1] > 0.99 * ARM_HORIZON
-    assert tilts.max() < 1e-3
-    times, tilts = replay(arm(), local, external=tool)
-    assert tilts[-1] == tilts.max() > 0.05  # and still falling
-    assert tilts[times < local.t[local.foot_margin < 0][0]].max() < 1e-3
-
-
-def test_six_joints_stand_where_the_local_method_tips() -> None:
-    local = resolve_accelerations(six(), six_path, (3, 4, 5), SIX_START, 1.0, external=six_tool, step=5e-3).motion
-    assert local.index.min() < -0.01
-    limits = Limits(friction=0.7, acceleration=100.0)
-    settings: dict[str, Any] = {"zmp": InFoot(0.005), "external": six_tool, "limits": limits}
-    problem = standing_problem(six(), six_path, (3, 4, 5), SIX_START, 1.0, tip_level="acceleration", **settings)
-    motion = sampled(six(), points(problem, 12), six_tool, (3, 4, 5))
-    assert motion.stands
-    assert motion.index.min() >= 0
-    assert motion.stays_in_limits
-    assert motion.friction.max() <= 0.7
-    assert tip_error(motion, six_path, (3, 4, 5)) < 1e-5
+    assert tip_error(standing, motion, task) < 1e-5
+    if standing is arm():
+        assert_stands(standing, motion, external)
+        assert_tips(standing, local, 0.05, external)
 
 
 def excess(standing: Standing, solution: Solution, limits: Limits, external: Any = None) -> dict[str, float]:
@@ -321,8 +284,9 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
     q, qd, qdd = (values[name] for name in ("joints", "velocities", "accelerations"))
     motion = standing_motion(standing, at * solution.horizon, q, qd, qdd, external)
     bounds = limits.bounds(standing)
-    pairs = {"velocities": "joint_velocities", "accelerations": "joint_accelerations", "torques": "joint_torques"}
-    found = {what: float((np.abs(getattr(motion, name)) - bounds[what]).max()) for what, name in pairs.items()}
+    sizes = (motion.joint_velocities, motion.joint_accelerations, motion.joint_torques)
+    most = {"velocity": bounds.velocity, "acceleration": bounds.acceleration, "torque": bounds.torque}
+    found = {what: float((np.abs(size) - most[what]).max()) for what, size in zip(most, sizes, strict=True)}
     least = 0.1 * standing.weight if limits.vertical_force is None else limits.vertical_force
     found["vertical force"] = float(least - motion.ground_force[:, 2].min())
     found["friction"] = float((motion.friction - limits.friction).max())
@@ -333,22 +297,15 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
 
 @pytest.mark.parametrize("size", [4, 6])
 def test_other_machines_hold_tip_and_zero_moment_point_between_the_points(size: int) -> None:
-    standing, path = planar_machine(size), planar_path(size)
+    standing, task = planar_machine(size), planar_task(size)
     for method, level in ((MultipleShooting(80), "position"), (Collocation(30, scheme="legendre"), "acceleration")):
-        problem = standing_problem(
-            standing,
-            path,
-            ROWS,
-            planar_start(size),
-            PLANAR_HORIZON,
-            zmp=InFoot(0.01),
-            tip_level=level,  # type: ignore[arg-type]
-        )
+        settings: dict[str, Any] = {"zmp": InFoot(0.01), "tip_level": level}
+        problem = standing_problem(standing, task, planar_start(size), PLANAR_HORIZON, **settings)
         solution = solve(problem, method)
         found = excess(standing, solution, Limits())
         assert found.pop("foot") < -0.01 + MILLIMETRE
         assert max(found.values()) < 1e-6, found
-        assert tip_error(sampled(standing, solution), path) < 1e-5
+        assert tip_error(standing, sampled(standing, solution), task) < 1e-5
 
 
 def narrow() -> Standing:
@@ -376,17 +333,8 @@ FREELY = Weights(joint_limits=0.0)  # nothing but the limits keeps the joints fr
 def test_a_tightened_plan_holds_its_limits_between_the_points(
     standing: Standing, limits: Limits, weights: Any, level: Any
 ) -> None:
-    problem = standing_problem(
-        standing,
-        table_path(1),
-        ROWS,
-        STANDING_STARTS[1],
-        HORIZON,
-        zmp=IN_RANGE,
-        limits=limits,
-        weights=weights,
-        tip_level=level,
-    )
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": limits, "weights": weights, "tip_level": level}
+    problem = standing_problem(standing, table_task(1), STANDING_STARTS[1], HORIZON, **settings)
     method = MultipleShooting(40) if level == "position" else Collocation(20, scheme="legendre")
     solution = tighten(problem, method)
     found = excess(standing, solution, limits)
@@ -410,30 +358,19 @@ def test_the_fastest_lift_holds_its_limits_between_the_points() -> None:
 
 def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() -> None:
     plan = sampled(machine(), held(table_plan(1, IN_RANGE)))
-    times, tilts = replay(machine(), plan)
-    assert times[-1] > 6.2
-    assert tilts.max() < 1e-3
-    local = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], HORIZON, step=5e-3).motion
-    times, tilts = replay(machine(), local)
-    assert tilts[-1] > 0.3
-    assert times[-1] == pytest.approx(6.17, abs=0.05)
-    leaves = local.t[local.foot_margin < 0][0]
-    assert tilts[times < leaves].max() < 2e-3
+    assert_stands(machine(), plan)
+    local = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=5e-3).motion
+    assert assert_tips(machine(), local, 0.3) == pytest.approx(6.17, abs=0.05)
 
 
 def test_another_machine_stands_by_plan_and_tips_by_pseudo_inverse_in_a_contact_simulation() -> None:
-    standing, path = planar_machine(5), planar_path(5, 0.75, -0.2)
+    standing, task = planar_machine(5), planar_task(5, 0.75, -0.2)
     start, zmp = planar_start(5), InFoot(0.02)
-    plan = sampled(standing, held(standing_problem(standing, path, ROWS, start, PLANAR_HORIZON, zmp=zmp), 60))
-    times, tilts = replay(standing, plan)
-    assert times[-1] > 0.99 * PLANAR_HORIZON
-    assert tilts.max() < 1e-3
-    local = resolve_accelerations(standing, path, ROWS, start, PLANAR_HORIZON, step=5e-3).motion
+    plan = sampled(standing, held(standing_problem(standing, task, start, PLANAR_HORIZON, zmp=zmp), 60))
+    assert_stands(standing, plan)
+    local = resolve_accelerations(standing, task, start, PLANAR_HORIZON, step=5e-3).motion
     assert not local.stands
-    times, tilts = replay(standing, local)
-    assert tilts[-1] == tilts.max() > 0.15  # and still falling
-    leaves = local.t[local.foot_margin < 0][0]
-    assert tilts[times < leaves].max() < 2e-3
+    assert_tips(standing, local, 0.15)
 
 
 def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
@@ -447,11 +384,8 @@ def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
 
 def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) -> Any:
     """The tip led straight forward and up."""
-    _, y, z = tip_at(machine(), STANDING_STARTS[1])
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes}
-    return standing_problem(
-        machine(), lambda s: [y + forward * s, z + up * s], ROWS, STANDING_STARTS[1], horizon, **settings
-    )
+    return standing_problem(machine(), straight(forward, up), STANDING_STARTS[1], horizon, **settings)
 
 
 @pytest.mark.parametrize("horizon", [3.0, FreeTime(0.5, 3.0, 2.0)], ids=["fixed", "free"])
@@ -467,14 +401,8 @@ def test_the_foot_that_the_error_asks_for_is_enough() -> None:
     problem = lean(3.0)
     _, amount, _ = misses(problem, MultipleShooting(20))[0]
     longer = replace(machine(), support=rectangle((-0.05, 0.05), (-0.1, 0.2 + amount + 0.02)))
-    _, y, z = tip_at(machine(), STANDING_STARTS[1])
-
-    def path(s: Any) -> list[Any]:
-        return [y + 0.9 * s, z + 0.5 * s]
-
-    problem = standing_problem(
-        longer, path, ROWS, STANDING_STARTS[1], 3.0, zmp=IN_RANGE, limits=LIMITS, along="parameter"
-    )
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter"}
+    problem = standing_problem(longer, straight(0.9, 0.5), STANDING_STARTS[1], 3.0, **settings)
     assert held(problem, 20).success
 
 
@@ -526,9 +454,10 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tip_path": lambda t: [0.0, 0.5]}, "tip_path starts at .* from the tip"),
+        ({"tasks": led(lambda t: [0.0, 0.5])}, "the frame of 'link5' is .* away from where its task begins"),
         ({"start_joints": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
-        ({"rows": (0, 4)}, r"leave out \[0\]"),
+        ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
+        ({"tasks": TipTask(velocity=(0.1,), rows=(4,))}, "'link5' moves at .* 0 s, where the joints are to be at rest"),
         ({"horizon": -1.0}, "horizon must be a positive number"),
         ({"control": "force"}, "control must be one of acceleration, jerk"),
         ({"along": "arc"}, "along must be one of time, parameter"),
@@ -536,7 +465,6 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
-        ({"limits": Limits(velocity="fast")}, "velocity must be positive, one number or 5, not 'fast'"),
         ({"limits": 3}, "Standing machine, Weights and Limits, not Standing, Weights, int"),
         ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
         ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
@@ -544,17 +472,11 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
         ({"zmp": Following(lambda t: [t])}, "Following: the reference must be two numbers"),
         ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity must be positive, one number or 5"),
-        ({"horizon": 1.0}, "tip_path moves at .* 1 s, where the joints are to be at rest"),
+        ({"horizon": 1.0}, "the task of .* moves at .* 1 s, where the joints are to be at rest"),
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments = {
-        "tip_path": table_path(1),
-        "rows": ROWS,
-        "start_joints": STANDING_STARTS[1],
-        "horizon": HORIZON,
-        **changes,
-    }
+    arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": HORIZON, **changes}
     with pytest.raises(ProblemError, match=message):
         standing_problem(machine(), **arguments)
 
@@ -564,15 +486,13 @@ def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
     triangle = replace(arm(), support=Support([(-0.1, -0.1), (0.2, -0.1), (-0.1, 0.1828427)]))
     settings: dict[str, Any] = {"zmp": InFoot(0.09)}
     with pytest.raises(ProblemError, match=r"margin 0.09 m leaves no room .* 0.08\d"):
-        standing_problem(triangle, arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, **settings)
+        standing_problem(triangle, arm_task(), ARM_START, ARM_HORIZON, **settings)
 
 
 def test_a_path_longer_than_the_arm_is_refused() -> None:
-    _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    with pytest.raises(ProblemError, match=r"tip_path leads .* m away from the first joint .* at most 1.84 m long"):
-        standing_problem(
-            machine(), lambda s: [y + 2 * s, z], ROWS, STANDING_STARTS[1], 3.0, along="parameter", limits=LIMITS
-        )
+    message = r"leads .* m away from the first joint .* at most 1.84 m long"
+    with pytest.raises(ProblemError, match=message):
+        standing_problem(machine(), straight(2.0, 0.0), STANDING_STARTS[1], 3.0, along="parameter", limits=LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -584,6 +504,8 @@ def test_a_path_longer_than_the_arm_is_refused() -> None:
         (lambda: InFoot(np.nan), "InFoot: margin must be a finite number"),
         (lambda: IndexAtLeast(None), "value must be below 1"),  # type: ignore[arg-type]
         (lambda: FreeTime(np.nan, 1.0, 1.0), "lower <= guess <= upper"),
+        (lambda: Limits(velocity="fast"), "velocity must be positive, one number or one for each joint, not 'fast'"),
+        (lambda: Limits(jerk=(1.0, 0.0)), "jerk must be positive"),
         (lambda: Limits(friction="ice"), "friction must be positive"),  # type: ignore[arg-type]
         (lambda: Limits(vertical_force=0.0), "vertical_force must be positive"),
         (lambda: Limits(friction=0.0), "friction must be positive"),

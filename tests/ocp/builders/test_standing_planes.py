@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing.plan import (
+from ocp.builders.standing import (
     Anywhere,
     Following,
     IndexAtLeast,
@@ -25,19 +25,28 @@ from ocp.builders.standing.plan import (
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from ocp.local.laws import Law
+from ocp.tasks.tip_task import TipTask, quintic
 from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
-from tests.ocp.builders.standing_tasks import PLANAR_HORIZON, planar_path, planar_start, quintic, sampled, tip_at
+from tests.ocp.builders.standing_tasks import (
+    PLANAR_HORIZON,
+    led,
+    moved_task,
+    planar_start,
+    planar_task,
+    sampled,
+    tip_at,
+)
 
 SIZE = 5
 START = planar_start(SIZE)
-PATH = planar_path(SIZE, 0.2, -0.3)
+TASK = planar_task(SIZE, 0.2, -0.3)
 WEIGHTS = Weights(manipulability=0.0)  # that of two rows depends on the plane
 LAWS: tuple[Law, ...] = ("augmented", "null_space", "stabilised")
 
 
-def turned(degrees: float) -> tuple[Standing, Any, list[int]]:
+def turned(degrees: float) -> tuple[Standing, TipTask]:
     """The planar machine turned about the vertical, somewhere else, and its task in x or y and z."""
     turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     machine = planar_machine(SIZE)
@@ -58,7 +67,7 @@ def turned(degrees: float) -> tuple[Standing, Any, list[int]]:
         share = quintic(t / PLANAR_HORIZON)
         return [tip[axis] + ahead * share, tip[2] - 0.3 * share]
 
-    return machine, path, [3 + axis, 5]
+    return machine, led(path, (3 + axis, 5))
 
 
 def resting_point(machine: Standing) -> Array:
@@ -66,9 +75,9 @@ def resting_point(machine: Standing) -> Array:
     return numeric(machine.zero_moment_point(START, rest, rest)).ravel()
 
 
-def planned(machine: Standing, path: Any, rows: Any, zmp: ZmpRule, **settings: Any) -> Solution:
+def planned(machine: Standing, task: TipTask, zmp: ZmpRule, **settings: Any) -> Solution:
     options = {"zmp": zmp, "weights": WEIGHTS, "tip_level": "acceleration", **settings}
-    problem = standing_problem(machine, path, rows, START, PLANAR_HORIZON, **options)
+    problem = standing_problem(machine, task, START, PLANAR_HORIZON, **options)
     return solve(problem, Collocation(10, degree=3, scheme="legendre"))
 
 
@@ -85,10 +94,10 @@ def test_motion_moves_the_zero_moment_point_along_the_plane_alone(degrees: float
 def test_plans_and_laws_are_the_same_in_every_vertical_plane() -> None:
     costs, pushes = [], []
     for degrees in (0.0, 35.0, 210.0):
-        machine, path, rows = turned(degrees)
+        machine, task = turned(degrees)
         point = resting_point(machine)
-        costs.append([planned(machine, path, rows, zmp).cost for zmp in (InFoot(0.01), Pinned(point))])
-        found = [resolve_accelerations(machine, path, rows, START, 0.2, law=law, zmp=point, step=0.01) for law in LAWS]
+        costs.append([planned(machine, task, zmp).cost for zmp in (InFoot(0.01), Pinned(point))])
+        found = [resolve_accelerations(machine, task, START, 0.2, law=law, zmp=point, step=0.01) for law in LAWS]
         assert all(one.succeeded for one in found)
         pushes.append([one.motion.joint_accelerations for one in found])
         for one in found:
@@ -109,14 +118,14 @@ def test_what_pushes_a_planar_machine_sideways_is_felt(zmp: ZmpRule) -> None:
     point = resting_point(machine)
     rule = Pinned(point) if isinstance(zmp, Pinned) else zmp
     limits = Limits(acceleration=8.0)
-    solution = planned(machine, PATH, (4, 5), rule, external=push(20.0), limits=limits)
+    solution = planned(machine, TASK, rule, external=push(20.0), limits=limits)
     motion = sampled(machine, solution, push(20.0))
     aside = 20.0 * motion.tip_in_world[:, 2] / motion.ground_force[:, 2]
     np.testing.assert_allclose(motion.zero_moment_point[:, 0], aside, atol=1e-12)
     assert motion.foot_margin.min() > -1e-3
     with pytest.raises(ProblemError, match="zero moment point"):
-        planned(machine, PATH, (4, 5), rule, external=push(60.0), limits=limits)
-    standing_problem(machine, PATH, (4, 5), START, PLANAR_HORIZON, zmp=Anywhere(), external=push(60.0), limits=limits)
+        planned(machine, TASK, rule, external=push(60.0), limits=limits)
+    standing_problem(machine, TASK, START, PLANAR_HORIZON, zmp=Anywhere(), external=push(60.0), limits=limits)
 
 
 @pytest.mark.parametrize("start", ["rest", "free"])
@@ -126,7 +135,7 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
         planar_machine(SIZE), support=rectangle((0.05, 0.2), (-0.12, 0.2)), most_stable_point=None, half_widths=None
     )
     with pytest.raises(ProblemError, match="zero moment point"):
-        planned(beside, PATH, (4, 5), zmp, start=start)
+        planned(beside, TASK, zmp, start=start)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +149,7 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
     ],
 )
 def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str | None) -> None:
-    arguments = (planar_machine(SIZE), PATH, (4, 5), START, PLANAR_HORIZON)
+    arguments = (planar_machine(SIZE), TASK, START, PLANAR_HORIZON)
     if message is None:
         assert standing_problem(*arguments, zmp=zmp, tip_level="acceleration").name == "standing plan"
         return
@@ -150,20 +159,14 @@ def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str 
 
 def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() -> None:
     machine, start = planar_machine(3), planar_start(3)
-    path = planar_path(3, 0.02, -0.02)
-    arguments = (machine, path, (4, 5), start, PLANAR_HORIZON)
+    arguments = (machine, planar_task(3, 0.02, -0.02), start, PLANAR_HORIZON)
     with pytest.raises(ProblemError, match=r"2 rows and 1 of the zero moment point leave the 3 joints no freedom"):
         standing_problem(*arguments, zmp=Pinned(), tip_level="acceleration")
     two, begin = planar_machine(2), planar_start(3)[:2]
-    _, y, z = tip_at(two, begin)
-
-    def ahead(t: Any) -> list[Any]:
-        share = 0.1 * quintic(t / PLANAR_HORIZON)
-        return [y + share, z - share]
-
+    ahead = moved_task(two, begin, (0.1, -0.1), PLANAR_HORIZON)
     with pytest.raises(ProblemError, match=r"2 rows leave the 2 joints no freedom .* tip_level='acceleration'"):
-        standing_problem(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere())
-    plan = standing_problem(two, ahead, (4, 5), begin, PLANAR_HORIZON, zmp=Anywhere(), tip_level="acceleration")
+        standing_problem(two, ahead, begin, PLANAR_HORIZON, zmp=Anywhere())
+    plan = standing_problem(two, ahead, begin, PLANAR_HORIZON, zmp=Anywhere(), tip_level="acceleration")
     solution = solve(plan, Collocation(10, degree=3, scheme="legendre"))
     np.testing.assert_allclose(solution["velocities"][-1], 0, atol=1e-5)
 
@@ -171,11 +174,6 @@ def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() 
 def test_a_singular_start_is_named_where_the_cost_needs_a_slope() -> None:
     machine = planar_machine(SIZE)
     straight = np.zeros(SIZE)
-    _, y, z = tip_at(machine, straight)
-
-    def path(t: Any) -> list[Any]:
-        share = 0.1 * quintic(t / PLANAR_HORIZON)
-        return [y - share, z + share]
-
+    task = moved_task(machine, straight, (-0.1, 0.1), PLANAR_HORIZON)
     with pytest.raises(ProblemError, match=r"start_joints \[0.0, .* singular there"):
-        standing_problem(machine, path, (4, 5), straight, PLANAR_HORIZON)
+        standing_problem(machine, task, straight, PLANAR_HORIZON)

@@ -20,14 +20,15 @@ from models import Robot, Standing, Wrench, rectangle, simplified, with_load
 from models.machines.standing_motion import StandingMotion
 from models.papers import standing_example
 from ocp import Collocation, Solution, solve
-from ocp.builders.standing.plan import Anywhere, Limits, Pinned, standing_problem
+from ocp.builders.standing import Anywhere, Limits, Pinned, standing_problem
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
+from ocp.tasks.equations import task_errors
 from scripts.robots import pushing
 from scripts.robots import standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State
 from tests.models.robot.trees import Array, numeric
-from tests.ocp.builders.standing_tasks import sampled, tip_error
+from tests.ocp.builders.standing_tasks import moved_task, sampled, tip_error
 
 pytestmark = pytest.mark.xdist_group("standing robots")
 
@@ -124,8 +125,7 @@ def test_tiago_stands_where_instant_resolution_tips_it(tiago: gallery.Results) -
     assert motion.foot_margin.min() > gallery.MARGIN - 1e-3
     assert motion.friction.max() <= 0.6
     assert_in_limits(tiago.robot, motion)
-    wanted = tip_error(motion, gallery.timed(gallery.circle(tiago.machine)), ROWS)
-    assert wanted < 1e-5
+    assert tip_error(tiago.machine, motion, gallery.from_rest(gallery.circle(tiago.machine))) < 1e-5
     np.testing.assert_allclose(np.linalg.norm(motion.external_force, axis=1), gallery.PULL, rtol=1e-12)
     audit = tiago.solution.audit(tolerances=gallery.TOLERANCES)
     assert audit.passed, str(audit)
@@ -133,9 +133,9 @@ def test_tiago_stands_where_instant_resolution_tips_it(tiago: gallery.Results) -
 
 def test_pinning_the_zero_moment_point_where_it_starts_makes_tiago_lift_off(tiago: gallery.Results) -> None:
     place = tiago.local.zero_moment_point[0]
-    path = gallery.timed(gallery.circle(tiago.machine))
+    task = gallery.from_rest(gallery.circle(tiago.machine))
     settings: dict[str, Any] = {"law": "augmented", "zmp": place, "external": tiago.external, "step": 5e-3}
-    found = resolve_accelerations(tiago.machine, path, ROWS, gallery.START, gallery.SECONDS, **settings)
+    found = resolve_accelerations(tiago.machine, task, gallery.START, gallery.SECONDS, **settings)
     assert found.stopped is not None
     assert found.stopped.reason == "lift_off"
 
@@ -154,16 +154,15 @@ def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None
     audit = solution.audit(tolerances=gallery.TOLERANCES)
     assert audit.passed, str(audit)
     shares = solution.at_fraction(np.linspace(0, 1, len(motion.t)))["path"][:, 0]
-    hand = gallery.circle(tiago.machine)
-    wanted = np.array([np.array(ca.DM(ca.vertcat(*hand(share)))).ravel() for share in shares])
-    assert np.abs(motion.tip_in_world - wanted).max() < 1e-5
+    errors = task_errors(tiago.machine, gallery.circle(tiago.machine), shares, None, motion.joints)
+    assert np.abs(errors).max() < 1e-5
 
 
 def test_anymal_stands_where_instant_resolution_tips_it(anymal: Peered, anymal_solution: Solution) -> None:
     machine = anymal.machine
     settings: dict[str, Any] = {"external": pushing.reaction(machine), "step": 1e-2}
-    path = pushing.timed(machine)
-    local = resolve_accelerations(machine, path, ROWS, pushing.START, pushing.SECONDS, **settings).motion
+    task = pushing.task(machine)
+    local = resolve_accelerations(machine, task, pushing.START, pushing.SECONDS, **settings).motion
     assert not local.stands
     audit = anymal_solution.audit()
     assert audit.passed, str(audit)
@@ -171,7 +170,7 @@ def test_anymal_stands_where_instant_resolution_tips_it(anymal: Peered, anymal_s
     assert motion.foot_margin.min() > 0.009
     assert motion.friction.max() <= 0.7
     assert_in_limits(machine.robot, motion)
-    assert tip_error(motion, path, ROWS) < 1e-6
+    assert tip_error(machine, motion, task) < 1e-6
     assert_pinocchio_agrees(anymal, motion, pushing.reaction(machine))
 
 
@@ -242,9 +241,7 @@ def test_a_start_in_a_singular_posture_may_be_left() -> None:
     machine, start = standing_example(), np.array([np.pi / 2, 0.0, 2 * np.pi, 2 * np.pi, 0.0])
     _, y, z = numeric(machine.tip_pose((), start).position).ravel()
     limits = Limits(joints=False, velocity=6.0, acceleration=60.0)
-    problem = standing_problem(
-        machine, lambda t: [y, z - 0.1 * gallery.smooth(t / 2.0)], (4, 5), start, 2.0, limits=limits
-    )
+    problem = standing_problem(machine, moved_task(machine, start, (0.0, -0.1), 2.0), start, 2.0, limits=limits)
     solution = solve(problem, Collocation(16, degree=3, scheme="legendre", control="held"))
     end = numeric(machine.tip_pose((), solution["joints"][-1]).position).ravel()
     np.testing.assert_allclose(end, [0, y, z - 0.1], atol=1e-7)

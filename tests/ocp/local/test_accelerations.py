@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from models import ModelError
+from models import FixedBase, ModelError
 from models.machines.standing import Standing
 from models.papers import STANDING_STARTS
 from models.robot.indices import jacobian_manipulability, joint_limit_index
@@ -16,6 +16,9 @@ from models.robot.motion import momentum
 from ocp.errors import ProblemError
 from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
 from ocp.local.laws import Law, accelerations
+from ocp.local.rates import resolve
+from ocp.tasks.equations import bind, task_errors, track_expression
+from ocp.tasks.tip_task import TipTask, pose_line
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
 from tests.ocp.builders.standing_tasks import (
@@ -23,25 +26,31 @@ from tests.ocp.builders.standing_tasks import (
     ARM_START,
     HORIZON,
     ROWS,
+    SIX_START,
+    TWO_START,
     arm,
-    arm_path,
+    arm_task,
+    led,
     machine,
+    six,
     spring,
-    table_path,
+    table_task,
     tip_at,
     tip_error,
     tool,
+    two,
+    two_tasks,
 )
+from tests.ocp.tasks.space_tasks import pose, turned
 
 
 def table(number: int, **settings: Any) -> AccelerationSolution:
     external = spring() if number == 2 else None
-    return resolve_accelerations(
-        machine(), table_path(number), ROWS, STANDING_STARTS[number], HORIZON, external=external, **settings
-    )
+    start = STANDING_STARTS[number]
+    return resolve_accelerations(machine(), table_task(number), start, HORIZON, external=external, **settings)
 
 
-def law(standing: Standing, path: Any, rows: Any, **settings: Any) -> Any:
+def law(standing: Standing, task: TipTask, **settings: Any) -> Any:
     """(time, q, q') -> q'' of a law, the zero moment point at the most stable point."""
     n = standing.joint_size
     time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
@@ -49,7 +58,7 @@ def law(standing: Standing, path: Any, rows: Any, **settings: Any) -> Any:
     return ca.Function(
         "law",
         [time, q, qd],
-        [accelerations(standing, path, rows, time=time, q=q, qd=qd, zmp=lambda _: place, **settings)],
+        [accelerations(standing, bind(standing, task), time=time, q=q, qd=qd, zmp=lambda _: place, **settings)],
     )
 
 
@@ -67,7 +76,7 @@ def test_the_plain_pseudo_inverse_tips_over() -> None:
     assert not found.motion.stands
     assert not found.succeeded
     assert found.tip_error.max() < 1e-9
-    assert tip_error(found.motion, table_path(1)) < 1e-9
+    assert tip_error(machine(), found.motion, table_task(1)) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["augmented", "null_space"])
@@ -98,7 +107,7 @@ def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
     for what in ("joints", "joint_velocities", "joint_accelerations"):
         found = [getattr(solution.motion, what) for solution in both]
         np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-9)
-    laws = [law(arm(), arm_path, (3, 4, 5), external=tool, law=name) for name in ("augmented", "null_space")]
+    laws = [law(arm(), arm_task(), external=tool, law=name) for name in ("augmented", "null_space")]
     rng = np.random.default_rng(1)
     for _ in range(5):
         at = near(rng, ARM_START)
@@ -108,12 +117,12 @@ def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
 def test_the_augmented_law_is_the_least_acceleration_that_does_both() -> None:
     """(20) by numpy's pseudo-inverse of the stacked rows, on a spatial arm with a wrench at the tool."""
     standing, rng = arm(), np.random.default_rng(2)
-    found = law(standing, arm_path, (3, 4, 5), external=tool, law="augmented")
+    found = law(standing, arm_task(), external=tool, law="augmented")
     n = standing.joint_size
     q, qd, t = ca.SX.sym("q", n), ca.SX.sym("qd", n), ca.SX.sym("t")
     jacobian = standing.tip_jacobian((), q)[3:6, :]
     bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
-    wanted = ca.jacobian(ca.jacobian(ca.vertcat(*arm_path(t)), t), t)
+    wanted = ca.jacobian(ca.jacobian(track_expression(arm_task().position, t, (3, 1)), t), t)
     rows = standing.zmp_rows(q, qd, (0, 0), tool(t, standing.tip_pose((), q).position))
     stack = [ca.vertcat(jacobian, rows.jacobian), ca.vertcat(wanted - bias, rows.needed(qd))]
     stacked = ca.Function("stacked", [t, q, qd], stack)
@@ -137,7 +146,7 @@ def printed_sequence(time: float, q0: Array, qd0: Array, delta: tuple[float, flo
     standing = machine()
     q, qd, t = ca.SX.sym("q", 5), ca.SX.sym("qd", 5), ca.SX.sym("t")
     jacobian = standing.tip_jacobian((), q)[ROWS, :]
-    wanted = ca.jacobian(ca.jacobian(ca.vertcat(*table_path(1)(t)), t), t)
+    wanted = ca.jacobian(ca.jacobian(track_expression(table_task(1).position, t, (2, 1)), t), t)
     rows = standing.zmp_rows(q, qd, (0, 0))
     parts: list[Any] = [ca.vertcat(jacobian, rows.jacobian[1, :])]
     bias = ca.jtimes(ca.mtimes(jacobian, qd), q, qd)
@@ -160,7 +169,7 @@ def printed_sequence(time: float, q0: Array, qd0: Array, delta: tuple[float, flo
 
 def test_layers_in_sequence_follow_the_corrected_printed_form_and_do_what_they_are_asked() -> None:
     layers = (Layer("joint_limits", -0.3), Layer("manipulability", 0.2))
-    found = law(machine(), table_path(1), ROWS, law="augmented", layers=layers)
+    found = law(machine(), table_task(1), law="augmented", layers=layers)
     q, qd, qdd = (ca.SX.sym(name, 5) for name in ("q", "qd", "qdd"))
     second = []
     for name in ("joint_limits", "manipulability"):
@@ -192,7 +201,7 @@ def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
         outside = {"external": lambda t, tip: [standing.tip_wrench(ca.DM(push) * (1 + t) - tip)]}  # noqa: B023
         start = standing.tip_pose((), q0).position[1:3]
         found = [
-            numeric(law(standing, lambda t: start + ca.sin(3 * t), (4, 5), law=name, **outside)(0.3, q0, qd0))  # noqa: B023
+            numeric(law(standing, led(lambda t: start + ca.sin(3 * t)), law=name, **outside)(0.3, q0, qd0))  # noqa: B023
             for name in ("augmented", "null_space")
         ]
         np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-9 * np.abs(found[0]).max())
@@ -208,7 +217,7 @@ def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> 
         start = np.array([2.0, -1.4, 1.2, -0.4, -0.3, 0.2])
     tip = tip_at(standing, start)[[row - 3 for row in rows]]
     layers = (Layer("joint_limits", -0.4), Layer("manipulability", 0.1))
-    found = law(standing, lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows, law="augmented", layers=layers)
+    found = law(standing, led(lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows), law="augmented", layers=layers)
     middle, width = (standing.robot.lower + standing.robot.upper) / 2, standing.robot.upper - standing.robot.lower
 
     def indices(q: Array) -> Array:
@@ -226,8 +235,8 @@ def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> 
 
 @pytest.mark.parametrize(("name", "sign"), [("joint_limits", -1.0), ("manipulability", 1.0)])
 def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tasks(name: Any, sign: float) -> None:
-    plain = law(machine(), table_path(1), ROWS, law="augmented")
-    driven = law(machine(), table_path(1), ROWS, law="augmented", layers=(Layer(name, sign, "gradient"),))
+    plain = law(machine(), table_task(1), law="augmented")
+    driven = law(machine(), table_task(1), law="augmented", layers=(Layer(name, sign, "gradient"),))
     q, rng = ca.SX.sym("q", 5), np.random.default_rng(4)
     slope = ca.Function("slope", [q], [index_and_slope(q, name)[1]])
     for _ in range(5):
@@ -277,7 +286,7 @@ def test_the_stabilised_law_fails_on_table_2() -> None:
 def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_beyond_its_limits() -> None:
     """The pinned pendulum carried on past its lift-off, but stopped before it diverges; and tighter joint limits."""
     flies = resolve_accelerations(
-        machine(), table_path(1), ROWS, STANDING_STARTS[1], 1.2, law="augmented", stop_at_lift_off=False
+        machine(), table_task(1), STANDING_STARTS[1], 1.2, law="augmented", stop_at_lift_off=False
     )
     assert flies.stopped is None
     assert flies.motion.index.min() == pytest.approx(1.0, abs=1e-9)
@@ -290,7 +299,7 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
               enumerate(standing.robot.joints)]  # fmt: skip
     joints[3] = replace(joints[3], lower=STANDING_STARTS[1][3] - 0.01, upper=STANDING_STARTS[1][3] + 0.01)
     narrow = replace(standing, robot=replace(standing.robot, joints=tuple(joints)))
-    bent = resolve_accelerations(narrow, table_path(1), ROWS, STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
+    bent = resolve_accelerations(narrow, table_task(1), STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
     assert bent.stopped is None
     assert bent.motion.index.min() == pytest.approx(1.0, abs=1e-9)
     assert bent.motion.stands
@@ -302,14 +311,9 @@ def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
     """Held still by a path that swings faster than the steps see."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     found = resolve_accelerations(
-        machine(),
-        lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2],
-        ROWS,
-        STANDING_STARTS[1],
-        0.5,
-        step=0.05,
-        null_damping=2.0,
-    )
+        machine(), led(lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2]), STANDING_STARTS[1], 0.5,
+        step=0.05, null_damping=2.0,
+    )  # fmt: skip
     assert found.tip_error.max() > 1e-3
     assert "leaves_path" in found.failures
 
@@ -327,7 +331,7 @@ def test_random_machines_stop_for_a_named_reason_or_reach_the_horizon_with_sound
     def path(t: Any) -> list[Any]:
         return [y + 0.1 * ca.sin(t) ** 2, z]
 
-    found = resolve_accelerations(standing, path, ROWS, start, 1.0, law=law, step=1e-2)
+    found = resolve_accelerations(standing, led(path), start, 1.0, law=law, step=1e-2)
     motion = found.motion
     assert np.isfinite(np.hstack([motion.joints, motion.joint_velocities, motion.joint_accelerations])).all()
     if found.stopped is None:
@@ -371,7 +375,7 @@ def test_both_integrators_agree_and_rk4_is_of_fourth_order() -> None:
 
 
 def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
-    found = resolve_accelerations(arm(), arm_path, (3, 4, 5), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
+    found = resolve_accelerations(arm(), arm_task(), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
     assert found.stopped is None
     assert found.tip_error.max() < 1e-9
     assert found.motion.index.min() < -0.3
@@ -385,7 +389,7 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     def path(t: Any) -> list[Any]:
         return [y + (1.8 - y) * t**2, z * (1 - t**2)]
 
-    found = resolve_accelerations(machine(), path, ROWS, STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
+    found = resolve_accelerations(machine(), led(path), STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
     assert found.stopped is not None
     assert found.stopped.reason in ("divergence", "breakdown")
     assert np.isfinite(found.motion.joint_accelerations).all()
@@ -403,11 +407,11 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
         ({"layers": ("limits",)}, "layers must be a list of Layer"),
         ({"law": "stabilised", "stabiliser": 3}, "stabiliser must be"),
         ({"zmp": lambda t: t, "law": "augmented"}, "zmp must be two numbers"),
-        ({"rows": (0, 4)}, r"gives positions, rows 3, 4, 5; leave out \[0\]"),
-        ({"start_velocities": (1.0,)}, "start_velocities must be 5 numbers"),
+        ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
+        ({"start_velocities": (1.0,)}, "start_velocities has 1 entries, expected 5"),
         ({"zmp": (0.0,)}, "zmp must be two numbers"),
-        ({"tip_path": lambda t: [0.0, 0.5]}, "tip_path starts at .* from the tip"),
-        ({"tip_path": lambda t: [0.0]}, r"tip_path has shape \(1, 1\), expected \(2, 1\)"),
+        ({"tasks": led(lambda t: [0.0, 0.5])}, "'link5' is .* away from where its task begins"),
+        ({"tasks": led(lambda t: [0.0])}, r"position has shape \(1, 1\), expected \(3, 1\) or \(2, 1\)"),
         (
             {"law": "stabilised", "layers": (Layer("joint_limits", -1.0), Layer("manipulability", 1.0))},
             "needs 6 joints .* there are 5",
@@ -415,7 +419,7 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments = {"tip_path": table_path(1), "rows": ROWS, "start_joints": STANDING_STARTS[1], "horizon": 1.0, **changes}
+    arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": 1.0, **changes}
     with pytest.raises(ProblemError, match=message):
         resolve_accelerations(machine(), **arguments)
 
@@ -446,15 +450,47 @@ def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> No
 )
 def test_what_gives_no_wrenches_is_refused(external: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], 1.0, external=external)
+        resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 1.0, external=external)
 
 
 def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
     def push(time: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
 
-    found = resolve_accelerations(machine(), table_path(1), ROWS, STANDING_STARTS[1], 0.3, external=push, step=0.01)
+    found = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 0.3, external=push, step=0.01)
     assert found.stopped is not None
     assert found.stopped.reason == "breakdown"
     assert found.stopped.time == pytest.approx(0.11)
     assert np.isfinite(found.motion.ground_force).all()
+
+
+def test_a_pose_that_takes_all_joints_gives_the_motion_of_the_rates() -> None:
+    """Six rows on six joints leave no choice: both levels of one task have the same joint motion."""
+    rotation, position = pose(six(), (), SIX_START)
+    goal = rotation @ turned((1, 2, 0.5), 0.4), position + np.array([0.02, 0.15, -0.1])
+    line = pose_line((rotation, position), goal, 1.0)
+    task = TipTask(position=line.position, orientation=line.orientation)
+    slow = resolve(FixedBase(six().robot), task=task, start_joints=SIX_START, horizon=1.0, samples=11)
+    fast = resolve_accelerations(six(), task, SIX_START, 1.0, step=0.01)
+    assert fast.tip_error.max() < 1e-8
+    np.testing.assert_allclose(fast.motion.joints[::10], slow.joints, atol=1e-7)
+    np.testing.assert_allclose(fast.motion.joint_velocities[::10], slow.joint_rates, atol=1e-6)
+
+
+def test_the_feedback_of_accelerations_closes_a_gap_critically_damped() -> None:
+    """e'' + 2 g e' + g^2 e = 0 from rest: e = e0 (1 + g t) exp(-g t)."""
+    _, y, z = tip_at(machine(), STANDING_STARTS[1])
+    task = TipTask(position=(y + 0.003, z - 0.004), rows=ROWS, gain=3.0, start_gap=0.01)
+    found = resolve_accelerations(machine(), task, STANDING_STARTS[1], 1.0, step=0.01)
+    expected = 0.005 * (1 + 3 * found.motion.t) * np.exp(-3 * found.motion.t)
+    np.testing.assert_allclose(found.tip_error, expected, atol=1e-9)
+
+
+def test_two_tips_are_led_at_once() -> None:
+    """A hand that is told nothing moves with the body; both stay on their paths where both are told."""
+    tasks = two_tasks((0.1, 0.0, 0.1), (0.0, -0.1, 0.0))
+    one, both = (resolve_accelerations(two(), some, TWO_START, 0.5, step=0.01) for some in (tasks[0], tasks))
+    np.testing.assert_allclose(both.tip_error, 0, atol=1e-8)
+    errors = task_errors(two(), tasks, one.motion.t, None, one.motion.joints)
+    assert np.abs(errors[:, :3]).max() < 1e-8
+    assert np.abs(errors[:, 3:]).max() > 1e-3

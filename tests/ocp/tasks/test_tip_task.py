@@ -13,7 +13,8 @@ from models.paths import Path, smooth
 from ocp.errors import ProblemError
 from ocp.local.rates import resolve
 from ocp.tasks.equations import bind, task_errors
-from ocp.tasks.tip_task import TipTask, along, pose_line
+from ocp.tasks.tip_task import TipTask, along, pose_line, timed
+from tests.models.machines.standing_machines import standing_arm
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.tasks.space_tasks import (
     BASE,
@@ -302,3 +303,96 @@ def test_a_planar_arm_takes_poses_in_its_plane() -> None:
     task = TipTask(position=line.position, orientation=line.orientation, rows=(2, 3, 4))
     local = resolve(machine, task=task, start_joints=start, horizon=2.0, samples=5)
     np.testing.assert_allclose(pose(machine, (), local.joints[-1])[1], position + np.array([-0.3, 0.2, 0.0]), atol=1e-8)
+
+
+def motion_of(symbols: Any, size: int, seed: int) -> Any:
+    """A smooth motion of `size` coordinates: time -> (value, rate, second derivative)."""
+    rng, t = np.random.default_rng(seed), symbols.sym("t")
+    value = ca.DM(rng.normal(size=size)) + ca.DM(rng.normal(size=size)) * ca.sin(t + ca.DM(rng.uniform(0, 6, size)))
+    rate = ca.jacobian(value, t)
+    return ca.Function("motion", [t], [value, rate, ca.jacobian(rate, t)])
+
+
+def tilting(time: Any) -> Any:
+    return ca.vertcat(ca.sin(0.3 * time), 0.2, ca.cos(0.3 * time))
+
+
+def drift(time: Any) -> Any:
+    return [0.3 + 0.1 * ca.sin(time), 0.2, 0.5 - 0.1 * time**2]
+
+
+TASKS = {
+    "pose": TipTask(position=drift, orientation=(0.9, 0.1, -0.3, 0.2), gain=1.5),
+    "axis": TipTask(position=drift, direction=tilting, rows=(5, 3), axes="tip", gain=0.0),
+    "velocity": TipTask(rows=(1, 5, 3), velocity=lambda t: [t, ca.sin(t), 0.1], axes="base", gain=2.0),
+    "relative": TipTask(position=drift, relative_to="link3", axes="reference", rows=(4,)),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_equations_of_accelerations_are_those_of_velocities_differentiated(name: str) -> None:
+    """Along any motion whatever, d/dt (J u - b) + gain (J u - b) by finite differences; and J is its slope in u'."""
+    machine, task = standing_arm(), TASKS[name]
+    equations, n = bind(machine, task), machine.joint_size
+    q, u, second, time = (ca.SX.sym(what, size) for what, size in (("q", n), ("u", n), ("s", n), ("t", 1)))
+    residual = equations.residual(ca.DM(0, 1), q, u, equations.targets(time))
+    twist_level = ca.Function("twist", [q, u, time], [residual])
+    level = equations.acceleration(ca.DM(0, 1), q, u, second, time)
+    slope = ca.Function("slope", [q, u, time], [ca.jacobian(level, second) - equations.jacobian(ca.DM(0, 1), q)])
+    acceleration_level = ca.Function("acceleration", [q, u, second, time], [level])
+    motion, h = motion_of(ca.SX, n, 3), 1e-5
+    for at in (0.2, 1.1, 2.7):
+        before, here, after = (numeric(twist_level(*motion(t)[:2], t)) for t in (at - h, at, at + h))
+        expected = (after - before) / (2 * h) + task.gain * here
+        np.testing.assert_allclose(numeric(acceleration_level(*motion(at), at)), expected, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(numeric(slope(*motion(at)[:2], at)), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [*TASKS, "path"])
+def test_a_task_of_a_path_parameter_run_by_a_clock_is_the_timed_task(name: str) -> None:
+    """The chain rule at both levels: pace and change of pace of the parameter on one side, `timed` on the other."""
+    machine, symbols = standing_arm(), ca.MX if name == "path" else ca.SX
+    path = smooth(Path.through([(0.0, 0, 0), (0.5, 0.0, 0), (0.5, 0.6, 0)]), deviation=0.02)
+    task = TASKS[name] if name != "path" else TipTask(position=along(path, 0.4))
+    equations, n = bind(machine, task), machine.joint_size
+    both = bind(machine, timed(task, lambda t: 0.3 * t + 0.2 * t**2))
+    q, u, second, time, pace, change = (
+        symbols.sym(what, size) for what, size in zip(("q", "u", "s", "t", "p", "c"), (n, n, n, 1, 1, 1), strict=True)
+    )
+    none = ca.DM(0, 1)
+    over_parameter = ca.Function("over", [q, u, second, time, pace, change], [
+        equations.residual(none, q, u, equations.targets(time, pace)),
+        equations.acceleration(none, q, u, second, time, pace, change),
+    ])  # fmt: skip
+    over_time = ca.Function("time", [q, u, second, time], [
+        both.residual(none, q, u, both.targets(time)), both.acceleration(none, q, u, second, time)
+    ])  # fmt: skip
+    rng = np.random.default_rng(4)
+    for at in (0.4, 1.3):
+        state = rng.normal(size=(3, n))
+        expected = over_parameter(*state, 0.3 * at + 0.2 * at**2, 0.3 + 0.4 * at, 0.4)
+        for ours, theirs in zip(over_time(*state, at), expected, strict=True):
+            np.testing.assert_allclose(numeric(ours), numeric(theirs), rtol=1e-10, atol=1e-10)
+
+
+def test_a_position_may_name_its_rows_alone() -> None:
+    machine = standing_arm()
+    targets = [
+        bind(machine, TipTask(position=track, rows=(5, 3))).target_function()(0.4)
+        for track in (lambda t: [ca.sin(t), 2 * t], lambda t: [2 * t, 0, ca.sin(t)])
+    ]
+    np.testing.assert_allclose(numeric(targets[0]), numeric(targets[1]), atol=0)
+    along_tip = TipTask(position=(1.0, 2.0), rows=(5, 3), axes="tip")
+    with pytest.raises(ProblemError, match=r"position has shape \(2, 1\), expected \(3, 1\)"):
+        bind(machine, along_tip).target_function()
+
+
+@pytest.mark.parametrize("rows", [(3, 4, 5), range(6)], ids=["six rows", "twelve rows"])
+def test_the_manipulability_of_two_arms_is_the_product_of_their_singular_values(rows: Any) -> None:
+    machine, rng = FixedBase(two_pandas().robot), np.random.default_rng(8)
+    hands = ("left_panda_hand", "right_panda_hand")
+    equations = bind(machine, [TipTask(velocity=np.zeros(len(rows)), rows=rows, link=hand) for hand in hands])
+    for joints in rng.uniform(-2, 2, size=(3, 14)):
+        values = np.linalg.svd(numeric(equations.jacobian(ca.DM(0, 1), joints)), compute_uv=False)
+        found = equations.manipulability(ca.DM(0, 1), ca.DM(joints))
+        np.testing.assert_allclose(float(found), values.prod(), rtol=1e-9)

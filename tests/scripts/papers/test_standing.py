@@ -16,11 +16,11 @@ from PIL import Image
 
 from models.machines.standing_motion import StandingMotion
 from models.papers import STANDING_STARTS
-from ocp.builders.standing.plan import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
+from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from ocp.local.accelerations import resolve_accelerations
 from scripts import reproduce, standing
 from scripts.papers.standing import results as standing_results
-from scripts.papers.standing.cases import HORIZON, LOCAL, ROWS, fails, machine, table_path
+from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task
 from scripts.papers.standing.checks import ALLOWED, STATIONARITY, check, failures, region_excess
 from scripts.papers.standing.drawing import arm_points
 from scripts.papers.standing.plans import PLANS, Plan
@@ -167,9 +167,9 @@ def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not
 
 
 def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
-    path, start, horizon = table_path(1), STANDING_STARTS[1], 0.8
-    ours, gap = printed_law(machine(), path, ROWS, start, horizon, sign=1.0)
-    other = resolve_accelerations(machine(), path, ROWS, start, horizon, law="null_space").motion
+    task, start, horizon = table_task(1), STANDING_STARTS[1], 0.8
+    ours, gap = printed_law(machine(), task, start, horizon, sign=1.0)
+    other = resolve_accelerations(machine(), task, start, horizon, law="null_space").motion
     assert gap < 1e-9
     np.testing.assert_allclose(ours.t, other.t, atol=1e-12)
     np.testing.assert_allclose(ours.joints, other.joints, atol=1e-9)

@@ -1,0 +1,348 @@
+"""Whole motions of a machine that stands on the ground: do tasks of its tips, do not tip over, spend the freedom well.
+
+The global counterpart of ocp.local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial, and
+any task of `tip_task`: positions, orientations, free tool axes, several arms.
+
+Joint accelerations (or jerks) are the control. Two ways to keep the tips to their tasks:
+
+tip_level "position": for controls held over intervals, `MultipleShooting(..., control="held")` or `Collocation(...,
+    control="held")`. The tip is on its path at the nodes; what the ground and the joints bear is constrained at both
+    ends of every interval; a pinned zero moment point is where it should be at the start of every interval. Converges
+    with the first order of the interval where a constraint of the ground is active, and by shooting the multipliers of
+    that constraint then belong to one end of an interval: the audit's stationarity, taken inside it, may not fit.
+tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
+    tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
+    nearer to the optimum for the same number of intervals, and certified by the audit. The one to take where slides
+    move the tip in straight lines: there a tip on its path at the nodes alone swings between them, or comes to no rest
+    on the grid (try one interval more). Not for plans that switch, as
+    those of least time do: between the points of an interval with a switch the polynomials swing far.
+
+Either way limits hold at the points of the grid; `ocp.tighten(problem, method)` in place of `solve` makes those of
+joints and ground hold between the points as well. Both ways have the tip within 1e-5 m of its path between the points
+where the grid is fine enough: 40 intervals with collocation, 80 with held controls, for tasks such as those of the
+paper. There a zero moment point that is pinned or follows a reference is within 1 mm of it by the second way, and by
+the first with the jerk as control; with held accelerations it strays 5 mm, for it jumps with them.
+`ocp.builders.standing.plan` chooses among all this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import Array
+from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
+from models.machines.standing_motion import StandingMotion
+from models.robot.dynamics import Wrench
+from models.robot.indices import joint_limit_index
+from ocp.builders.standing.start import (
+    check_freedom,
+    check_loads,
+    check_slope,
+    inside_limits,
+    local_guess,
+    task_demand,
+)
+from ocp.errors import ProblemError
+from ocp.problem.problem import Problem
+from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.limits import JointBounds, Limits
+from ocp.tasks.tip_task import TipTask
+from ocp.tasks.zmp_rules import (
+    Following,
+    IndexAtLeast,
+    InFoot,
+    Pinned,
+    ZmpRule,
+    check_rule,
+    foot_rows,
+    index_rows,
+    is_finite,
+)
+
+__all__ = ["FreeTime", "Weights", "motion_cost", "standing_problem"]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Of the parts of the cost, an integral over the motion plus `time` times a free final time.
+
+    Attributes:
+        acceleration, velocity, jerk: Of the sums of squares over the joints.
+        joint_limits: Of the joint-limit index p1 (23).
+        manipulability: Of minus the manipulability p2 (27) of the tasks' rows.
+        time: Of a free final time, 1/s.
+    """
+
+    acceleration: float = 0.01
+    velocity: float = 0.01
+    joint_limits: float = 1.0
+    manipulability: float = 0.5
+    jerk: float = 1e-4
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, value in vars(self).items():
+            if not (is_finite(value) and value >= 0):
+                raise ProblemError(f"weights: {what} must be a finite number, zero or above, not {value!r}")
+
+
+@dataclass(frozen=True)
+class FreeTime:
+    """A final time that is found: between lower and upper, with a first guess, s."""
+
+    lower: float
+    upper: float
+    guess: float
+
+    def __post_init__(self) -> None:
+        given = (self.lower, self.guess, self.upper)
+        if not (all(map(is_finite, given)) and 0 < self.lower <= self.guess <= self.upper):
+            raise ProblemError(
+                f"FreeTime: 0 < lower <= guess <= upper is needed, not {self.lower!r}, {self.guess!r}, {self.upper!r}"
+            )
+
+
+def standing_problem(
+    machine: Standing,
+    tasks: TipTask | Sequence[TipTask],
+    start_joints: Any,
+    horizon: float | FreeTime,
+    *,
+    zmp: ZmpRule | None = None,
+    external: External | None = None,
+    weights: Weights | None = None,
+    limits: Limits | None = None,
+    control: Literal["acceleration", "jerk"] = "acceleration",
+    along: Literal["time", "parameter"] = "time",
+    tip_level: Literal["position", "acceleration"] = "position",
+    start: Literal["rest", "free"] = "rest",
+    end: Literal["rest", "free"] = "rest",
+    end_joints: Any = None,
+    symbols: Any = ca.SX,
+) -> Problem:
+    """Do the tasks while the machine stands, at the least cost.
+
+    States "joints", "velocities" (and "accelerations" where the jerk is the control); controls "accelerations" or
+    "jerks". Where the tasks are functions of a parameter, states "path" 0..1 and "path_rate" >= 0, control
+    "path_acceleration". Path constraints "tip"; "zero moment point" (m; inside a foot the distance from its edges, less
+    the margin); "foot", the distance from edges that another rule leaves open; "vertical force", N; "friction", the
+    square of the force the ground holds less that it gives, over the squared weight; "torques".
+
+    Args:
+        machine: What stands.
+        tasks: A TipTask, or several that are done at once, of the time, s, or of the path parameter.
+        start_joints: Shape (n,), rad or m.
+        horizon: Final time, s, or FreeTime(...).
+        zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
+            Pinned(point), Following(reference) or Anywhere().
+        external: Wrenches from outside as a function of time and tip position, for example `tip_spring`.
+        weights: Of the parts of the cost. limits: Of joints and ground.
+        control: What is held over an interval of the plan.
+        along: What the tasks are functions of; "parameter" from 0 to 1, velocities per unit of it. A free final time
+            needs "parameter", or tasks that suit any horizon.
+        tip_level: Whether the path constraint "tip" is that the poses are as wanted (m; sines of angles), and the
+            velocities of tasks that are such, or the derivative of the velocities (m/s^2, rad/s^2), by which alone a
+            gap at the start can be closed; what is left of it at the end still moves the joints.
+        start, end: Whether the joints are at rest there, or free to move.
+        end_joints: Joint positions at the end, nan where free; all free if None. Shape (n,).
+        symbols: casadi.SX, or casadi.MX when a task, external or a reference calls an interpolant.
+
+    Returns:
+        The problem, with a local motion as its guess.
+
+    Raises:
+        ProblemError: Sizes, rows or options that do not fit, a start outside the limits, a task that does not begin
+            at its tip, is longer than the arm, or moves where the joints are to rest; a start from rest at which
+            torques, vertical force or zero moment point are beyond what may be whatever the joints do; a zero moment
+            point that is asked out of the support; no freedom left to come to rest; a singular start whose
+            manipulability the cost would need.
+    """
+    zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
+    if not (isinstance(machine, Standing) and isinstance(weights, Weights) and isinstance(limits, Limits)):
+        given = [type(one).__name__ for one in (machine, weights, limits)]
+        raise ProblemError(f"standing_problem takes a Standing machine, Weights and Limits, not {', '.join(given)}")
+    _check_options(control=control, along=along, tip_level=tip_level, start=start, end=end)
+    if tip_level == "acceleration" and control == "jerk":
+        raise ProblemError("tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'")
+    equations = bind(machine, tasks)
+    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    begin, base = checked_configuration(machine, start_joints, None)
+    bounds = limits.bounds(machine)
+    begin = inside_limits(machine, begin, bounds.lower, bounds.upper)
+    check_rule(machine, zmp, duration)
+    last = 1.0 if along == "parameter" else duration
+    checked_tasks(equations, base, begin, last)
+    check_freedom(machine, equations.size, zmp, along, tip_level, end)
+    if weights.manipulability:
+        check_slope(equations, begin)
+    check_length(equations, base, last)
+    if along == "time":
+        check_rest(equations, 0.0 if start == "rest" else None, last if end == "rest" else None)
+    if start == "rest":
+        tip = np.array(ca.DM(machine.tip_pose((), begin).position))
+        acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
+        held = tip_level == "acceleration"  # else the tip is on its path at the nodes alone
+        demand = task_demand(equations, begin, along == "parameter") if held else None
+        check_loads(machine, begin, acting, zmp, limits.least_force(machine), bounds, demand)
+    guess = local_guess(machine, equations, begin, duration, along == "parameter", external)
+
+    problem = Problem("standing plan", symbols=symbols)
+    final = _horizon(problem, horizon)
+    resting = None if end == "free" else _rest(equations, guess["joints"].values[-1], tip_level)
+    motion, jerks = _motion(problem, bounds, begin, start, resting, end_joints, control, guess)
+    joints, velocities, accelerations = motion
+    progress: tuple[Any, ...] = (problem.time,)
+    if along == "parameter":
+        progress = _progress(problem, start, end, guess)
+    none = ca.DM(0, 1)
+    if tip_level == "acceleration":
+        if start == "free":
+            targets = equations.targets(*progress[:2])
+            problem.start("tip velocity", equations.residual(none, joints, velocities, targets), lower=0, upper=0)
+        gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
+    else:
+        gap = equations.gap(none, joints, velocities, equations.targets(*progress[:2]))
+    problem.path("tip", gap, lower=0, upper=0)
+
+    wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
+    _ground(problem, machine, motion, wrenches, zmp, limits)
+    effort = bounds.torque
+    if np.isfinite(effort).any():
+        limited = np.flatnonzero(np.isfinite(effort)).tolist()
+        torques = machine.joint_torques(*motion, wrenches)[limited]
+        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited])
+
+    running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
+    if weights.joint_limits:
+        running += weights.joint_limits * joint_limit_index(machine.robot, joints)
+    if weights.manipulability:
+        running -= weights.manipulability * equations.manipulability(none, joints)
+    running += weights.jerk * ca.sumsqr(jerks)
+    problem.minimize(running=running, terminal=weights.time * final)
+    return problem
+
+
+def _check_options(**options: str) -> None:
+    known = {
+        "control": ("acceleration", "jerk"),
+        "along": ("time", "parameter"),
+        "tip_level": ("position", "acceleration"),
+        "start": ("rest", "free"),
+        "end": ("rest", "free"),
+    }
+    for what, value in options.items():
+        if value not in known[what]:
+            raise ProblemError(f"{what} must be one of {', '.join(known[what])}, not {value!r}")
+
+
+def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+    if isinstance(horizon, FreeTime):
+        return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
+    return problem.horizon(float(horizon))
+
+
+def _motion(
+    problem: Problem,
+    bounds: JointBounds,
+    begin: Array,
+    start: str,
+    resting: Array | None,
+    end_joints: Any,
+    control: str,
+    guess: Mapping[str, Any],
+) -> tuple[tuple[Any, Any, Any], Any]:
+    """The states and controls of the joints: (positions, velocities, accelerations), and jerks, nothing if not one."""
+    n = len(begin)
+    joints = problem.state(
+        "joints", n, initial=begin, terminal=end_joints, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"]
+    )
+    fast, push, rough = bounds.velocity, bounds.acceleration, bounds.jerk
+    velocities = problem.state(
+        "velocities", n, initial=0.0 if start == "rest" else None, terminal=resting, lower=-fast, upper=fast,
+        guess=guess["velocities"],
+    )  # fmt: skip
+    jerks: Any = ca.DM(0, 1)
+    declare: Any = problem.state if control == "jerk" else problem.control
+    accelerations = declare("accelerations", n, lower=-push, upper=push, guess=guess["accelerations"])
+    if control == "jerk":
+        jerks = problem.control("jerks", n, lower=-rough, upper=rough)
+        problem.dynamics(accelerations, jerks)
+    problem.dynamics(joints, velocities)
+    problem.dynamics(velocities, accelerations)
+    return (joints, velocities, accelerations), jerks
+
+
+def _progress(problem: Problem, start: str, end: str, guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+    """The path parameter, from 0 to 1, its rate and the rate of that."""
+    at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
+    first, last = (0.0 if side == "rest" else None for side in (start, end))
+    rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last)
+    push = problem.control("path_acceleration", guess=guess["path_acceleration"])
+    problem.dynamics(at, rate)
+    problem.dynamics(rate, push)
+    return at, rate, push
+
+
+def _rest(equations: TaskEquations, joints: Array, tip_level: str) -> Array:
+    """Joint velocities at the end, nan where free. Shape (n,).
+
+    A tip whose acceleration is prescribed comes to rest by itself, one whose velocity is prescribed too: as many joints
+    as the tasks have such rows then follow the others, and demanding rest of them too would be redundant. Those that
+    move the tip best are left out.
+    """
+    rest = np.zeros(len(joints))
+    jacobian = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints)))
+    if tip_level == "position":
+        jacobian = jacobian[~equations.posed]
+    for _ in range(len(jacobian)):
+        best = int((jacobian**2).sum(axis=0).argmax())
+        length = np.linalg.norm(jacobian[:, best])
+        if length < 1e-9:  # singular: the joints left out move the tip all ways that there are
+            break
+        direction = jacobian[:, best] / length
+        jacobian = jacobian - np.outer(direction, direction @ jacobian)
+        rest[best] = np.nan
+    return rest
+
+
+def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
+    """The cost of standing_problem for a sampled motion, by the trapezoidal rule; without the weight of jerks."""
+    w = weights or Weights()
+    running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
+    running += w.velocity * (motion.joint_velocities**2).sum(axis=1)
+    running += w.joint_limits * motion.joint_limit_index - w.manipulability * motion.manipulability
+    return float(np.trapezoid(running, motion.t) + w.time * motion.t[-1])
+
+
+def _ground(
+    problem: Problem,
+    machine: Standing,
+    motion: tuple[Any, Any, Any],
+    wrenches: Sequence[Wrench],
+    zmp: ZmpRule,
+    limits: Limits,
+) -> None:
+    """The path constraints on what the ground bears."""
+    reaction = machine.ground_reaction(*motion, wrenches)
+    force = reaction[3:6]
+    problem.path("vertical force", force[2], lower=limits.least_force(machine))
+    if np.isfinite(limits.friction):
+        room = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
+        problem.path("friction", room, lower=0)
+    point = center_of_pressure(reaction)
+    if isinstance(zmp, IndexAtLeast):
+        low, high = zmp.region(machine)
+        rows = index_rows(machine, zmp, point, bool(wrenches))
+        problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows])
+    elif isinstance(zmp, Pinned | Following):
+        gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
+        problem.path("zero moment point", gap, lower=0, upper=0)
+    inside = foot_rows(machine, zmp, point, bool(wrenches))
+    if inside.numel():
+        problem.path("zero moment point" if isinstance(zmp, InFoot) else "foot", inside, lower=0)

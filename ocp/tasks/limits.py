@@ -1,0 +1,102 @@
+"""What a machine's joints bear, and the ground that it stands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from models import Machine, Standing
+from models.arrays import Array
+from ocp.errors import ProblemError
+from ocp.tasks.zmp_rules import is_finite
+
+__all__ = ["JointBounds", "Limits"]
+
+
+class JointBounds(NamedTuple):
+    """Limits of every joint, infinite where there are none. Shape (n,) each, rad or m and seconds, N m or N.
+
+    Attributes:
+        lower, upper: Of the positions.
+        velocity, acceleration, jerk, torque: The greatest sizes.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    torque: Array
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What joints and ground bear; None means what the robot says, which is nothing of accelerations and jerks.
+
+    Attributes:
+        velocity, acceleration, jerk, torque: Of each joint, or one number for all; inf for no limit.
+        joints: Whether the robot's position limits hold.
+        vertical_force: Least vertical force of the ground on a standing machine, N; a tenth of its weight if None.
+        friction: Coefficient of friction of the ground.
+
+    Raises:
+        ProblemError: A limit that is not positive.
+    """
+
+    velocity: Any = None
+    acceleration: Any = None
+    jerk: Any = None
+    torque: Any = None
+    joints: bool = True
+    vertical_force: float | None = None
+    friction: float = np.inf
+
+    def __post_init__(self) -> None:
+        for what in ("velocity", "acceleration", "jerk", "torque"):
+            value = getattr(self, what)
+            if value is not None and not (_numbers(value) > 0).all():
+                raise ProblemError(f"limits: {what} must be positive, one number or one for each joint, not {value!r}")
+        if self.vertical_force is not None and not (is_finite(self.vertical_force) and self.vertical_force > 0):
+            raise ProblemError(f"limits: vertical_force must be positive, not {self.vertical_force!r}")
+        if not (isinstance(self.friction, Real) and self.friction > 0):
+            raise ProblemError(f"limits: friction must be positive, not {self.friction!r}")
+
+    def least_force(self, machine: Standing) -> float:
+        """Least vertical ground force, N."""
+        return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
+
+    def bounds(self, machine: Machine) -> JointBounds:
+        """For the joints of a machine.
+
+        Raises:
+            ProblemError: Not one number or one for each joint; a robot that gives joints a limit of 0.
+        """
+        robot, n = machine.robot, machine.joint_size
+        free = np.full(n, np.inf)
+        given = {"velocity": robot.velocity, "acceleration": free, "jerk": free, "torque": robot.effort}
+        for what, own in given.items():
+            value = getattr(self, what)
+            if value is not None:
+                array = _numbers(value)
+                if array.size not in (1, n):
+                    raise ProblemError(f"limits: {what} must be positive, one number or {n}, not {value!r}")
+                given[what] = np.array(np.broadcast_to(array, n))
+            elif not (own > 0).all():
+                names = [name for name, most in zip(robot.joint_names, own, strict=True) if not most > 0]
+                raise ProblemError(
+                    f"limits: the robot gives the joints {names} a {what} limit of 0; lock them, or say what they "
+                    f"bear: Limits({what}=...), inf for no limit"
+                )
+        lower, upper = (robot.lower, robot.upper) if self.joints else (-free, free)
+        return JointBounds(lower, upper, **given)
+
+
+def _numbers(value: Any) -> Array:
+    """A limit as a flat array, a single 0 where it is none."""
+    try:
+        return np.asarray(value, dtype=float).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(1)
