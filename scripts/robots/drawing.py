@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -15,10 +16,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 
 from models import Robot
 from models.arrays import Array
-from scripts.drawing import COLORS, add_note, gif, sheet
+from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
 from scripts.robots.frames import TIP, Frames, chain, inertia_box
-
-__all__ = ["JOINT_COLORS", "Scene", "animate", "cells", "draw_scene", "solid"]
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]
 DPI = 100
@@ -86,21 +85,38 @@ class Scene:
         return np.stack([tip - self.tool * self.frames.rotations[TIP][k][:, 2], tip])
 
 
-def cells(figure: Figure, axes: Any, row: int, columns: slice, **options: Any) -> Any:
-    """New axes over some columns of a row of a grid of axes, which they replace."""
-    layout: Any = figure.get_layout_engine()
-    layout.set(rect=RECT)
-    grid = axes[row, columns.start].get_subplotspec().get_gridspec()
-    for ax in axes[row, columns]:
-        ax.remove()
-    return figure.add_subplot(grid[row, columns], **options)
+@contextmanager
+def page(
+    path: Path, scenes: Sequence[Scene], instants: int | Sequence[float], *, height: float, share: float, note: str
+) -> Iterator[tuple[Any, Any, Any]]:
+    """A figure of two scenes at some instants, with equal scales, above three diagrams, whose axes are yielded.
+
+    Args:
+        path: PNG file, saved when the block ends.
+        instants: Number of instants, or times, s; see draw_scene.
+        height: Of the figure, inches. share: Height of the scenes over that of the diagrams.
+        note: Fine print.
+    """
+    with sheet(path, (2, 6), (7.6, height), note, height_ratios=(share, 1)) as (figure, axes):
+        layout: Any = figure.get_layout_engine()
+        layout.set(rect=RECT)
+        grid = axes[0, 0].get_subplotspec().get_gridspec()
+        for ax in axes.flat:
+            ax.remove()
+        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
+            ax = figure.add_subplot(grid[0, place], projection="3d")
+            frame_up(ax, scenes, 1.12)
+            draw_scene(ax, scene, instants)
+        first, second, third = (figure.add_subplot(grid[1, place : place + 2]) for place in (0, 2, 4))
+        yield first, second, third
 
 
-def solid(figure: Figure, axes: Any, row: int, columns: slice, scenes: Sequence[Scene]) -> Any:
-    """As cells, of three dimensions, wide enough for all of the scenes and with equal scales."""
-    ax = cells(figure, axes, row, columns, projection="3d")
-    frame_up(ax, scenes, 1.12)
-    return ax
+def joint_curves(ax: Any, t: Array, values: Array, names: Iterable[str], **legend: Any) -> None:
+    """A quantity of every joint over time, shape (M, n), each in its colour; a legend where it is given options."""
+    for i, name in enumerate(names):
+        ax.plot(t, values[:, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.1, label=name)
+    if legend:
+        ax.legend(**{"loc": "lower center", "handlelength": 1.6, "columnspacing": 0.8} | legend)
 
 
 def frame_up(ax: Any, scenes: Sequence[Scene], zoom: float = 1.0) -> None:
@@ -149,7 +165,7 @@ def animate(path: Path, scenes: Sequence[Scene], *, frames: int, seconds: float,
         note: Fine print.
     """
     size = (3.6 * len(scenes), 3.9)
-    with sheet(None, columns=len(scenes), size=size, subplot_kw={"projection": "3d"}) as (figure, axes):
+    with sheet(None, (1, len(scenes)), size, subplot_kw={"projection": "3d"}) as (figure, axes):
         figure.set_dpi(DPI)
         layout: Any = figure.get_layout_engine()
         layout.set(rect=RECT)
@@ -167,9 +183,8 @@ def animate(path: Path, scenes: Sequence[Scene], *, frames: int, seconds: float,
             if scene.boxes:
                 ax.add_collection3d(boxes)
             moving.append((scene, arm, trace, tool, boxes, spot))
-        figure.legend(
-            handles=[moving[0][2]], loc="upper left", fontsize=7
-        )  # the first picture gives the palette: every colour is in it
+        # the first picture gives the palette: every colour is in it
+        figure.legend(handles=[moving[0][2]], loc="upper left", fontsize=7)
         clock = figure.suptitle("time 0.0 s", fontsize=9)
         add_note(figure, note)
 

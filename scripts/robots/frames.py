@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,6 @@ import numpy as np
 from models import ModelError, Robot, link_frames
 from models.arrays import Array
 from models.spatial import rotation, rotation_from_quaternion
-
-__all__ = ["TIP", "Frames", "bones", "chain", "frames_along", "frames_function", "inertia_box", "placement"]
 
 TIP = "the tip frame"
 """Key of the tip among the frames; no link can have it that is also a link of the arm drawn."""
@@ -131,9 +129,3 @@ def inertia_box(robot: Robot, name: str) -> tuple[Array, Array, Array] | None:
     if np.linalg.det(axes) < 0:
         axes = axes * [1, 1, -1]
     return np.sqrt(np.maximum(squares, 0)), axes, np.asarray(link.center_of_mass, dtype=float)
-
-
-def bones(robot: Robot) -> Iterator[tuple[str, str]]:
-    """(Parent, child) links of every joint."""
-    for joint in robot.joints:
-        yield joint.parent, joint.child

@@ -15,14 +15,11 @@ from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.inverse_kinematics import inverse_kinematics
 from ocp.local.rates import resolve
 from ocp.tasks.tip_task import TipTask
-from scripts.drawing import COLORS, DASHES, sheet
-from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.drawing import COLORS
+from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import frames_along
 from scripts.robots.results import Example
 from scripts.robots.robots import PANDA
-from scripts.viewer.plan import save_plan
-
-__all__ = ["circling", "draw", "plan"]
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 """The arm's ready posture, rad: inverse kinematics start there."""
@@ -33,6 +30,7 @@ TILT = 0.4
 LAP = 6.0  # s
 LAPS = 6
 SAMPLES = 100  # a lap
+VIEW = (20.0, -50.0)
 
 
 def circling(center: Any = CENTER, radius: float = RADIUS, tilt: float = TILT, lap: float = LAP) -> TipTask:
@@ -57,15 +55,9 @@ def plan(coarse: bool = False) -> Example:
     machine, task, laps = FixedBase(PANDA.read()), circling(), 3 if coarse else LAPS
     start = inverse_kinematics(machine, task, near=HOME, starts=0)[0].joints
     local = resolve(machine, task=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
-    solution = plan_minimum_velocity(
-        machine,
-        task=task,
-        start_joints=start,
-        horizon=LAP,
-        cyclic=True,
-        free_start=True,
-        method=Collocation(intervals=24 if coarse else 40, degree=4),
-    )
+    method = Collocation(intervals=24 if coarse else 40, degree=4)
+    closed: dict[str, Any] = {"horizon": LAP, "cyclic": True, "free_start": True}
+    solution = plan_minimum_velocity(machine, task=task, start_joints=start, method=method, **closed)
     drift = drifts(local.joints)
     facts = {
         "laps": laps,
@@ -102,8 +94,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     machine, local, laps = example.machine, example.local, example.more["laps"]
     robot, again = machine.robot, repeated(example)
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(robot, local.joints), local.t, "blue", view=VIEW),
-        Scene("optimal cyclic plan", robot, frames_along(robot, again), local.t, "orange", view=VIEW),
+        Scene("pseudo-inverse", robot, frames_along(robot, local.joints), local.t, "orange", view=VIEW),
+        Scene("optimal cyclic plan", robot, frames_along(robot, again), local.t, "blue", view=VIEW),
     ]
     note = (
         f"{example.file.name} on a fixed base, fingers locked: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool "
@@ -116,39 +108,23 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         f"not return, {each.min():.2f} to {each.max():.2f}."
     )
     above = f" Upper row: where the arm is at the start of each of {laps} laps, and at their end (darkest)."
-    with sheet(folder / "panda.png", rows=2, columns=6, size=(7.6, 6.6), note=note + above, height_ratios=(1.8, 1)) as (
-        figure,
-        axes,
-    ):
-        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
-            draw_scene(solid(figure, axes, 0, place, scenes), scene, [lap * LAP for lap in range(laps + 1)])
-        drift, left, right = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
+    path, starts = folder / "panda.png", [lap * LAP for lap in range(laps + 1)]
+    with page(path, scenes, starts, height=6.6, share=1.8, note=note + above) as (drift, left, right):
         for name, values, color, mark in (
-            ("pseudo-inverse", drifts(local.joints), "blue", "o"),
-            ("optimal cyclic", drifts(again), "orange", "D"),
+            ("pseudo-inverse", drifts(local.joints), "orange", "o"),
+            ("optimal cyclic", drifts(again), "blue", "D"),
         ):
             drift.plot(np.arange(laps + 1), values, "-" + mark, color=COLORS[color], ms=4, label=name)
         drift.set(xlabel="laps", ylabel="largest |q − q(0)|, rad", xticks=range(laps + 1))
         drift.legend(loc="upper left", fontsize=7)
         middle, half = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
         for ax, joints, title in ((left, local.joints, scenes[0].title), (right, again, scenes[1].title)):
-            share = (joints - middle) / half
-            for i in range(robot.dof):
-                ax.plot(local.t / LAP, share[:, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.0, label=str(i + 1))
+            joint_curves(ax, local.t / LAP, (joints - middle) / half, map(str, range(1, robot.dof + 1)))
             ax.axhspan(1, 3, color=COLORS["grey"], alpha=0.25, lw=0)
             ax.axhspan(-3, -1, color=COLORS["grey"], alpha=0.25, lw=0)
             ax.set(xlabel="laps", title=title, ylim=(-1.9, 1.6))
         left.set_ylabel("joint position, limits = ±1")
         right.legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
-    save_plan(
-        folder / "panda.npz",
-        example.plan,
-        robot,
-        example.file.options,
-        package=(example.file.package, example.file.ending),
-    )
+    example.save(folder / "panda.npz")
     if animation:
         animate(folder / "panda.gif", scenes, frames=24 * laps // 2, seconds=0.1, note=note)
-
-
-VIEW = (20.0, -50.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -16,8 +17,7 @@ from ocp.local.rates import LocalSolution
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask
 from scripts.robots.robots import RobotFile
-
-__all__ = ["FINE", "Example", "joint_return", "momentum_drift", "tip_error", "turning_angle"]
+from scripts.viewer.plan import save_plan
 
 FINE = 1001
 """Times at which a plan is looked at, between its nodes too."""
@@ -46,18 +46,24 @@ class Example:
     facts: dict[str, Any] = field(default_factory=dict)
     more: dict[str, Any] = field(default_factory=dict)
 
+    def save(self, path: Path) -> None:
+        """The plan for scripts/view.py."""
+        file = self.file
+        base = "base" if self.machine.base_size else None
+        save_plan(path, self.plan, self.machine.robot, file.options, package=(file.package, file.ending), base=base)
+
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
         machine = self.machine
         drift = momentum_drift(machine, self.plan) if isinstance(machine, FreeFloating) else None
         return {
             "robot": self.file.name,
-            "dof": self.machine.joint_size,
+            "dof": machine.joint_size,
             "task_rows": self.task.size,
             "duration_s": self.plan.horizon,
             "cost_local": float(self.local.cost[-1]),
             "cost_optimal": float(self.plan.cost),
-            "tip_error": tip_error(self.machine, self.task, self.plan),
+            "tip_error": tip_error(machine, self.task, self.plan),
             "momentum_drift_relative": drift,
             "joint_return_rad": joint_return(self.plan),
             "audit_passed": self.audit.passed,

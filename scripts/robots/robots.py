@@ -13,8 +13,6 @@ import numpy as np
 from models import Robot
 from scripts.viewer.plan import packaged
 
-__all__ = ["PANDA", "SPACE_ARM", "TOOL_ANGLE", "UR5", "RobotFile", "missing"]
-
 
 @dataclass(frozen=True)
 class RobotFile:

@@ -13,14 +13,11 @@ from ocp import Collocation
 from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.rates import resolve
 from ocp.tasks.tip_task import TipTask, pose_line
-from scripts.drawing import COLORS, DASHES, sheet
-from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.drawing import COLORS, DASHES
+from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import frames_along
 from scripts.robots.results import FINE, Example, turning_angle
 from scripts.robots.robots import SPACE_ARM
-from scripts.viewer.plan import save_plan
-
-__all__ = ["draw", "plan"]
 
 START = (0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4)  # rad
 SHIFT = (0.5, 1.5, -0.5)  # m
@@ -39,13 +36,8 @@ def plan(coarse: bool = False) -> Example:
     line = pose_line((rotation, position), goal, DURATION)
     task = TipTask(position=line.position, orientation=line.orientation)
     local = resolve(machine, task=task, start_joints=start, horizon=DURATION, samples=FINE)
-    solution = plan_minimum_velocity(
-        machine,
-        task=task,
-        start_joints=start,
-        horizon=DURATION,
-        method=Collocation(intervals=20 if coarse else 50, degree=4),
-    )
+    method = Collocation(intervals=20 if coarse else 50, degree=4)
+    solution = plan_minimum_velocity(machine, task=task, start_joints=start, horizon=DURATION, method=method)
     facts = {
         "base_turn_local_deg": float(np.degrees(turning_angle(local.base).max())),
         "base_turn_optimal_deg": float(np.degrees(turning_angle(solution["base"]).max())),
@@ -61,8 +53,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     at = solution.at(local.t)
     boxes = (robot.root,)
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(robot, local.joints, local.base), local.t, "blue", boxes),
-        Scene("optimal", robot, frames_along(robot, at["joints"], at["base"]), local.t, "orange", boxes),
+        Scene("pseudo-inverse", robot, frames_along(robot, local.joints, local.base), local.t, "orange", boxes),
+        Scene("optimal", robot, frames_along(robot, at["joints"], at["base"]), local.t, "blue", boxes),
     ]
     base = robot.link(robot.root).mass
     note = (
@@ -70,39 +62,23 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         "seven joints; the base reacts. Cost: integral of half the squared joint rates, which need not begin "
         "at zero. Box: of even density, with the base's mass and inertia."
     )
-    with sheet(folder / "space_arm.png", rows=2, columns=6, size=(7.6, 6.4), note=note, height_ratios=(1.7, 1)) as (
-        figure,
-        axes,
-    ):
-        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
-            draw_scene(solid(figure, axes, 0, place, scenes), scene, INSTANTS)
-        turn, rates, best = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
-        for name, poses, color, dash in (
-            ("pseudo-inverse", local.base, "blue", DASHES[0]),
-            ("optimal", at["base"], "orange", DASHES[1]),
-        ):
-            turn.plot(local.t, np.degrees(turning_angle(poses)), color=COLORS[color], ls=dash, label=name)
+    path = folder / "space_arm.png"
+    with page(path, scenes, INSTANTS, height=6.4, share=1.7, note=note) as (turn, rates, best):
+        for scene, poses, dash in zip(scenes, (local.base, at["base"]), DASHES, strict=False):
+            angle = np.degrees(turning_angle(poses))
+            turn.plot(local.t, angle, color=COLORS[scene.color], ls=dash, label=scene.title)
         turn.set(xlabel="time, s", ylabel="turn of the base, deg")
         turn.legend(loc="upper left", fontsize=7)
         turn.set_ylim(top=1.35 * turn.get_ylim()[1])  # room for the legend
-        for ax, values, title in ((rates, local.joint_rates, scenes[0].title), (best, at["rates"], scenes[1].title)):
-            for i, name in enumerate(robot.joint_names):
-                ax.plot(
-                    local.t, values[:, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.1, label=name.split("_")[-1]
-                )
-            ax.set(xlabel="time, s", title=title)
+        names = [name.split("_")[-1] for name in robot.joint_names]
+        joint_curves(rates, local.t, local.joint_rates, names)
+        joint_curves(best, local.t, at["rates"], names, ncols=4, fontsize=6.5, title="joint")
+        for ax, scene in zip((rates, best), scenes, strict=True):
+            ax.set(xlabel="time, s", title=scene.title)
         rates.set_ylabel("joint rates, rad/s")
         best.sharey(rates)
         low, high = rates.get_ylim()
         rates.set_ylim(low - 0.35 * (high - low), high)
-        best.legend(ncols=4, fontsize=6.5, loc="lower center", handlelength=1.6, columnspacing=0.8, title="joint")
-    save_plan(
-        folder / "space_arm.npz",
-        solution,
-        robot,
-        example.file.options,
-        package=(example.file.package, example.file.ending),
-        base="base",
-    )
+    example.save(folder / "space_arm.npz")
     if animation:
         animate(folder / "space_arm.gif", scenes, frames=60, seconds=0.1, note=note)

@@ -196,7 +196,7 @@ def figure(
     """
     kinds = (("instant by instant", results.local, "orange", 1), ("planned", results.motion, "blue", 0))
     span = (0.0, results.solution.horizon)
-    with sheet(path, rows=2, columns=2, size=(8.4, 6.6), note=note) as (drawn, axes):
+    with sheet(path, (2, 2), (8.4, 6.6), note) as (drawn, axes):
         above, edge, outside, shares = axes.flat
         _from_above(above, results, kinds, inset)
         for label, motion, color, dash in kinds:

@@ -15,14 +15,11 @@ from ocp.builders.redundancy import plan_minimum_velocity
 from ocp.local.inverse_kinematics import Posture, inverse_kinematics
 from ocp.local.rates import LocalSolution, resolve
 from ocp.tasks.tip_task import TipTask
-from scripts.drawing import COLORS, DASHES, sheet
-from scripts.robots.drawing import JOINT_COLORS, Scene, animate, cells, draw_scene, solid
+from scripts.drawing import COLORS, DASHES
+from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import TIP, Frames, frames_along
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
-from scripts.viewer.plan import save_plan
-
-__all__ = ["draw", "plan", "raster", "roll"]
 
 LANES = 5
 LENGTH, WIDTH = 0.6, 0.28  # m, of the field
@@ -64,16 +61,12 @@ def plan(coarse: bool = False) -> Example:
     """
     machine, task = FixedBase(UR5.read()), raster()
     method = Collocation(intervals=70 if coarse else 80, degree=5)
+    tried: list[tuple[LocalSolution, Solution | None, Solution | None]] = []
     rows: list[dict[str, Any]] = []
-    locals_: list[LocalSolution] = []
-    alike: list[Solution | None] = []
-    plans: list[Solution] = []
     for posture in starts(machine, task)[: 1 if coarse else BRANCHES]:
         local = resolve(machine, task=task, start_joints=posture.joints, horizon=DURATION, samples=FINE)
-        free = _planned(machine, task, posture, method, True)
-        same = _planned(machine, task, posture, method, False)
-        locals_.append(local)
-        alike.append(same)
+        same, free = (_planned(machine, task, posture, method, free_start) for free_start in (False, True))
+        tried.append((local, same, free))
         rows.append(
             {
                 "start_rad": posture.joints,
@@ -83,14 +76,13 @@ def plan(coarse: bool = False) -> Example:
                 "cost_optimal_free_start": None if free is None else float(free.cost),
             }
         )
-        if free is not None:
-            plans.append(free)
+    plans = [free for _, _, free in tried if free is not None]
     if not plans:
         raise SolveError("no start of the raster leads to an audited plan")
-    local, solution = locals_[0], min(plans, key=lambda found: found.cost)
+    (local, same, _), solution = tried[0], min(plans, key=lambda found: found.cost)
     motions = [
         ("pseudo-inverse", local.t, local.joints, local.cost),
-        *(_motion(name, found) for name, found in (("optimal, same start", alike[0]), ("optimal", solution)) if found),
+        *(_motion(name, found) for name, found in (("optimal, same start", same), ("optimal", solution)) if found),
     ]
     rolls = [roll(frames_along(machine.robot, joints)) for _, _, joints, _ in motions]
     rolls = [angles - 2 * np.pi * np.round((angles[0] - rolls[0][0]) / (2 * np.pi)) for angles in rolls]
@@ -111,18 +103,10 @@ def starts(machine: Machine, task: TipTask) -> list[Posture]:
     return clear or found
 
 
-def _planned(
-    machine: Machine, task: TipTask, posture: Posture, method: Collocation, free_start: bool
-) -> Solution | None:
+def _planned(machine: Machine, task: TipTask, start: Posture, method: Collocation, free_start: bool) -> Solution | None:
+    options: dict[str, Any] = {"horizon": DURATION, "free_start": free_start, "method": method}
     try:
-        return plan_minimum_velocity(
-            machine,
-            task=task,
-            start_joints=posture.joints,
-            horizon=DURATION,
-            free_start=free_start,
-            method=method,
-        )
+        return plan_minimum_velocity(machine, task=task, start_joints=start.joints, **options)
     except SolveError:
         return None
 
@@ -150,10 +134,11 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     at = solution.at(local.t)
     look: dict[str, Any] = {"surface": panel(), "view": (24.0, -40.0), "tool": 0.1}
     scenes = [
-        Scene(
-            "pseudo-inverse, best conditioned start", robot, frames_along(robot, local.joints), local.t, "blue", **look
-        ),
-        Scene("optimal over roll and start", robot, frames_along(robot, at["joints"]), local.t, "orange", **look),
+        Scene(title, robot, frames_along(robot, joints), local.t, color, **look)
+        for title, joints, color in (
+            ("pseudo-inverse, best conditioned start", local.joints, "orange"),
+            ("optimal over roll and start", at["joints"], "blue"),
+        )
     ]
     note = (
         f"{example.file.name} ({np.degrees(TOOL_ANGLE):.0f} deg to the flange) on a fixed base: {LANES} lanes over a "
@@ -164,38 +149,21 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     others = [row["cost_local"] for row in example.facts["starts"][1:] if row["local_arrives"]]
     if others:
         note += f" From the other starts the pseudo-inverse costs {min(others):.2f} to {max(others):.2f} rad²/s."
-    with sheet(folder / "ur5.png", rows=2, columns=6, size=(7.6, 6.2), note=note, height_ratios=(1.5, 1)) as (
-        figure,
-        axes,
-    ):
-        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
-            draw_scene(solid(figure, axes, 0, place, scenes), scene, 4)
-        rolling, spent, joints = (cells(figure, axes, 1, place) for place in (slice(0, 2), slice(2, 4), slice(4, 6)))
-        for i, ((name, t, _, cost), angles) in enumerate(
-            zip(example.more["motions"], example.more["rolls"], strict=True)
-        ):
-            color = COLORS[{"pseudo-inverse": "blue", "optimal": "orange"}.get(name, "green")]
+    path, motions = folder / "ur5.png", zip(example.more["motions"], example.more["rolls"], strict=True)
+    with page(path, scenes, 4, height=6.2, share=1.5, note=note) as (rolling, spent, joints):
+        for i, ((name, t, _, cost), angles) in enumerate(motions):
+            color = COLORS[{"pseudo-inverse": "orange", "optimal": "blue"}.get(name, "green")]
             rolling.plot(t, np.degrees(angles - example.more["rolls"][0][0]), color=color, ls=DASHES[i], label=name)
             spent.plot(t, cost, color=color, ls=DASHES[i], label=name)
         rolling.set(xlabel="time, s", ylabel="roll of the tool, deg from the first")
         spent.set(xlabel="time, s", ylabel="cost so far, rad²/s")
         spent.set_ylim(top=1.45 * spent.get_ylim()[1])
         spent.legend(loc="upper left", fontsize=7)
-        for i, name in enumerate(robot.joint_names):
-            joints.plot(
-                local.t, at["joints"][:, i] - at["joints"][0, i], color=JOINT_COLORS[i], ls=DASHES[i % 4], lw=1.1
-            )
-            joints.lines[-1].set_label(name.removesuffix("_joint").replace("_", " "))
+        names = [name.removesuffix("_joint").replace("_", " ") for name in robot.joint_names]
+        joint_curves(joints, local.t, at["joints"] - at["joints"][0], names, ncols=2, fontsize=6.3)
         low, high = joints.get_ylim()
         joints.set(xlabel="time, s", ylabel="joints, optimal, less start, rad", ylim=(low - 0.45 * (high - low), high))
-        joints.legend(ncols=2, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8)
-    save_plan(
-        folder / "ur5.npz",
-        solution,
-        robot,
-        example.file.options,
-        package=(example.file.package, example.file.ending),
-    )
+    example.save(folder / "ur5.npz")
     if animation:
         animate(folder / "ur5.gif", scenes, frames=60, seconds=0.1, note=note)
 

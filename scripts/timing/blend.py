@@ -1,31 +1,27 @@
-"""How fast a smooth path is planned and followed: samples in compiled C, mapped and by other means, plans, long paths.
-
-`scripts/benchmark.py` calls run and plot; alone: `python scripts/timing/blend.py [--out results] [--repeats 5]`.
-"""
+"""How fast a smooth path is planned and followed: samples in compiled C, mapped and by other means; long paths."""
 
 from __future__ import annotations
 
-import argparse
-import sys
+import importlib
 import time
 import tracemalloc
+import warnings
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
 import casadi as ca
 import numpy as np
 
 from models import paths
+from models.arrays import Array
 from models.machines.scara_path import scara_along
 from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
-from models.paths.arc_length import arc_length
+from models.paths.arc_length import arc_length, speed
 from ocp.builders.timing import plan_minimum_time
 from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing
-from scripts.papers.blend.compiled import march_compiled, place_compiled
 from scripts.papers.blend.example import (
     ARM,
     CENTRIPETAL,
@@ -35,13 +31,10 @@ from scripts.papers.blend.example import (
     MEAN_ACCELERATION,
     REMAINING,
     SPEED,
-    Array,
     example,
 )
-from scripts.timing.blend_peers import GRID, peer_plans, roots
-from scripts.timing.compiled import has_compiler, least
-
-__all__ = ["plot", "random_task", "run"]
+from scripts.papers.run import text_table
+from scripts.timing.measure import against, compiled, has_compiler, least
 
 PERIOD = 1e-3  # s
 SEED = 5
@@ -50,6 +43,8 @@ TARGET_NS, TARGET_PLAN_MS, TARGET_SCALE_S = 200.0, 20.0, 10.0
 DEFAULT = "gauss_newton, cubic, compiled"
 """The row that the first target is for: the paper's example and the default mapping."""
 STEPS = (1e-3, 1e-2)  # m, shortest and longest segment of the random task
+GRID = 400
+ACCELERATIONS = (5.0, 30.0)  # m/s^2, of each axis, for toppra
 TASK_SPEED, TASK_ACCELERATION, TASK_DEVIATION = 0.2, 5.0, 2e-4
 
 
@@ -97,6 +92,7 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
     along = plan.at(instants).distance
     s = along[(along > blend.start + 1e-12) & (along < blend.end)]
     x, count = s - blend.start, len(s)
+    loops, runs = max(1, 10_000 // count), 20 * repeats  # many short runs: nothing else disturbs the least of them
     rows: list[dict[str, Any]] = []
 
     def add(method: str, how: str, nanoseconds: float, u: Array) -> None:
@@ -107,8 +103,11 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
         mapping = make(3 if path.kind == "cubic" else 5)
         name = mapping.name()
         if has_compiler():
-            u, nanoseconds = march_compiled(mapping, blend.coefficients, x, repeats)
-            add(name, "compiled", nanoseconds, u)
+            # what march does, each sample from the one before, in one loop of C
+            with compiled(mapping, marching=True) as called:
+                inputs = [np.zeros((1, 2)), entries(mapping, blend.coefficients)[None], increments(x)]
+                states, seconds = called(inputs, loops, runs)
+            add(name, "compiled", 1e9 * seconds, states[:, 1])
         u = march(mapping, blend.coefficients, x)
         inputs = mapped_inputs(mapping, blend.coefficients, x, u)
         many = mapping.map(count)
@@ -116,9 +115,10 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
         add(name, "map", 1e9 * least(lambda many=many, inputs=inputs: many.call(inputs), repeats) / count, found)  # type: ignore[misc]
         add(name, "march", 1e9 * least(lambda m=mapping: march(m, blend.coefficients, x), repeats) / count, u)  # type: ignore[misc]
     if has_compiler():
-        places, nanoseconds = place_compiled(path_function(path), s, repeats)
+        with compiled(path_function(path)) as called:
+            places, seconds = called([s[:, None]], loops, runs)
         error = float(np.linalg.norm(places[:, :3] - path.at(s).position, axis=1).max()) * 1e6
-        rows.append(_row("path_function", path.kind, "compiled", nanoseconds, error))
+        rows.append(_row("path_function", path.kind, "compiled", 1e9 * seconds, error))
     add("SmoothPath.parameter", "numpy", 1e9 * least(lambda: path.parameter(s), repeats) / count, path.parameter(s))
     knots = np.linspace(0, 1, TABLE)
     table = arc_length(blend.coefficients, knots)
@@ -135,12 +135,22 @@ def _row(method: str, kind: str, how: str, nanoseconds: float, error: float) -> 
     return {"method": f"{method}, {kind}, {how}", "ns_per_sample": nanoseconds, "worst_error_um": error}
 
 
+def increments(x: Array) -> Array:
+    """From distances, shape (M,), m, to the last and the next step to each of them. Shape (M, 2), m."""
+    given = np.diff(x, prepend=0.0)
+    return np.stack([np.concatenate([[0.0], given[:-1]]), given], axis=1)
+
+
+def entries(mapping: Any, coefficients: Array) -> Array:
+    """As many coefficients of a blend as the mapping takes. Shape (n,)."""
+    return coefficients.ravel()[: mapping.numel_in(1)]
+
+
 def mapped_inputs(mapping: Any, coefficients: Array, x: Array, u: Array) -> list[Any]:
     """What the mapping sees at every sample, side by side."""
-    given, before = np.diff(x, prepend=0.0), np.concatenate([[0.0, 0.0], u])
-    steps = np.stack([np.concatenate([[0.0], given[:-1]]), given])
-    entries = np.repeat(coefficients.ravel()[: mapping.numel_in(1), None], len(x), axis=1)
-    return [ca.DM(np.stack([before[:-2], before[1:-1]])), ca.DM(entries), ca.DM(steps)]
+    before = np.concatenate([[0.0, 0.0], u])
+    constant = np.repeat(entries(mapping, coefficients)[:, None], len(x), axis=1)
+    return [ca.DM(np.stack([before[:-2], before[1:-1]])), ca.DM(constant), ca.DM(increments(x).T)]
 
 
 # ---- plans ---------------------------------------------------------------------------------------------------
@@ -225,7 +235,83 @@ def long_path(segments: int) -> dict[str, Any]:
     }
 
 
+# ---- peers ---------------------------------------------------------------------------------------------------
+
+
+def roots(coefficients: Array) -> Callable[[float], float] | None:
+    """Distance -> parameter by scipy's brentq on a 20-point Gauss-Legendre length; None without scipy."""
+    try:
+        brentq = importlib.import_module("scipy.optimize").brentq
+    except ImportError:
+        return None
+    points, weights = np.polynomial.legendre.leggauss(20)
+    points, weights = (points + 1) / 2, weights / 2
+    curves = np.repeat(coefficients[None], len(points), axis=0)
+
+    def excess(u: float, distance: float) -> float:
+        return u * float(weights @ speed(curves, u * points)) - distance
+
+    return lambda distance: float(brentq(excess, 0.0, 1.0, args=(distance,), xtol=1e-14))
+
+
+def peer_plans(path: SmoothPath, repeats: int) -> dict[str, Any] | None:
+    """toppra on the same path, speed and acceleration of each axis limited. None where it is not installed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            toppra, constraint, algorithm = (
+                importlib.import_module(f"toppra{part}") for part in ("", ".constraint", ".algorithm")
+            )
+    except ImportError:
+        return None
+    toppra.setup_logging("ERROR")
+    s = np.linspace(0, path.length, GRID)
+    points, one = path.at(s).position, np.ones((3, 1))
+    found: dict[str, Any] = {"version": version("toppra"), "grid_points": GRID, "plans": [], "profiles": {}}
+    for acceleration in ACCELERATIONS:
+
+        def planned(most: float = acceleration) -> Any:
+            curve = toppra.SplineInterpolator(s, points)
+            limits = [
+                constraint.JointVelocityConstraint(SPEED * one * [-1, 1]),
+                constraint.JointAccelerationConstraint(most * one * [-1, 1]),
+            ]
+            return algorithm.TOPPRA(limits, curve, gridpoints=s).compute_trajectory(0, 0)
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            motion = planned()
+            ms = 1e3 * least(planned, repeats)
+            t = np.linspace(0, motion.duration, 20_001)
+            position, velocity = motion(t), np.linalg.norm(motion(t, 1), axis=1)
+            rate = np.abs(motion(t, 2)).max()
+        passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+        inside = (passed > path.bounds[1]) & (passed < path.bounds[2])
+        found["plans"].append(
+            {
+                "axis_acceleration": acceleration,
+                "ms": ms,
+                "duration_s": motion.duration,
+                "least_speed_in_blend": velocity[inside].min(),
+                "largest_speed": velocity.max(),
+                "acceleration_over_limit": rate / acceleration,
+            }
+        )
+        every = slice(None, None, 25)
+        name = f"toppra, {acceleration:g} m/s² an axis"
+        found["profiles"][name] = {"distance": passed[every], "speed": velocity[every]}
+    return found
+
+
 # ---- the page ------------------------------------------------------------------------------------------------
+
+
+def report(summary: dict[str, Any]) -> str:
+    """The times, and the figures beside their targets."""
+    tables = [summary[part] for part in ("rows", "planning", "scale")]
+    if isinstance(summary["toppra"], dict):
+        tables.append(summary["toppra"]["plans"])
+    return "\n\n".join([*(text_table(rows, 4) for rows in tables), against(summary["targets"], "target")])
 
 
 def plot(path: Path, summary: dict[str, Any]) -> None:
@@ -237,7 +323,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         "least of several runs of one run; right of a bar: ns, worst error of the distance. Right: the paper's example "
         f"at 1 m/s; toppra with {GRID} grid points, speed and acceleration of each axis limited, no jerk limit."
     )
-    with drawing.sheet(path, columns=2, size=(10.4, 5.2), note=note, width_ratios=(1.25, 1)) as (_, axes):
+    with drawing.sheet(path, (1, 2), (10.4, 5.2), note, width_ratios=(1.25, 1)) as (_, axes):
         ax = axes[0, 0]
         plain = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
         for k, row in enumerate(rows):
@@ -262,26 +348,3 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         ax.set(xlabel="distance along the path, m", ylabel="line speed, m/s", title="Speed on the same path")
         ax.set_ylim(0, 1.3)
         ax.legend(loc="lower center")
-
-
-def main() -> None:
-    """Run, write OUT/benchmark/blend.csv, blend.json and blend.png, and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the results")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of which the least time is taken")
-    arguments = parser.parse_args()
-    summary = run(arguments.repeats)
-    folder = arguments.out / "benchmark"
-    drawing.write_table(folder / "blend.csv", summary["rows"], 6)
-    drawing.write_json(folder / "blend.json", summary)
-    plot(folder / "blend.png", summary)
-    for part in ("rows", "planning", "scale"):
-        print(drawing.text_table(summary[part], 4), end="\n\n")
-    if isinstance(summary["toppra"], dict):
-        print(drawing.text_table(summary["toppra"]["plans"], 4), end="\n\n")
-    for name, target in summary["targets"].items():
-        print(f"{name}: {target['figure']:.4g}, target {target['target']:g}" if target["figure"] else f"{name}: -")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,18 +1,11 @@
-"""How fast the captive trajectory rig's inverse kinematics is: compiled, mapped, from Python, and by other means.
-
-`scripts/benchmark.py` calls run and plot; alone: `python scripts/timing/cts.py [--out results] [--repeats 5]`.
-"""
+"""How fast the captive trajectory rig's inverse kinematics is: compiled, mapped, from Python, and by other means."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import sys
 import time
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
 import casadi as ca
 import numpy as np
@@ -22,17 +15,12 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, forward, inverse
 from models.papers import reference_rig, reference_tunnel
 from scripts import drawing
-from scripts.papers.cts.compiled import compiled_inverse
 from scripts.papers.cts.iterations import combined, null_space
 from scripts.papers.cts.results import PAPER_TIMES, sweep_targets
-from scripts.timing.compiled import FLAGS, has_compiler, least
+from scripts.papers.run import text_table
+from scripts.timing.measure import FLAGS, against, compiled, has_compiler, least
 
-__all__ = ["plot", "run"]
-
-LIMITS: dict[str, Any] = {
-    "lower": (0.05, -3.0, -2.2, -1.3, 0.2, -3.1),
-    "upper": (1.6, -0.1, 2.2, 1.3, 2.8, 3.1),
-}
+LIMITS: dict[str, Any] = {"lower": (0.05, -3.0, -2.2, -1.3, 0.2, -3.1), "upper": (1.6, -0.1, 2.2, 1.3, 2.8, 3.1)}
 COUNT = 200
 PEER_COUNT = 40
 SEED = 3
@@ -73,21 +61,16 @@ def run(repeats: int = 5) -> dict[str, Any]:
     for name, function in cases.items():
         for on, rows_in in (("sweep", targets), ("random", spread)):
             if has_compiler():
-                found = compiled_inverse(function, rows_in, np.zeros(1), repeats)
-                solved = float(np.mean(found.result[:, 8] == 0))
-                add(f"compiled, {name}", on, 1e-9 * found.nanoseconds, solved, 1e-9 * found.worst)
+                found, mean, worst = compiled_inverse(function, rows_in, repeats)
+                add(f"compiled, {name}", on, mean, float(np.mean(found[:, 8] == 0)), worst)
             many = function.map(COUNT)
             inputs = [ca.DM(rows_in.T), ca.DM.zeros(1, COUNT)]
             status = np.array(many.call(inputs)[3])
             seconds = least(lambda many=many, inputs=inputs: many.call(inputs), repeats) / COUNT  # type: ignore[misc]
             add(f"map, {name}", on, seconds, float(np.mean(status == 0)))
     one = cases["I1, reach"]
-    add(
-        "one call from Python, I1, reach",
-        "sweep",
-        least(lambda: [one(row, 0.0) for row in targets], repeats) / COUNT,
-        1.0,
-    )
+    seconds = least(lambda: [one(row, 0.0) for row in targets], repeats) / COUNT
+    add("one call from Python, I1, reach", "sweep", seconds, 1.0)
 
     first = np.array(inverse(rigs["reach"], ca.DM(targets[0]), ca.DM(0), HOME)[0]).ravel()
     newton = combined(rigs["reach"], tunnel, targets)
@@ -113,6 +96,23 @@ def run(repeats: int = 5) -> dict[str, Any]:
         "peer": peers or "not installed",
         "flags": list(FLAGS),
     }
+
+
+def compiled_inverse(function: Any, targets: Array, repeats: int = 5) -> tuple[Array, float, float]:
+    """An optimal_inverse function in C over targets, shape (M, 5), from roll 0.
+
+    Returns:
+        Joints, index, code of the active constraint, code of the status, shape (M, 9); the time of a target, s, the
+        mean over all of them; the same of the slowest target alone, run again and again.
+    """
+    previous = np.zeros((1, 1))
+    with compiled(function) as rows:
+        # short runs: one of many is undisturbed
+        found, mean = rows([targets, previous], max(1, 2000 // len(targets)), 10 * repeats)
+        # calls from Python, only to find the slowest
+        alone = [rows([target, previous], 1, 20)[1] for target in targets]
+        slowest = np.tile(targets[int(np.argmax(alone))], (100, 1))
+        return found, mean, rows([slowest, previous], 20, 10 * repeats)[1]
 
 
 def peer_times(targets: Array) -> list[dict[str, Any]] | None:
@@ -166,6 +166,11 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
     return made_of
 
 
+def report(summary: dict[str, Any]) -> str:
+    """The times, and the figures beside their goals."""
+    return f"{text_table(summary['rows'], 4)}\n{against(summary['goals'], 'goal')}"
+
+
 def plot(path: Path, summary: dict[str, Any]) -> None:
     """Time of a target by every method, on a logarithmic axis."""
     rows = [row for row in summary["rows"] if row["targets"] == "random" or "Table" in row["method"]]
@@ -174,7 +179,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         "200 random targets within the joint limits (Tables 3 and 4: the paper's sweep), one core, least of several "
         "runs of one run, mean over the targets; bars: the slowest target. Compiled: cc " + " ".join(summary["flags"])
     )
-    with drawing.sheet(path, size=(8.2, 4.8), note=note) as (_, axes):
+    with drawing.sheet(path, (1, 1), (8.2, 4.8), note) as (_, axes):
         ax = axes[0, 0]
         plain = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
         for k, row in enumerate(rows):
@@ -192,23 +197,3 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         )
         ax.set(xscale="log", xlabel="ns a target", title="Inverse kinematics of the captive trajectory rig")
         ax.legend(loc="upper right")
-
-
-def main() -> None:
-    """Run, write OUT/benchmark/cts.csv, cts.json and cts.png, and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the results")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of which the least time is taken")
-    arguments = parser.parse_args()
-    summary = run(arguments.repeats)
-    folder = arguments.out / "benchmark"
-    drawing.write_table(folder / "cts.csv", summary["rows"], 6)
-    drawing.write_json(folder / "cts.json", summary)
-    plot(folder / "cts.png", summary)
-    print(drawing.text_table(summary["rows"], 4))
-    for name, goal in summary["goals"].items():
-        print(f"{name}: {goal['figure']:.4g}, goal {goal['goal']:g}" if goal["figure"] else f"{name}: -")
-
-
-if __name__ == "__main__":
-    main()

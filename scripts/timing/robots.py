@@ -1,21 +1,15 @@
 """Robots read from URDF: time to load them and to build their functions, and the generalized Jacobian of a space arm.
 
-`scripts/benchmark.py` calls run and plot; alone: `python scripts/timing/robots.py [--out results] [--repeats 5]`.
 The files come with the distributions example-robot-data and spartpy, the comparison with pin; what is not installed
 is left out.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import sys
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
 import casadi as ca
 import numpy as np
@@ -33,10 +27,10 @@ from models import (
 )
 from models.arrays import Array
 from scripts import drawing
-from scripts.timing.compiled import FLAGS as FAST
-from scripts.timing.compiled import compiled, has_compiler, least, pointers
-
-__all__ = ["plot", "run"]
+from scripts.papers.run import text_table
+from scripts.timing.measure import FLAGS as FAST
+from scripts.timing.measure import compiled, has_compiler, least
+from scripts.viewer.plan import packaged
 
 DATA = "example-robot-data"
 ROBOTS: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -66,32 +60,13 @@ SEED = 11
 GOALS = {"generalized Jacobian": 1.0, "its derivative": 5.0}
 """us."""
 
-DRIVER = """
-#include "kernel.h"
-int run(const double* base, const double* q, double* out, int count, int loops) {{
-  static long long iw[{name}_SZ_IW + 1];
-  static double w[{name}_SZ_W + 1];
-  const double* arg[{name}_SZ_ARG + 1];
-  double* res[{name}_SZ_RES + 1];
-  int i, k;
-  for (k = 0; k < loops; ++k)
-    for (i = 0; i < count; ++i) {{
-      arg[0] = base + 7 * i; arg[1] = q + JOINTS * i; res[0] = out + SIZE * i;
-      if ({name}(arg, res, iw, w, 0)) return 1;
-    }}
-  return 0;
-}}
-"""
-
 
 def urdf_file(package: str, ending: str) -> Path | None:
     """A file of a distribution; None where that is not installed."""
     try:
-        owner = distribution(package)
-    except PackageNotFoundError:
+        return packaged(package, ending)
+    except FileNotFoundError:
         return None
-    found = next((f for f in owner.files or [] if ("/" + f.as_posix()).endswith("/" + ending)), None)
-    return None if found is None else Path(str(owner.locate_file(found)))
 
 
 def build(robot: Robot) -> dict[str, Any]:
@@ -135,18 +110,6 @@ def loading(repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def compiled_at(function: Any, base: Array, q: Array, repeats: int, flags: tuple[str, ...]) -> tuple[Array, float]:
-    """Compile a function of (base, q): its results at each row, column by column, and the least time of one call, s."""
-    out = np.empty((len(q), function.nnz_out(0)))
-    given = [np.ascontiguousarray(each, dtype=float) for each in (base, q)]
-    places = pointers(*given, out)
-    loops = 10  # bursts of about a millisecond: on a busy machine some of many run undisturbed
-    driver = DRIVER.replace("JOINTS", str(q.shape[1])).replace("SIZE", str(out.shape[1]))
-    with compiled(function, driver, flags) as run:
-        seconds = least(lambda: run(*places, len(q), loops), 100 * repeats) / (loops * len(q))
-    return out, seconds
-
-
 def space_arm(repeats: int) -> list[dict[str, Any]]:
     """The generalized Jacobian of the free-floating arm of seven joints by several means, us a call."""
     path = urdf_file(*ROBOTS["space arm"][:2])
@@ -172,18 +135,17 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
     found = np.array(many.call(columns)[0]).reshape(6, COUNT, -1).transpose(1, 0, 2)
     if has_compiler():
         for name, flags in FLAGS.items():
-            out, seconds = compiled_at(value, base, q, repeats, flags)
-            check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), found, name)
-            add("generalized Jacobian", f"compiled, {name}", seconds, value.n_instructions())
-            _, seconds = compiled_at(derivative, base, q, repeats, flags)
-            add("its derivative", f"compiled, {name}", seconds, derivative.n_instructions())
+            for what, function in (("generalized Jacobian", value), ("its derivative", derivative)):
+                with compiled(function, flags) as called:
+                    # bursts of about a millisecond: on a busy machine some of many run undisturbed
+                    out, seconds = called([base, q], 10, 100 * repeats)
+                if function is value:
+                    check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), found, name)
+                add(what, f"compiled, {name}", seconds, function.n_instructions())
     add("generalized Jacobian", "map in CasADi", least(lambda: many.call(columns), repeats) / COUNT)
     one = [[ca.DM(base[i]), ca.DM(q[i])] for i in range(COUNT)]
-    add(
-        "generalized Jacobian",
-        "one call from Python",
-        least(lambda: [value.call(each) for each in one], repeats) / COUNT,
-    )
+    seconds = least(lambda: [value.call(each) for each in one], repeats) / COUNT
+    add("generalized Jacobian", "one call from Python", seconds)
     if (peer := pinocchio_jacobian(path, given)) is not None:
         theirs = np.array([peer(base[i], q[i]) for i in range(COUNT)])
         check(theirs, found, "Pinocchio")
@@ -243,6 +205,14 @@ def run(repeats: int = 5) -> dict[str, Any]:
     return summary
 
 
+def report(summary: dict[str, Any]) -> str:
+    """The times, as far as there are any."""
+    parts = [text_table(summary[key], 4) for key in ("loading", "space_arm") if summary[key]]
+    if ratio := summary.get("pinocchio_over_compiled"):
+        parts.append(f"Pinocchio and numpy take {ratio:.0f} x the generalized Jacobian compiled by -O2")
+    return "\n".join(parts)
+
+
 def plot(path: Path, summary: dict[str, Any]) -> None:
     """Left: seconds to load and to build, by robot. Right: us of a generalized Jacobian by each means."""
     rows, arm = summary["loading"], summary["space_arm"]
@@ -251,7 +221,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         f"Jacobian, base rate, inverse dynamics. Space arm: seven joints, {COUNT} random configurations. One core, "
         "least of several runs in one run. The compiled functions are called from C, the others from Python."
     )
-    with drawing.sheet(path, columns=2, size=(9.4, 3.9), note=note) as (_, axes):
+    with drawing.sheet(path, (1, 2), (9.4, 3.9), note) as (_, axes):
         left, right = axes[0]
         for k, row in enumerate(reversed(rows)):
             left.barh(k, row["load_s"], color=drawing.COLORS["sky"], label="load" if k == 0 else None)
@@ -271,25 +241,3 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         right.set(xscale="log", xlabel="μs a call", title="Generalized Jacobian of a free-floating arm")
         if arm:
             right.set_xlim(0.1, 6 * max(row["us"] for row in arm))
-
-
-def main() -> None:
-    """Run, write OUT/benchmark/robots.csv, space_arm.csv, robots.json and robots.png, and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the results")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of which the least time is taken")
-    arguments = parser.parse_args()
-    summary = run(arguments.repeats)
-    folder = arguments.out / "benchmark"
-    for name, rows in (("robots", summary["loading"]), ("space_arm", summary["space_arm"])):
-        if rows:
-            drawing.write_table(folder / f"{name}.csv", rows, 6)
-            print(drawing.text_table(rows, 4))
-    drawing.write_json(folder / "robots.json", summary)
-    plot(folder / "robots.png", summary)
-    if ratio := summary.get("pinocchio_over_compiled"):
-        print(f"Pinocchio and numpy take {ratio:.0f} x the generalized Jacobian compiled by -O2")
-
-
-if __name__ == "__main__":
-    main()

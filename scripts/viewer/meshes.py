@@ -12,8 +12,6 @@ import numpy as np
 
 from models.arrays import Array
 
-__all__ = ["Shape", "Shapes", "find_mesh", "read_shapes"]
-
 GREY = (0.72, 0.74, 0.78, 1.0)
 
 

@@ -18,10 +18,8 @@ import numpy as np
 from models import Robot
 from models.arrays import Array
 from ocp import ProblemError, Solution
-from scripts.drawing import written
+from scripts.papers.run import written
 from scripts.robots.frames import Frames, frames_function
-
-__all__ = ["Played", "packaged", "play", "read_record", "save_plan"]
 
 RECORD = "robot"
 """Entry of the plan's file that says of which robot it is; `Solution.load` passes over it."""

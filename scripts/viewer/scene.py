@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from models.arrays import Array
-from scripts.robots.frames import TIP, Frames, bones, inertia_box
+from scripts.robots.frames import TIP, Frames, inertia_box
 from scripts.viewer.meshes import Shapes, read_shapes
 from scripts.viewer.plan import Played
-
-__all__ = ["View"]
 
 TRACE_POINTS = 401
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
@@ -25,19 +23,20 @@ BOX = (150, 156, 166)
 
 
 class View:
-    """A plan on a viser server: set `time`, `playing`, `speed`, or call `advance`; a browser's controls do the same.
+    """A plan on a viser server: set `time` or the values of the controls, or call `advance`; a browser does the same.
 
     Attributes:
         server: The viser server, listening.
         links: Handles of the frames of all links and of the tip (key TIP), by name.
-        slider: Of the time.
+        slider: Of the time. play: Whether `advance` moves on. repeat: Whether it starts again from the end.
+        speed: Seconds of the plan in a second, of SPEEDS.
         missing: Mesh files that are not shown, and why.
     """
 
     slider: Any
-    _playing: Any
-    _speed: Any
-    _repeat: Any
+    play: Any
+    speed: Any
+    repeat: Any
 
     def __init__(
         self,
@@ -90,45 +89,18 @@ class View:
         self.slider.value = clipped
         self._show(clipped)
 
-    @property
-    def playing(self) -> bool:
-        """Whether `advance` moves on."""
-        return bool(self._playing.value)
-
-    @playing.setter
-    def playing(self, value: bool) -> None:
-        self._playing.value = bool(value)
-
-    @property
-    def speed(self) -> float:
-        """Seconds of the plan in a second."""
-        return float(self._speed.value)
-
-    @speed.setter
-    def speed(self, value: float) -> None:
-        self._speed.value = min(SPEEDS, key=lambda each: abs(float(each) - value))
-
-    @property
-    def repeat(self) -> bool:
-        """Whether it starts again from the end."""
-        return bool(self._repeat.value)
-
-    @repeat.setter
-    def repeat(self, value: bool) -> None:
-        self._repeat.value = bool(value)
-
     def advance(self, seconds: float) -> None:
         """Play on for so many seconds of the clock; from the end it starts again, or stops there if not to repeat."""
-        if not self.playing:
+        if not self.play.value:
             return
-        later, end = self.time + self.speed * seconds, self.played.horizon
+        later, end = self.time + float(self.speed.value) * seconds, self.played.horizon
         if later < end:
             self.time = later
-        elif self.repeat and self.time >= end:
+        elif self.repeat.value and self.time >= end:
             self.time = 0.0
         else:
             self.time = end
-            self.playing = self.repeat
+            self.play.value = self.repeat.value
 
     def stop(self) -> None:
         """End the server."""
@@ -155,23 +127,18 @@ class View:
                     _add_mesh(scene, f"{node}/visual{k}", shape)
             elif (box := inertia_box(robot, link.name)) is not None:
                 size, turn, center = box
-                scene.add_box(
-                    f"{node}/box",
-                    BOX,
-                    np.maximum(size, 0.005 * self._size),
-                    opacity=0.5,
-                    wxyz=_quaternion(turn),
-                    position=center,
-                )
+                place: dict[str, Any] = {"wxyz": _quaternion(turn), "position": center}
+                scene.add_box(f"{node}/box", BOX, np.maximum(size, 0.005 * self._size), opacity=0.5, **place)
         # lines from joint to joint, where meshes do not show the links
         bare = {link.name for link in robot.links if link.name not in shapes.by_link}
         bare -= {link.name for link in robot.links if link.mass == 0} if shapes.by_link else set()
-        self._bones = [pair for pair in bones(robot) if not bare.isdisjoint(pair)]
+        self._bones = [
+            (each.parent, each.child) for each in robot.joints if not bare.isdisjoint((each.parent, each.child))
+        ]
         self._lines: Any = None
         if self._bones:
-            self._lines = scene.add_line_segments(
-                "/lines", np.zeros((len(self._bones), 2, 3)), LINE, thickness=0.008 * self._size
-            )
+            nowhere = np.zeros((len(self._bones), 2, 3))
+            self._lines = scene.add_line_segments("/lines", nowhere, LINE, thickness=0.008 * self._size)
         tip = self._dense.tip
         scene.add_line_segments("/path", np.stack([tip[:-1], tip[1:]], axis=1), PATH, thickness=0.004 * self._size)
         self._trace = scene.add_line_segments("/trace", np.zeros((1, 2, 3)), TRACE, thickness=0.007 * self._size)
@@ -185,9 +152,9 @@ class View:
         gui.add_markdown(f"**{played.robot.name}**: {played.solution.name}")
         step = played.horizon / 1000
         self.slider = gui.add_slider("time, s", 0.0, played.horizon, step, 0.0)
-        self._playing = gui.add_checkbox("play", False)
-        self._repeat = gui.add_checkbox("repeat", True)
-        self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+        self.play = gui.add_checkbox("play", False)
+        self.repeat = gui.add_checkbox("repeat", True)
+        self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         tracing = gui.add_checkbox("tip trace", True)
         framing = gui.add_checkbox("link frames", False)
         if self.missing:

@@ -13,7 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from scripts.drawing import gif, sheet, text_table, write_json, write_table, written
+from scripts.drawing import gif, sheet
+from scripts.papers.run import Table, text_table, write, written
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -43,7 +44,7 @@ def test_a_written_file_is_whole_readable_by_all_and_alone(tmp_path: Path) -> No
 
 def test_a_table_reads_back_as_it_was_written(tmp_path: Path) -> None:
     rows = [{"name": "a, b", "value": 1 / 3, "good": True}, {"name": "c", "value": -2e-15, "good": False}]
-    write_table(tmp_path / "table.csv", rows)
+    write(tmp_path / "table.csv", Table(rows))
     with (tmp_path / "table.csv").open(newline="", encoding="utf-8") as stream:
         read = list(csv.DictReader(stream))
     assert [row["name"] for row in read] == ["a, b", "c"]
@@ -53,12 +54,12 @@ def test_a_table_reads_back_as_it_was_written(tmp_path: Path) -> None:
 
 def test_json_takes_arrays_and_refuses_what_is_not_finite(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
-    write_json(path, {"peaks": np.array([1.5, -2.0]), "passed": np.bool_(True), "deep": {"count": np.int64(3)}})
+    write(path, {"peaks": np.array([1.5, -2.0]), "passed": np.bool_(True), "deep": {"count": np.int64(3)}})
     assert json.loads(path.read_text(encoding="utf-8")) == {"peaks": [1.5, -2.0], "passed": True, "deep": {"count": 3}}
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(path, {"cost": float("nan")})
+        write(path, {"cost": float("nan")})
     with pytest.raises(TypeError, match="Figure cannot be written"):
-        write_json(path, {"figure": Figure()})
+        write(path, {"figure": Figure()})
     assert json.loads(path.read_text(encoding="utf-8"))["deep"] == {"count": 3}
     assert list(tmp_path.iterdir()) == [path]
 
@@ -74,7 +75,7 @@ def test_text_columns_line_up() -> None:
 
 def test_a_figure_has_the_size_asked_for_and_nothing_of_the_time_it_was_made(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
-        with sheet(tmp_path / name, columns=2, size=(4.0, 2.0), note="assumed " * 30) as (_, axes):
+        with sheet(tmp_path / name, (1, 2), (4.0, 2.0), "assumed " * 30) as (_, axes):
             assert axes.shape == (1, 2)
             axes[0, 0].plot([0, 1], [0, 1])
     with Image.open(tmp_path / "one.png") as picture:
@@ -90,7 +91,7 @@ def test_a_figure_that_fails_is_not_written(tmp_path: Path) -> None:
 
 def test_an_animation_has_every_frame_and_its_time(tmp_path: Path) -> None:
     path = tmp_path / "motion.gif"
-    with sheet(None, size=(2.0, 2.0)) as (figure, axes):
+    with sheet(None, (1, 1), (2.0, 2.0)) as (figure, axes):
         (dot,) = axes[0, 0].plot([0], [0], "o")
 
         def frames() -> Iterator[Figure]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
@@ -21,19 +19,9 @@ from models.arrays import Array
 from ocp import Solution, SolveError
 from ocp.local.accelerations import resolve_accelerations
 from scripts import gallery
-from scripts.robots import (
-    panda as gallery_panda,
-)
-from scripts.robots import (
-    pushing as gallery_pushing,
-)
-from scripts.robots import (
-    robots as gallery_robots,
-)
-from scripts.robots import (
-    ur5 as gallery_ur5,
-)
+from scripts.robots import panda, pushing, robots, ur5
 from scripts.robots.drawing import Scene, animate
+from scripts.robots.examples import run
 from scripts.robots.frames import TIP, Frames, frames_along
 from scripts.robots.results import turning_angle
 from scripts.viewer.plan import play
@@ -60,7 +48,7 @@ class Gallery:
 @pytest.fixture(scope="module")
 def coarse(tmp_path_factory: pytest.TempPathFactory) -> Gallery:
     folder = tmp_path_factory.mktemp("gallery")
-    rows, failed = gallery.run(NAMES, folder, coarse=True)
+    rows, failed = run(NAMES, folder, coarse=True)
     return Gallery(folder, rows, failed)
 
 
@@ -86,7 +74,7 @@ def test_the_momentum_of_the_space_arm_stays_zero_and_its_base_turns_less(coarse
 
 def test_the_cyclic_plan_returns_within_the_limits_where_the_pseudo_inverse_drifts(coarse: Gallery) -> None:
     row, plan = coarse.rows["panda"], coarse.plan("panda")
-    robot = gallery_robots.PANDA.read()
+    robot = robots.PANDA.read()
     assert np.abs(plan["joints"][-1] - plan["joints"][0]).max() <= 1e-8
     assert row["joint_return_rad"] <= 1e-8
     assert ((plan["joints"] >= robot.lower) & (plan["joints"] <= robot.upper)).all()
@@ -103,27 +91,27 @@ def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Ga
 def test_the_pushing_robot_stays_on_its_feet_where_instant_resolution_tips_it(coarse: Gallery) -> None:
     row = coarse.rows["pushing"]
     assert row["zmp_margin_local_m"] < 0
-    assert row["zmp_margin_optimal_m"] > 0.99 * gallery_pushing.MARGIN
+    assert row["zmp_margin_optimal_m"] > 0.99 * pushing.MARGIN
     assert row["tip_error"] < 1e-5
     assert not row["audit_tolerances"]
 
 
 def test_what_acts_on_the_pushing_hand_is_the_reaction_of_its_push() -> None:
-    machine, _ = gallery_pushing.anymal()
-    (wrench,) = gallery_pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
-    np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + gallery_pushing.PUSH, 0.0)
+    machine, _ = pushing.anymal()
+    (wrench,) = pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
+    np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + pushing.PUSH, 0.0)
     # by hand: pushing to its right presses its left feet
-    task = (gallery_pushing.task(machine), gallery_pushing.START, gallery_pushing.SECONDS)
+    task = (pushing.task(machine), pushing.START, pushing.SECONDS)
     pressed, free = (
         resolve_accelerations(machine, *task, external=external, step=1e-2, stop_at_lift_off=False).motion
-        for external in (gallery_pushing.reaction(machine), None)
+        for external in (pushing.reaction(machine), None)
     )
     aside = pressed.zero_moment_point[0, 1] - free.zero_moment_point[0, 1]
-    lever = -gallery_pushing.PUSH[1] * pressed.tip_in_world[0, 2]
+    lever = -pushing.PUSH[1] * pressed.tip_in_world[0, 2]
     assert aside == pytest.approx(lever / machine.weight)
 
 
-def placed(file: gallery_robots.RobotFile, joints: Array, frame: str) -> tuple[Array, Array]:
+def placed(file: robots.RobotFile, joints: Array, frame: str) -> tuple[Array, Array]:
     """Rotations and positions of a frame by Pinocchio; joints that the plan does not move stand at zero."""
     model = pinocchio.buildModelFromUrdf(str(file.path))
     data, robot = model.createData(), file.read()
@@ -141,29 +129,29 @@ def placed(file: gallery_robots.RobotFile, joints: Array, frame: str) -> tuple[A
 def test_the_panda_goes_round_its_circle_by_another_librarys_kinematics(coarse: Gallery) -> None:
     plan = coarse.plan("panda")
     t = np.linspace(0.0, plan.horizon, 61)
-    turn, place = placed(gallery_robots.PANDA, plan.at(t)["joints"], "panda_hand_tcp")
-    angle = 2 * np.pi * t / gallery_panda.LAP
-    x, y, z = gallery_panda.CENTER
+    turn, place = placed(robots.PANDA, plan.at(t)["joints"], "panda_hand_tcp")
+    angle = 2 * np.pi * t / panda.LAP
+    x, y, z = panda.CENTER
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    np.testing.assert_allclose(place, [x, y, z] + gallery_panda.RADIUS * ring, atol=1e-6)
-    lean = (gallery_panda.TILT * ring - [0, 0, 1]) / np.hypot(1, gallery_panda.TILT)
+    np.testing.assert_allclose(place, [x, y, z] + panda.RADIUS * ring, atol=1e-6)
+    lean = (panda.TILT * ring - [0, 0, 1]) / np.hypot(1, panda.TILT)
     np.testing.assert_allclose(turn[:, :, 2], lean, atol=1e-6)
 
 
 def test_the_tool_of_the_ur5_stands_on_the_panel_by_another_librarys_kinematics(coarse: Gallery) -> None:
     plan = coarse.plan("ur5")
-    turn, place = placed(gallery_robots.UR5, plan.at(np.linspace(0.0, plan.horizon, 61))["joints"], "tool0")
-    options = gallery_robots.UR5.options
+    turn, place = placed(robots.UR5, plan.at(np.linspace(0.0, plan.horizon, 61))["joints"], "tool0")
+    options = robots.UR5.options
     tip = place + turn @ np.array(options["tip_translation"])
     axis = turn @ np.array(options["tip_rotation"])[:, 2]
-    center = np.stack([tip[:, 0], 0 * tip[:, 1], 0 * tip[:, 2] + gallery_ur5.CENTER[1] - gallery_ur5.CURVE], axis=1)
+    center = np.stack([tip[:, 0], 0 * tip[:, 1], 0 * tip[:, 2] + ur5.CENTER[1] - ur5.CURVE], axis=1)
     out = tip - center
-    np.testing.assert_allclose(np.linalg.norm(out, axis=1), gallery_ur5.CURVE, atol=1e-6)
-    np.testing.assert_allclose(axis, -out / gallery_ur5.CURVE, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), ur5.CURVE, atol=1e-6)
+    np.testing.assert_allclose(axis, -out / ur5.CURVE, atol=1e-6)
     # the whole field: every lane from edge to edge
-    half = gallery_ur5.LENGTH / 2
+    half = ur5.LENGTH / 2
     np.testing.assert_allclose([tip[:, 1].min(), tip[:, 1].max()], [-half, half], atol=0.02)
-    np.testing.assert_allclose(tip[-1, 0] - tip[0, 0], gallery_ur5.WIDTH, atol=1e-6)
+    np.testing.assert_allclose(tip[-1, 0] - tip[0, 0], ur5.WIDTH, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -185,14 +173,14 @@ def test_the_summary_holds_every_example(coarse: Gallery) -> None:
 
 
 def test_roll_is_the_angle_about_the_tools_own_axis() -> None:
-    robot = gallery_robots.UR5.read()
+    robot = robots.UR5.read()
     pose = frames_along(robot, np.tile([0.3, -1.4, 1.6, -1.5, -1.2, 0.4], (2, 1)))
     angle = 0.7
     cosine, sine = np.cos(angle), np.sin(angle)
     about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     turned = pose.rotations[TIP].copy()
     turned[1] = turned[1] @ about_z
-    found = gallery_ur5.roll(Frames({TIP: turned}, {}))
+    found = ur5.roll(Frames({TIP: turned}, {}))
     assert found[1] - found[0] == pytest.approx(angle)
 
 
@@ -204,7 +192,7 @@ def test_the_turn_of_a_base_is_its_angle_whatever_the_sign_of_its_quaternion() -
 
 
 def test_an_animation_moves_from_its_first_picture_to_its_last(tmp_path: Path) -> None:
-    robot = gallery_robots.SPACE_ARM.read()
+    robot = robots.SPACE_ARM.read()
     joints = np.linspace(0.0, 1.0, 11)[:, None] * np.ones(7)
     base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (11, 1))
     scene = Scene("turn", robot, frames_along(robot, joints, base), np.linspace(0, 1, 11), "blue", (robot.root,))
@@ -223,7 +211,7 @@ def test_without_the_robots_it_says_what_to_install(
     def absent(name: str) -> Any:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(gallery_robots, "distribution", absent)
+    monkeypatch.setattr(robots, "distribution", absent)
     assert gallery.main(["--out", str(tmp_path), "--only", "space_arm", "panda"]) == 1
     assert "pip install spartpy example-robot-data" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -235,7 +223,7 @@ def test_an_interruption_ends_it_with_nothing_half_written(
     def interrupted(coarse: bool = False) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(gallery_panda, "plan", interrupted)
+    monkeypatch.setattr(panda, "plan", interrupted)
     assert gallery.main(["--out", str(tmp_path), "--only", "panda"]) == 130
     assert "stopped" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.*"))
@@ -252,7 +240,7 @@ def test_an_interruption_that_a_solver_keeps_to_itself_is_noticed(
             signal.signal(signal.SIGINT, before)
         raise SolveError("interrupted")
 
-    monkeypatch.setattr(gallery_panda, "plan", keeps)
+    monkeypatch.setattr(panda, "plan", keeps)
     assert gallery.main(["--out", str(tmp_path), "--only", "panda", "ur5"]) == 130
     assert "stopped" in capsys.readouterr().err
 
@@ -263,8 +251,8 @@ def test_what_fails_is_told_and_does_not_stop_the_rest(
     def fails(coarse: bool = False) -> Any:
         raise SolveError("no way round")
 
-    monkeypatch.setattr(gallery_panda, "plan", fails)
-    monkeypatch.setattr(gallery_ur5, "plan", fails)
+    monkeypatch.setattr(panda, "plan", fails)
+    monkeypatch.setattr(ur5, "plan", fails)
     folder = tmp_path / "gallery"
     folder.mkdir()
     (folder / "summary.json").write_text(json.dumps({"space_arm": {"dof": 7}, "gone": {}}), encoding="utf-8")
@@ -274,18 +262,11 @@ def test_what_fails_is_told_and_does_not_stop_the_rest(
     assert "ur5: no way round" in shown
 
 
-def test_the_script_runs_as_a_file_and_knows_its_examples() -> None:
-    script = Path(gallery.__file__)
-    done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert all(name in done.stdout for name in NAMES)
-
-
 def test_the_raster_starts_and_ends_at_rest() -> None:
     time = ca.SX.sym("time")
-    track = gallery_ur5.raster().position
+    track = ur5.raster().position
     assert track is not None
     position = track(time)
     speed = ca.Function("speed", [time], [ca.jacobian(position, time)])
-    for end in (0.0, gallery_ur5.DURATION):
+    for end in (0.0, ur5.DURATION):
         np.testing.assert_allclose(np.array(speed(end)), 0.0, atol=1e-12)

@@ -20,6 +20,7 @@ from ocp import Collocation, ProblemError, Solution, solve
 from ocp.builders.redundancy import minimum_velocity_problem
 from scripts import view
 from scripts.robots.frames import TIP, frames_along, inertia_box
+from scripts.viewer.command import parser, read
 from scripts.viewer.meshes import find_mesh, read_shapes
 from scripts.viewer.plan import Played, play, read_record, save_plan
 from scripts.viewer.scene import View
@@ -149,18 +150,18 @@ def test_playing_goes_on_at_its_speed_and_repeats_or_stops_at_the_end(folder: Pa
     shown = show(play(folder / "fixed.npz", folder / "arm.urdf"))
     shown.advance(0.3)
     assert shown.time == 0.0  # not playing
-    shown.playing, shown.speed = True, 2.0
+    shown.play.value, shown.speed.value = True, "2"
     shown.advance(0.3)
     assert shown.time == pytest.approx(0.6)
     shown.advance(10.0)
     assert shown.time == pytest.approx(1.5)
-    assert shown.playing
+    assert shown.play.value
     shown.advance(0.1)
     assert shown.time == 0.0
-    shown.repeat = False
+    shown.repeat.value = False
     shown.advance(10.0)
     assert shown.time == pytest.approx(1.5)
-    assert not shown.playing
+    assert not shown.play.value
 
 
 def test_joints_are_matched_by_name_whatever_their_order_in_the_plan(folder: Path, tmp_path: Path) -> None:
@@ -191,7 +192,7 @@ def test_a_saved_plan_with_its_robot_is_still_a_solution(folder: Path) -> None:
 
 def test_a_bare_plan_plays_when_told_how_to_read_the_robot(folder: Path) -> None:
     words = [str(folder / "bare.npz"), str(folder / "arm.urdf"), "--tip", "finger", "--lock", "grip=0.05"]
-    found = view.read(view.parser().parse_args(words))
+    found = read(parser(None).parse_args(words))
     wanted = play(folder / "floating.npz", folder / "arm.urdf")
     assert found.base == "base"
     np.testing.assert_allclose(
@@ -201,7 +202,7 @@ def test_a_bare_plan_plays_when_told_how_to_read_the_robot(folder: Path) -> None
 
 def test_a_mount_given_stands_in_for_the_one_recorded(folder: Path) -> None:
     words = [str(folder / "fixed.npz"), str(folder / "arm.urdf"), "--mount", "1", "2", "3", "0", "0", "0.5"]
-    hull = view.read(view.parser().parse_args(words)).frames(0.0)
+    hull = read(parser(None).parse_args(words)).frames(0.0)
     np.testing.assert_allclose(hull.positions["hull"][0], [1, 2, 3])
     np.testing.assert_allclose(hull.rotations["hull"][0][0], [np.cos(0.5), -np.sin(0.5), 0], atol=1e-12)
 

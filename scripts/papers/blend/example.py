@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
 from models.machines.scara import Elbow, Scara
 from models.paths import Arc, Line, Path, SmoothPath, smooth
 from models.paths.blends import BlendKind
 from ocp.schedule import JointLimits
 
-__all__ = ["NOTE", "corner", "example"]
-
-Array: TypeAlias = NDArray[np.float64]
 MM = 1e-3
 
 # printed

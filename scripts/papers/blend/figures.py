@@ -1,38 +1,49 @@
-"""Figures of the blend paper, 3 to 9 and 13 to 18."""
+"""Figures of the blend paper, 3 to 9 and 13 to 18; mapping errors, curvature, limits; and the arm in motion."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from models.arrays import Array
 from models.paths import SmoothPath
 from models.paths.blends import BlendKind, polynomial
 from ocp.schedule import joint_motion
-from scripts.drawing import COLORS, DASHES, sheet
-from scripts.papers.blend.example import MM, NOTE, PAPER_TIMES, PERIOD, POINTS, Array, corner
+from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
+from scripts.papers.blend.example import (
+    ARM,
+    CENTRIPETAL,
+    JOINT_LIMITS,
+    MM,
+    NOTE,
+    PAPER_TIMES,
+    PERIOD,
+    POINTS,
+    REMAINING,
+    SPEED,
+    corner,
+)
 from scripts.papers.blend.results import Results, exit_steps
 
-__all__ = ["LINES", "MAPPINGS", "draw_paper"]
-
 TIME = "time, s"
-LINES: tuple[Any, ...] = DASHES
 JOINTS = ("shoulder", "elbow", "quill", "wrist")
 MAPPINGS = {"predictor_corrector": "the paper's mapping", "gauss_newton": "Gauss-Legendre and Newton"}
+SHAPES: tuple[tuple[float, BlendKind], ...] = ((1.0, "cubic"), (3.0, "cubic"), (1.5, "quintic"))
+FRAME = 0.04  # s
+ROUNDING = 1e-11
+"""Errors below it, exact zeros too, are drawn here."""
 
 
-def draw_paper(folder: Path, results: Results) -> None:
-    """Write the paper's figures."""
+def draw(results: Results, folder: Path) -> None:
+    """Write the paper's figures, those of what it leaves out, and the animation."""
     _shapes(folder)
     _differences(folder)
-    _path(folder, results)
-    _tool(folder, results)
-    _joints(folder, results)
-    _line_speed(folder, results)
-
-
-SHAPES: tuple[tuple[float, BlendKind], ...] = ((1.0, "cubic"), (3.0, "cubic"), (1.5, "quintic"))
+    for one in (_path, _tool, _joints, _line_speed, _mapping, _curvature, _limits, _animation):
+        one(folder, results)
 
 
 def _corner(ax: Any, path: SmoothPath, **style: Any) -> None:
@@ -44,14 +55,14 @@ def _corner(ax: Any, path: SmoothPath, **style: Any) -> None:
 def _legs(ax: Any, degrees: float, length: float) -> None:
     angle = np.radians(degrees)
     x, y = [-length, 0, -length * np.cos(angle)], [0, 0, length * np.sin(angle)]
-    ax.plot(x, y, color=COLORS["grey"], lw=0.8, ls=LINES[3])
+    ax.plot(x, y, color=COLORS["grey"], lw=0.8, ls=DASHES[3])
     ax.set_aspect("equal", "datalim")
     ax.set_xlabel("x, mm")
 
 
 def _shapes(folder: Path) -> None:
     sizes = (30, 25, 20, 15)
-    with sheet(folder / "fig03_06_shapes.png", columns=3, size=(8.2, 3.4)) as (_, axes):
+    with sheet(folder / "fig03_06_shapes.png", (1, 3), (8.2, 3.4)) as (_, axes):
         cases = (
             ("α = 30 mm, 90° (figure 3)", 90.0, 30.0),
             ("λ = 1, 90° (figure 5)", 90.0, None),
@@ -59,17 +70,17 @@ def _shapes(folder: Path) -> None:
         )
         for ax, (title, degrees, alpha) in zip(axes[0], cases, strict=True):
             _legs(ax, degrees, 33)
-            for size, dash in zip(sizes, LINES, strict=True):
+            for size, dash in zip(sizes, DASHES, strict=True):
                 _corner(
                     ax, corner(degrees, size * MM, alpha / size if alpha else 1.0), ls=dash, label=f"$L_r$ = {size} mm"
                 )
             ax.set_title(title)
         axes[0, 0].set_ylabel("y, mm")
         axes[0, 0].legend(loc="upper left")
-    with sheet(folder / "fig04_07_similarity.png", columns=2, size=(7.4, 3.6)) as (_, axes):
+    with sheet(folder / "fig04_07_similarity.png", (1, 2), (7.4, 3.6)) as (_, axes):
         left, right = axes[0]
         _legs(left, 90, 33)
-        for size, dash in ((30, LINES[0]), (15, LINES[1])):
+        for size, dash in ((30, DASHES[0]), (15, DASHES[1])):
             path = corner(90, size * MM, 1.0)
             middle = polynomial(path.coefficients[0], np.array(0.5)) / MM
             _corner(left, path, ls=dash, label=f"$L_r$ = {size} mm, $L_s$ = {np.hypot(*middle[:2]):.2f} mm")
@@ -78,7 +89,7 @@ def _shapes(folder: Path) -> None:
         left.set_ylabel("y, mm")
         left.legend(loc="upper left")
         _legs(right, 90, 33)
-        for (shape, kind), dash in zip(SHAPES, LINES, strict=False):
+        for (shape, kind), dash in zip(SHAPES, DASHES, strict=False):
             _corner(right, corner(90, 30 * MM, shape, kind), ls=dash, label=f"{kind}, λ = {shape:g}")
         right.set_title("λ = 1 and 3 (figure 7), and the quintic")
         right.legend(loc="upper left")
@@ -89,9 +100,7 @@ def _differences(folder: Path) -> None:
         "90° corner, Lr = 30 mm, sampled at every mm along the path: V = first, A = second difference of the position."
     )
     titles = ("λ = 1 (figure 8)", "λ = 3 (figure 9)", "quintic, λ = 1.5")
-    with sheet(
-        folder / "fig08_09_differences.png", rows=2, columns=3, size=(8.2, 4.4), note=note, sharey="row", sharex=True
-    ) as (_, axes):
+    with sheet(folder / "fig08_09_differences.png", (2, 3), (8.2, 4.4), note, sharey="row", sharex=True) as (_, axes):
         for column, (shape, kind), title in zip(axes.T, SHAPES, titles, strict=True):
             path = corner(90, 30 * MM, shape, kind)
             count = int(path.length / MM)
@@ -100,10 +109,10 @@ def _differences(folder: Path) -> None:
             second = np.diff(first, axis=0)
             blend = path.blend(0)
             for ax, values, start in ((column[0], first, 1), (column[1], second, 2)):
-                for axis, dash in zip((0, 1), LINES, strict=False):
+                for axis, dash in zip((0, 1), DASHES, strict=False):
                     ax.plot(np.arange(len(values)) + start, values[:, axis], ls=dash, label="xy"[axis])
                 for edge in (blend.start, blend.end):
-                    ax.axvline(edge / MM, color=COLORS["grey"], lw=0.8, ls=LINES[3])
+                    ax.axvline(edge / MM, color=COLORS["grey"], lw=0.8, ls=DASHES[3])
             column[0].set_title(title)
             column[1].set_xlabel("distance, mm")
         axes[0, 0].set_ylabel("V, mm")
@@ -113,10 +122,10 @@ def _differences(folder: Path) -> None:
 
 def _path(folder: Path, results: Results) -> None:
     task = results.cubic.path
-    grey = {"color": COLORS["grey"], "lw": 0.9, "ls": LINES[3]}
+    grey = {"color": COLORS["grey"], "lw": 0.9, "ls": DASHES[3]}
     note = "Heights are drawn four times as large as the other lengths."
     kind = {"projection": "3d"}
-    with sheet(folder / "fig13_path.png", size=(6.0, 4.2), note=note, subplot_kw=kind) as (_, axes):
+    with sheet(folder / "fig13_path.png", (1, 1), (6.0, 4.2), note, subplot_kw=kind) as (_, axes):
         ax = axes[0, 0]
         for i, length in enumerate(task.lengths):
             s = np.linspace(0, length, 60)
@@ -149,18 +158,18 @@ def _tool(folder: Path, results: Results) -> None:
     paper = ", ".join(f"{time:.3f}" for time in PAPER_TIMES)
     ours = ", ".join(f"{time:.4f}" for time in edges)
     note = f"Shaded: the blends, which begin and end at {ours} s; printed: {paper} s."
-    with sheet(folder / "fig14_position.png", size=(6.3, 3.4), note=note) as (_, axes):
-        for i, dash in zip(range(3), LINES, strict=False):
+    with sheet(folder / "fig14_position.png", (1, 1), (6.3, 3.4), note) as (_, axes):
+        for i, dash in zip(range(3), DASHES, strict=False):
             axes[0, 0].plot(t, place.position[:, i] / MM, ls=dash, label="xyz"[i])
         _mark(axes[0, 0], edges)
         axes[0, 0].set(xlabel=TIME, ylabel="position, mm", title="Tool position (figure 14)")
         axes[0, 0].legend()
-    with sheet(folder / "fig15_velocity.png", columns=2, size=(8.2, 3.4), note=note) as (_, axes):
+    with sheet(folder / "fig15_velocity.png", (1, 2), (8.2, 3.4), note) as (_, axes):
         for ax, values, label in zip(
             axes[0], (velocity, acceleration), ("velocity, mm/s", "acceleration, m/s²"), strict=True
         ):
             scale = MM if "mm" in label else 1.0
-            for i, dash in zip(range(3), LINES, strict=False):
+            for i, dash in zip(range(3), DASHES, strict=False):
                 ax.plot(t, values[:, i] / scale, ls=dash, label="xyz"[i])
             _mark(ax, edges)
             ax.set(xlabel=TIME, ylabel=label)
@@ -185,11 +194,10 @@ def _joints(folder: Path, results: Results) -> None:
         ),
     )
     for file, title, values, labels, quills in kinds:
-        with sheet(
-            folder / file, rows=len(values), columns=2, size=(8.2, 2.9 * len(values)), note=NOTE, sharex=True
-        ) as (_, axes):
+        shape, size = (len(values), 2), (8.2, 2.9 * len(values))
+        with sheet(folder / file, shape, size, NOTE, sharex=True, xlabel=TIME) as (_, axes):
             for row, value, label, quill in zip(axes, values, labels, quills, strict=True):
-                for joint, dash in zip((0, 1, 3), LINES, strict=False):
+                for joint, dash in zip((0, 1, 3), DASHES, strict=False):
                     row[0].plot(t, np.degrees(value[:, joint]), ls=dash, label=JOINTS[joint])
                 row[1].plot(t, value[:, 2] / MM)
                 row[0].set_ylabel(label)
@@ -199,8 +207,6 @@ def _joints(folder: Path, results: Results) -> None:
             axes[0, 0].set_title(title)
             axes[0, 1].set_title("Quill, the vertical axis")
             axes[0, 0].legend()
-            for ax in axes[-1]:
-                ax.set_xlabel(TIME)
 
 
 def _line_speed(folder: Path, results: Results) -> None:
@@ -218,15 +224,146 @@ def _line_speed(folder: Path, results: Results) -> None:
         "mapping leaves the chord against the arc alone, the paper's drifts, which shows as one step of "
         f"{exits[0]:+.1f} and {exits[1]:+.1f} mm/s (beyond the axis) where its blends end."
     )
-    with sheet(folder / "fig18_line_speed.png", columns=3, size=(9.4, 3.4), note=note) as (_, axes):
+    with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.4), note) as (_, axes):
         left, centre, right = axes[0]
         left.plot(middle, speed / MM)
         left.set(xlabel=TIME, ylabel="line speed, mm/s", title="Line speed (figure 18)")
         centre.plot(motion.t[1:-1], acceleration)
         centre.set(xlabel=TIME, ylabel="line acceleration, m/s²", title="Line acceleration (figure 18)")
-        for (mapping, name), color, dash in zip(MAPPINGS.items(), ("orange", "blue"), LINES, strict=False):
+        for (mapping, name), color, dash in zip(MAPPINGS.items(), ("orange", "blue"), DASHES, strict=False):
             right.plot(results.speed_error_times, results.speed_errors[mapping], COLORS[color], ls=dash, label=name)
         right.set(xlabel=TIME, ylabel="line speed error, mm/s", ylim=(-0.75, 0.2), title="Speed error, enlarged")
         right.legend(loc="lower left")
         for ax in axes[0]:
             _mark(ax, edges)
+
+
+def _mapping(folder: Path, results: Results) -> None:
+    note = "90° corner at 1000 mm/s; cubic with λ = 3, quintic with λ = 1.5. Below 1e-9 the curves show rounding."
+    with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 5.8), note, sharex=True, sharey="row") as (figure, axes):
+        for row, key, label in (
+            (axes[0], "drift_um", "|drift| at the blend's end, µm"),
+            (axes[1], "true_speed_error_mm_s", "worst |speed error|, mm/s"),
+        ):
+            row[0].set_ylabel(label)
+            for ax, kind in zip(row, ("cubic", "quintic"), strict=True):
+                for (mapping, name), color in zip(MAPPINGS.items(), ("orange", "blue"), strict=True):
+                    for period, dash, marker in zip((1, 2, 4), DASHES, "osD", strict=False):
+                        wanted = {"blend": kind, "mapping": mapping, "period_ms": period}
+                        mine = [r for r in results.small_blends if all(r[k] == v for k, v in wanted.items())]
+                        x, y = [r["remaining_mm"] for r in mine], [max(abs(r[key]), ROUNDING) for r in mine]
+                        style = {"ls": dash, "marker": marker, "ms": 3.5, "color": COLORS[color]}
+                        ax.loglog(x, y, **style, label=f"{name}, {period} ms")
+        ticks = sorted({row["remaining_mm"] for row in results.small_blends})
+        for ax in axes[1]:
+            ax.set(xlabel="$L_r$, mm", xticks=ticks, xticklabels=[f"{x:g}" for x in ticks])
+            ax.minorticks_off()
+        axes[0, 0].set_title("Cubic blend")
+        axes[0, 1].set_title("Quintic blend")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+
+
+def _curvature(folder: Path, results: Results) -> None:
+    with sheet(folder / "curvature.png", (1, 1), (6.6, 3.4)) as (_, axes):
+        ax = axes[0, 0]
+        kinds = ((results.cubic, "orange", DASHES[0]), (results.quintic, "blue", DASHES[1]))
+        for (path, color, dash), name in zip(kinds, ("cubic, λ = 3", "quintic, λ = 1.5"), strict=True):
+            s = np.unique(np.concatenate([np.linspace(0, path.length, 6001), path.bounds, path.bounds[1:-1] - 1e-9]))
+            ax.plot(s / MM, path.curvature(s) * MM * REMAINING / MM, color=COLORS[color], ls=dash, label=name)
+        ax.set(xlabel="distance, mm", ylabel="curvature × $L_r$", title="Curvature along the example")
+        ax.legend(loc="upper left")
+        jump = results.cubic.curvature_jumps()
+        at = int(jump.argmax())
+        inset = ax.inset_axes((0.74, 0.42, 0.24, 0.42))
+        place = results.cubic.bounds[at + 1]
+        for path, color, dash in kinds:
+            centre = path.bounds[at + 1]
+            for side in (np.linspace(-0.012, -1e-9, 60), np.linspace(0, 0.012, 60)):
+                inset.plot(side / MM, path.curvature(centre + side) * REMAINING, ls=dash, color=COLORS[color])
+        inset.set_title(f"end at {place / MM:.0f} mm", fontsize=7)
+        inset.tick_params(labelsize=6)
+
+
+def _limits(folder: Path, results: Results) -> None:
+    note = (
+        f"Thick: the schedule; thin: the minimum time by optimal control. Centripetal acceleration at most "
+        f"{CENTRIPETAL:g} m/s². Joint limits (chosen) of shoulder, elbow, quill, wrist: {joint_limits()}. "
+        "The cubic's curvature jumps, so that it can keep no joint jerk limit."
+    )
+    with sheet(folder / "limits.png", (2, 2), (9.0, 5.6), note, sharey="row") as (_, axes):
+        for (upper, lower), kind in zip(axes.T, ("cubic", "quintic"), strict=True):
+            mine = {name: plan for name, plan in results.plans.items() if name.startswith(kind)}
+            for (name, plan), color, dash in zip(mine.items(), ("grey", "blue", "green"), DASHES, strict=False):
+                label = f"{name.split(', ')[1]}: {plan.schedule.duration:.3f} s, minimum {plan.fastest.duration:.3f} s"
+                thick: dict[str, Any] = {"ls": dash, "label": label}
+                thin: dict[str, Any] = {"lw": 0.8, "alpha": 0.8}
+                for one, style in ((plan.schedule, thick), (plan.fastest.schedule, thin)):
+                    motion = one.at(np.linspace(0, one.duration, 4001))
+                    place = np.clip(motion.distance, 0, plan.path.length)
+                    upper.plot(place / MM, motion.speed / MM, **style, color=COLORS[color])
+                    centripetal = motion.speed**2 * plan.path.curvature(place)
+                    lower.plot(place / MM, centripetal, **style, color=COLORS[color])
+            upper.set(title=f"{kind.capitalize()} blends", ylim=(0, 1.05 * SPEED / MM))
+            upper.legend(loc="lower center")
+            lower.axhline(CENTRIPETAL, color=COLORS["black"], lw=0.8, ls=DASHES[3])
+            lower.set(xlabel="distance, mm")
+        axes[0, 0].set_ylabel("line speed, mm/s")
+        axes[1, 0].set_ylabel("centripetal acceleration, m/s²")
+
+
+def joint_limits() -> str:
+    """The chosen limits in words."""
+    texts = []
+    for kind, power in (("velocity", ""), ("acceleration", "²"), ("jerk", "³")):
+        values = ", ".join(f"{value:g}" for value in np.asarray(getattr(JOINT_LIMITS, kind)))
+        texts.append(f"{kind} {values} rad/s{power} (m/s{power})")
+    return "; ".join(texts)
+
+
+def _animation(folder: Path, results: Results) -> None:
+    """The arm drawing the path, in real time."""
+    plan = results.mean
+    times = np.append(np.arange(0, plan.duration, FRAME), plan.duration)
+    motion = plan.at(times)
+    joints = results.joints.at(motion.distance).position
+    fine = plan.at(np.linspace(0, plan.duration, 1001))
+    whole = results.cubic.at(fine.distance).position / MM
+    edges = plan.time_at(results.cubic.bounds[1:5])
+
+    with sheet(None, (2, 2), (8.0, 4.4), width_ratios=(1.5, 1), sharex="col") as (figure, axes):
+        figure.set_dpi(90)
+        for ax in axes[:, 0]:
+            ax.remove()
+        ax = figure.add_subplot(axes[0, 0].get_gridspec()[:, 0])
+        ax.plot(whole[:, 0], whole[:, 1], color=COLORS["grey"], lw=0.8, ls=DASHES[3], label="path")
+        (drawn,) = ax.plot([], [], color=COLORS["blue"], lw=2, label="drawn")
+        (arm,) = ax.plot([], [], "o-", color=COLORS["orange"], lw=4, ms=7, label="arm")
+        ax.set_aspect("equal")
+        ax.set(xlim=(-480, 860), ylim=(-60, 800), xlabel="x, mm", ylabel="y, mm")
+        ax.legend(loc="upper right")
+        title = ax.set_title("")
+        moving: list[tuple[Any, Any]] = []
+        rows = ((axes[0, 1], fine.speed / MM, "line speed, mm/s"), (axes[1, 1], whole[:, 2], "height z, mm"))
+        for right, values, label in rows:
+            right.plot(fine.t, values, color=COLORS["grey"], lw=0.8)
+            _mark(right, edges)
+            right.set_ylabel(label)
+            moving.append((right.plot([], [], "o", color=COLORS["blue"], ms=5)[0], values))
+        axes[1, 1].set_xlabel(TIME)
+        axes[0, 1].set_title("Shaded: the blends")
+        add_note(figure, "Seen from above; link lengths 400 mm each and the side of the elbow are assumed.")
+
+    def frames() -> Iterator[Figure]:
+        for time, q in zip(times, joints, strict=True):
+            done = int(np.searchsorted(fine.t, time, side="right"))
+            elbow = ARM.upper_arm * np.array([np.cos(q[0]), np.sin(q[0])]) / MM
+            tip = elbow + ARM.forearm * np.array([np.cos(q[0] + q[1]), np.sin(q[0] + q[1])]) / MM
+            arm.set_data([0, elbow[0], tip[0]], [0, elbow[1], tip[1]])
+            drawn.set_data(whole[:done, 0], whole[:done, 1])
+            for dot, values in moving:
+                dot.set_data([time], [np.interp(time, fine.t, values)])
+            title.set_text(f"t = {time:.2f} s")
+            yield figure
+            figure.set_layout_engine("none")  # laid out by the first drawing, costly in each
+
+    gif(folder / "motion.gif", frames(), seconds=FRAME)

@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from models.arrays import Array
 from models.paths import Blend, SmoothPath, gauss_newton, march, predictor_corrector
 from models.paths.arc_length import arc_length
 from models.paths.blends import DEFAULT_SHAPE, BlendKind, polynomial
 from ocp.schedule import Schedule, SpeedProfile
-from scripts.drawing import Row
-from scripts.papers.blend.example import MM, PERIOD, SPEED, Array, corner
-
-__all__ = ["mapping_table", "small_blend_table", "speed_errors"]
+from scripts.papers.blend.example import MM, PERIOD, SPEED, corner
+from scripts.papers.run import Row
 
 PERIODS = (1e-3, 2e-3, 4e-3)  # s
 DISTANCES = tuple(MM * d for d in (5, 10, 20, 50, 100, 150))

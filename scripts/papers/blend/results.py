@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from models.arrays import Array
 from models.machines.scara_path import ScaraPath, scara_along
 from models.paths import SmoothPath, gamma, smooth
 from models.paths.blends import polynomial
 from ocp.builders.timing import Fastest, plan_minimum_time
-from ocp.schedule import LineLimits, Schedule, joint_motion, peak_acceleration, schedule
-from scripts.drawing import Row
+from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts.papers.blend.example import (
     ARM,
     CENTRIPETAL,
@@ -23,19 +23,13 @@ from scripts.papers.blend.example import (
     MEAN_ACCELERATION,
     MM,
     PAPER_GAMMA,
-    PAPER_TIMES,
     REMAINING,
     SPEED,
-    Array,
     corner,
     example,
 )
 from scripts.papers.blend.mapping import mapping_table, small_blend_table, speed_errors
-
-__all__ = ["Plan", "Results", "asked_centripetal", "compute", "event_table", "exit_steps", "limit_table"]
-
-SAMPLES = 20001
-"""At which a schedule's demands are looked at: 0.1 ms apart or less."""
+from scripts.papers.run import Row
 
 
 @dataclass(frozen=True)
@@ -140,68 +134,6 @@ def gamma_table() -> list[Row]:
             row[f"{name}_paper"] = paper
             row[f"{name}_difference"] = row[name] - paper
         rows.append(row)
-    return rows
-
-
-def event_table(results: Results) -> list[Row]:
-    """When the blends begin and end, in both readings of the acceleration, beside the printed times."""
-    names = ("blend 1 begins", "blend 1 ends", "blend 2 begins", "blend 2 ends")
-    mean, peak = (plan.time_at(results.cubic.bounds[1:5]) for plan in (results.mean, results.peak))
-    rows: list[Row] = [
-        {
-            "event": name,
-            "paper_s": paper,
-            "mean_s": a,
-            "mean_difference_s": a - paper,
-            "peak_s": b,
-            "peak_difference_s": b - paper,
-        }
-        for name, paper, a, b in zip(names, PAPER_TIMES, mean.tolist(), peak.tolist(), strict=True)
-    ]
-    for blend in (0, 1):
-        paper = PAPER_TIMES[2 * blend + 1] - PAPER_TIMES[2 * blend]
-        a, b = (float(times[2 * blend + 1] - times[2 * blend]) for times in (mean, peak))
-        rows.append(
-            {
-                "event": f"blend {blend + 1} lasts",
-                "paper_s": paper,
-                "mean_s": a,
-                "mean_difference_s": a - paper,
-                "peak_s": b,
-                "peak_difference_s": b - paper,
-            }
-        )
-    return rows
-
-
-def limit_table(results: Results) -> list[Row]:
-    """Schedules under more and more limits, against the minimum of the optimal control problem.
-
-    A number "over limit" is the largest demand over its limit, whether the limit was asked for or not.
-    """
-    rows: list[Row] = []
-    bounds = [np.asarray(getattr(JOINT_LIMITS, kind)) for kind in ("velocity", "acceleration", "jerk")]
-    for name, plan in results.plans.items():
-        motion = plan.schedule.at(np.linspace(0, plan.schedule.duration, SAMPLES))
-        joints = joint_motion(plan.joints, motion)
-        used = [float((np.abs(value) / bound).max()) for value, bound in zip(joints[1:], bounds, strict=True)]
-        centripetal = motion.speed**2 * plan.path.curvature(motion.distance)
-        # where the curvature jumps, so do the joint accelerations, between any two samples
-        smooth_joints = plan.path.curvature_jumps().max() < 1e-9
-        rows.append(
-            {
-                "case": name,
-                "duration_s": plan.schedule.duration,
-                "minimum_s": plan.fastest.duration,
-                "over_minimum_percent": 100 * (plan.schedule.duration / plan.fastest.duration - 1),
-                "minimum_demand": plan.fastest.demand,
-                "dips": len(plan.schedule.dips),
-                "centripetal_over_limit": float(centripetal.max()) / CENTRIPETAL,
-                "joint_velocity_over_limit": used[0],
-                "joint_acceleration_over_limit": used[1],
-                "joint_jerk_over_limit": used[2] if smooth_joints else "unbounded",
-            }
-        )
     return rows
 
 

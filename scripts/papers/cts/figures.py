@@ -14,11 +14,12 @@ from models.arrays import Array
 from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH, Rig
 from scripts.drawing import COLORS, DASHES, gif, sheet
-from scripts.papers.cts.results import NOTE, SCALE, Results, corners, surroundings
-
-__all__ = ["draw", "draw_release"]
+from scripts.papers.cts.plan import draw_plan
+from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, surroundings
 
 UNITS = ("in", *["deg"] * 5)
+ITERATIONS = (("combined", 0.0, "combined"), *(("jacobian", gain, f"Jacobian, gain {gain:g}") for gain in GAINS))
+METHOD_COLORS = ("orange", "green", "purple")
 
 
 def skeleton(rig: Rig, joints: Array) -> Array:
@@ -35,54 +36,47 @@ def shown(joints: Array) -> Array:
     return np.asarray(joints * [1 / INCH, *[180 / np.pi] * 5])
 
 
-def draw(folder: Path, results: Results) -> None:
-    """Figures 6 to 9."""
+def draw(results: Results, folder: Path) -> None:
+    """Figures 6 to 9, the store release, and the plan of the whole sweep."""
     _rig(folder / "fig06_rig.png", results)
+    _joints(folder, results)
+    _iterations(folder / "fig08_iterations.png", results)
+    _release(folder, results)
+    draw_plan(folder / "plan.png", results.plan)
+
+
+def _joints(folder: Path, results: Results) -> None:
     z = results.targets[:, 2] / INCH
     for number, name in ((7, "i1"), (9, "i2")):
         closed = shown(results.optimal[name].joints)
-        paths = [("combined", results.runs[name, "combined", 0.0])]
-        paths += [(f"Jacobian, gain {gain:g}", results.runs[name, "jacobian", gain]) for gain in (1.0, 20.0)]
         title = f"Figure {number}: joints over the sweep, index {'$I_1$' if name == 'i1' else '$I_2$'}"
-        with sheet(
-            folder / f"fig0{number}_joints_{name}.png", rows=2, columns=3, size=(9.0, 5.0), note=NOTE, sharex=True
-        ) as (figure, axes):
+        path = folder / f"fig0{number}_joints_{name}.png"
+        with sheet(path, (2, 3), (9.0, 5.0), NOTE, sharex=True, xlabel="target z, in") as (figure, axes):
             for k, ax in enumerate(axes.flat):
-                ax.plot(z, closed[:, k], color=COLORS["black"], lw=2.5, alpha=0.4, label="global optimum")
-                for (label, run), dash, color in zip(paths, DASHES, ("blue", "green", "orange"), strict=False):
-                    ax.plot(z, shown(run.joints)[:, k], ls=dash, color=COLORS[color], lw=1.2, label=label)
+                ax.plot(z, closed[:, k], color=COLORS["blue"], lw=2.5, alpha=0.4, label="global optimum")
+                for (method, gain, label), color, dash in zip(ITERATIONS, METHOD_COLORS, DASHES, strict=False):
+                    joints = shown(results.runs[name, method, gain].joints)
+                    ax.plot(z, joints[:, k], ls=dash, color=COLORS[color], lw=1.2, label=label)
                 low, high = closed[:, k].min(), closed[:, k].max()
                 ax.set_ylim(low - 0.5 * (high - low) - 1, high + 0.5 * (high - low) + 1)
                 ax.set_ylabel(f"$q_{k + 1}$, {UNITS[k]}")
-            for ax in axes[1]:
-                ax.set_xlabel("target z, in")
             handles, labels = axes[0, 0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside right upper")
-            bounds = [f"gain {gain:g}: {results.stability[name, gain]:.3g}" for gain in (1.0, 20.0)]
+            bounds = [f"gain {gain:g}: {results.stability[name, gain]:.3g}" for gain in GAINS]
             stable = "largest gain $n_6^2 I''$, stable below 2: " + ", ".join(bounds)
             figure.suptitle(f"{title}\n{stable}", fontsize=10)
-    _iterations(folder / "fig08_iterations.png", results)
 
 
 def _iterations(path: Path, results: Results) -> None:
     z = results.targets[:, 2] / INCH
-    with sheet(path, columns=2, size=(8.2, 3.6), note=NOTE + " The closed form has no iterations.", sharey=True) as (
-        _,
-        axes,
-    ):
+    note = NOTE + " The closed form has no iterations."
+    with sheet(path, (1, 2), (8.2, 3.6), note, sharey=True, xlabel="target z, in") as (_, axes):
         for ax, name in zip(axes[0], ("i1", "i2"), strict=True):
-            kinds = (
-                ("combined", 0.0, "combined"),
-                ("jacobian", 1.0, "Jacobian, gain 1"),
-                ("jacobian", 20.0, "Jacobian, gain 20"),
-            )
-            for (method, gain, label), color, dash in zip(kinds, ("blue", "green", "orange"), DASHES, strict=False):
+            for (method, gain, label), color, dash in zip(ITERATIONS, METHOD_COLORS, DASHES, strict=False):
                 run = results.runs[name, method, gain]
                 text = f"{label}: {int(run.converged.sum())} of {len(z)} converge"
                 ax.plot(z, run.iterations, color=COLORS[color], ls=dash, label=text)
-            ax.set(
-                xlabel="target z, in", title=f"Figure 8: iterations, index $I_{name[1]}$", yscale="log", ylim=(0.8, 900)
-            )
+            ax.set(title=f"Figure 8: iterations, index $I_{name[1]}$", yscale="log", ylim=(0.8, 900))
             ax.legend(loc="upper left")
         axes[0, 0].set_ylabel("iterations to a target")
 
@@ -92,17 +86,11 @@ def _rig(path: Path, results: Results) -> None:
     places = corners(results, table) / INCH
     rows = np.linspace(0, len(places) - 1, 5).astype(int)
     lines = skeleton(results.rig, table.joints[rows])
-    with sheet(path, columns=2, size=(9.0, 3.8), note=NOTE) as (_, axes):
+    with sheet(path, (1, 2), (9.0, 3.8), NOTE) as (_, axes):
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
             for line, row, color in zip(lines, rows, ("blue", "sky", "green", "yellow", "orange"), strict=True):
-                ax.plot(
-                    line[:, i],
-                    line[:, k],
-                    "-o",
-                    ms=3,
-                    color=COLORS[color],
-                    label=f"z = {results.targets[row, 2] / INCH:.1f} in",
-                )
+                label = f"z = {results.targets[row, 2] / INCH:.1f} in"
+                ax.plot(line[:, i], line[:, k], "-o", ms=3, color=COLORS[color], label=label)
             ax.plot(places[:, i], places[:, k], color=COLORS["black"], ls=DASHES[3], label="path of $P_G$")
             center = results.tunnel.center / INCH
             ax.plot(center[i], center[k], "+", ms=10, color=COLORS["black"], label="$P_C$")
@@ -112,11 +100,14 @@ def _rig(path: Path, results: Results) -> None:
         axes[0, 1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def draw_release(folder: Path, results: Results) -> None:
+def _release(folder: Path, results: Results) -> None:
     """The store release: curves, and the rig in motion."""
     found = results.release
     note = f"Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. " + NOTE
-    with sheet(folder / "release.png", rows=2, columns=2, size=(8.2, 5.0), note=note, sharex=True) as (_, axes):
+    with sheet(folder / "release.png", (2, 2), (8.2, 5.0), note, sharex=True, xlabel="time at full size, s") as (
+        _,
+        axes,
+    ):
         move = found.table.targets[:, :3] - found.table.targets[0, :3]
         for k, (label, dash) in enumerate(zip("xyz", DASHES, strict=False)):
             axes[0, 0].plot(found.t, move[:, k] / INCH, ls=dash, label=label)
@@ -129,8 +120,6 @@ def draw_release(folder: Path, results: Results) -> None:
             ax.set_ylabel(label)
             ax.legend(loc="best")
         axes[1, 1].set_ylim(0, None)
-        for ax in axes[1]:
-            ax.set_xlabel("time at full size, s")
     _animate(folder / "release.gif", results)
 
 
@@ -141,7 +130,7 @@ def _animate(path: Path, results: Results) -> None:
     around = surroundings()
     assert around.walls is not None
     wing = around.solids[0]
-    with sheet(None, columns=2, size=(8.0, 3.6)) as (figure, axes):
+    with sheet(None, (1, 2), (8.0, 3.6)) as (figure, axes):
         drawn: list[tuple[Any, Any, Any, Any, int, int]] = []
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
             half = around.walls.size / (2 * INCH)
@@ -160,13 +149,8 @@ def _animate(path: Path, results: Results) -> None:
             drawn.append((rig, store, trail, spot, i, k))
         axes[0, 0].set_title("store release, from the side (blue: $P_G$)")
         axes[0, 1].set_title("from the front")
-        figure.supxlabel(
-            "Store, ejectors, air, walls, wing and link lengths chosen.",
-            x=0.01,
-            ha="left",
-            fontsize=6,
-            color=COLORS["grey"],
-        )
+        chosen = "Store, ejectors, air, walls, wing and link lengths chosen."
+        figure.supxlabel(chosen, x=0.01, ha="left", fontsize=6, color=COLORS["grey"])
         yaw, pitch = found.table.targets[:, 3:].T
         axis = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         length = SCALE * 2.2 / INCH

@@ -7,6 +7,7 @@ the null space. `cts_optimal` has neither fault.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,22 +110,19 @@ def combined(
     step = newton_step(rig, tunnel, rate_weight)
     x, r = ca.SX.sym("target", 5), ca.SX.sym("roll")
     close = ca.Function("close", [x, r], list(inverse(rig, x, r, branch)))
-    joints, counts, done = np.full((len(rows), 6), np.nan), np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
-    roll = start_roll
-    for i, target in enumerate(rows):
-        previous = roll
-        for count in range(1, MOST_STEPS + 1):
-            last, roll = roll, float(step(target, roll, previous)[0])
-            counts[i] = count
-            done[i] = abs(roll - last) < TOLERANCE
-            if done[i] or not np.isfinite(roll):
-                break
+
+    def joints_of(target: Array, roll: float) -> Array:
         found, reach = close(target, roll)
-        if float(ca.mmin(reach)) >= 0:
-            joints[i] = np.array(found).ravel()
-        if not np.isfinite(roll):
-            roll = previous
-    return Run(joints, counts, done)
+        return np.array(found).ravel() if float(ca.mmin(reach)) >= 0 else np.full(6, np.nan)
+
+    return _iterated(
+        rows,
+        start_roll,
+        lambda target, roll, previous: float(step(target, roll, previous)[0]),
+        lambda moved: abs(moved) < TOLERANCE,
+        lambda roll: not np.isfinite(roll),
+        joints_of,
+    )
 
 
 def null_space(
@@ -148,18 +146,37 @@ def null_space(
     rows = checked_targets(targets)
     step = null_space_step(rig, tunnel, rate_weight, gain, unit)
     units = np.array([unit, 1, 1, 1, 1, 1])
+    return _iterated(
+        rows,
+        np.array(checked_array(start, (6,), "null_space", "start")),
+        lambda target, q, before: np.array(step(target, q, before[5])[0]).ravel(),
+        lambda moved: (np.abs(moved) / units).max() < TOLERANCE,
+        lambda q: not np.abs(q).max() < 1e6,
+        lambda target, q: q,
+    )
+
+
+def _iterated(
+    rows: Array,
+    start: Any,
+    step: Callable[[Array, Any, Any], Any],
+    small: Callable[[Any], bool],
+    diverged: Callable[[Any], bool],
+    joints_of: Callable[[Array, Any], Array],
+) -> Run:
+    """Steps (target, state, state before this target) -> state, from the last sound state, until one is small."""
     joints, counts, done = np.full((len(rows), 6), np.nan), np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
-    q = np.array(checked_array(start, (6,), "null_space", "start"))
+    state = start
     for i, target in enumerate(rows):
-        sound, previous = q, q[5]
+        before = state
         for count in range(1, MOST_STEPS + 1):
-            last, q = q, np.array(step(target, q, previous)[0]).ravel()
+            last, state = state, step(target, state, before)
             counts[i] = count
-            done[i] = (np.abs(q - last) / units).max() < TOLERANCE
-            if done[i] or not np.abs(q).max() < 1e6:
+            done[i] = small(state - last)
+            if done[i] or diverged(state):
                 break
-        if np.abs(q).max() < 1e6:
-            joints[i] = q
+        if diverged(state):
+            state = before
         else:
-            q = sound
+            joints[i] = joints_of(target, state)
     return Run(joints, counts, done)

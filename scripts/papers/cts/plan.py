@@ -19,8 +19,6 @@ from ocp import Collocation, solve
 from ocp.builders.cts import roll_problem
 from scripts.drawing import COLORS, DASHES, sheet
 
-__all__ = ["RollPlan", "draw_plan", "plan_summary", "plan_sweep"]
-
 HORIZON = 10.0  # s, the paper's sweep
 RATE_LIMIT, ACCELERATION_LIMIT = 0.37, 0.4  # rad/s, rad/s^2
 RATE_WEIGHT, ACCELERATION_WEIGHT = 0.05, 0.02  # s^2, s^4
@@ -133,7 +131,7 @@ def draw_plan(path: Path, found: RollPlan) -> None:
     )
     names = ("roll", "rate", "index", "clearance")
     labels = ("roll $q_6$, rad", "roll rate, rad/s", "index $I_1$", "clearance of the rig, m")
-    with sheet(path, rows=2, columns=2, size=(8.2, 5.0), note=note, sharex=True) as (_, axes):
+    with sheet(path, (2, 2), (8.2, 5.0), note, sharex=True, xlabel="time, s") as (_, axes):
         for ax, name, label in zip(axes.flat, names, labels, strict=True):
             ax.plot(found.t, getattr(found.single, name), ls=DASHES[1], color=COLORS["orange"], label="each by itself")
             ax.plot(found.t, getattr(found.plan, name), color=COLORS["blue"], label="whole trajectory")
@@ -144,5 +142,3 @@ def draw_plan(path: Path, found: RollPlan) -> None:
         for ax in (axes[0, 0], axes[0, 1], axes[1, 1]):
             ax.legend(loc="best")
         axes[1, 1].set_ylim(0, None)
-        for ax in axes[1]:
-            ax.set_xlabel("time, s")

@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.arrays import Array
 from ocp import Collocation, Indirect, Problem, Solution, certificate, solve
-from scripts.drawing import Row
 from scripts.papers.free_floating.false_optima import INTERVALS, MAX_ITERATIONS, Settled, first_guess, settle, solvers
+from scripts.papers.run import Row
 
-__all__ = ["CONFIRMED", "HORIZONS", "NOT_GLOBAL", "STARTS", "Extremal", "Search", "search", "summary", "table"]
-
-Array: TypeAlias = NDArray[np.float64]
 MakeProblem: TypeAlias = Callable[..., Problem]  # (horizon, guess_damping=...) -> the "rates" formulation
 
 HORIZONS = (3.5, 4.0, 5.0, 6.0)  # s

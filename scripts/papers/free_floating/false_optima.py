@@ -8,16 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.arrays import Array
 from ocp import Collocation, Problem, Solution, prepare
-
-__all__ = ["GUESSES", "HORIZON", "Settled", "Trial", "first_guess", "settle", "solvers", "trials"]
-
-Array: TypeAlias = NDArray[np.float64]
 
 HORIZON = 4.0  # s
 INTERVALS = 50

@@ -1,67 +1,86 @@
-"""Figures of the free-floating paper: 3 to 13, the convergence of the methods, the false optima, the animation."""
+"""Figures of the free-floating paper: 3 to 13, and what makes the plan an optimum.
+
+Convergence of the methods, false optima, costates, Hamiltonian, the extremals at other horizons, the animation.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import matplotlib
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from models import FreeFloating
-from scripts.drawing import COLORS, DASHES, Row, add_note, gif, sheet
+from models.arrays import Array
+from scripts.drawing import COLORS, DASHES, TIME_COLORS, add_note, gif, sheet, time_bar
+from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL, Search
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE, HORIZON, Trial
-from scripts.papers.free_floating.motion import Array, Motion, outline
+from scripts.papers.free_floating.motion import Motion, outline
+from scripts.papers.free_floating.optimality import Agreement, costate_difference, costates, hamiltonians
+from scripts.papers.free_floating.results import ASSUMED, NOTE, Results
+from scripts.papers.run import Row, progress
 
-__all__ = ["draw", "draw_animation", "draw_convergence", "draw_false_optima"]
+Quantity: TypeAlias = tuple[str, Sequence[str], Callable[[Motion], Array]]
+"""Label, names of the columns, and the columns of a motion."""
 
 PLATE = 2.0  # side of the base, m; printed
-VIRIDIS: Any = matplotlib.colormaps["viridis"]
-TIME_COLORS = ListedColormap(VIRIDIS(np.linspace(0.0, 0.88, 256)))  # its yellow is too pale
 STROBE = 0.5  # s between two pictures of the arm
 NAMES = ("pseudo-inverse", "optimum")
 FRAME = 0.05  # s between two frames of the animation
+PARTS = (("base", ("x", "y", "angle")), ("joints", ("joint 1", "joint 2", "joint 3")))
+PALETTE = ("blue", "orange", "green")
+MARKED = 16  # reported points between two markers of the direct solution
+FLOOR = 1e-17  # a logarithm needs more than zero
+BINS = 100
+PANEL, LINE = 170.0, 9.5  # height of the panel of costs, and of a line of its labels, points
 
 
-def draw(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion, note: str) -> None:
-    """Write the figures of both motions, the paper's two of a kind side by side on equal axes."""
+def draw(results: Results, folder: Path) -> None:
+    """Write every figure and the animation."""
+    _motions(folder, results.machine, results.local, results.optimal)
+    _convergence(folder, results.convergence)
+    _false_optima(folder, results.trials)
+    _costates(folder, results.agreement)
+    _hamiltonian(folder, results.agreement)
+    _extremals(folder, results.searches)
+    _animation(folder, results.machine, results.local, results.optimal)
+
+
+def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion) -> None:
+    """The figures of both motions, the paper's two of a kind side by side on equal axes."""
     motions = (local, optimal)
-    with sheet(folder / "fig03_08_motion.png", columns=2, size=(8.2, 5.2), note=note, sharey=True) as (figure, axes):
+    with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.2), NOTE, xlabel="x, m", sharey=True) as (figure, axes):
         for ax, motion, name, number in zip(axes[0], motions, NAMES, (3, 8), strict=True):
             _strobe(ax, machine, motion)
             ax.set_title(f"{name} (figure {number})")
-            ax.set_xlabel("x, m")
         axes[0, 0].set_ylabel("y, m")
         axes[0, 0].legend(loc="lower right")
-        _time_bar(figure, axes, local.t[-1])
-    with sheet(folder / "optimal_motion.png", size=(4.6, 5.4), note=note) as (figure, axes):
+        time_bar(figure, axes, local.t[-1], fraction=0.04, pad=0.02)
+    with sheet(folder / "optimal_motion.png", (1, 1), (4.6, 5.4), NOTE) as (figure, axes):
         _strobe(axes[0, 0], machine, optimal)
         axes[0, 0].set(xlabel="x, m", ylabel="y, m", title="Optimal motion on a free-floating base")
         axes[0, 0].legend(loc="lower right")
-        _time_bar(figure, axes, optimal.t[-1])
+        time_bar(figure, axes, optimal.t[-1], fraction=0.04, pad=0.02)
 
     joints = [f"joint {i + 1}" for i in range(local.joints.shape[1])]
-    _pose(folder / "fig04_09_base_pose.png", motions, (4, 9), lambda m: m.base, ("position, m", "angle, deg"), note)
-    units = ("velocity, m/s", "angular velocity, deg/s")
-    _pose(folder / "fig06_11_base_velocity.png", motions, (6, 11), lambda m: m.base_rates, units, note)
-    kinds: tuple[tuple[str, tuple[int, int], Callable[[Motion], Array], str], ...] = (
-        ("fig05_10_joint_angles.png", (5, 10), lambda m: m.joints, "joint angle, deg"),
-        ("fig07_12_joint_velocity.png", (7, 12), lambda m: m.joint_rates, "joint velocity, deg/s"),
-    )
-    for file, numbers, of, label in kinds:
-        with sheet(folder / file, columns=2, size=(8.2, 3.3), note=note, sharey=True) as (_, axes):
-            for ax, motion, name, number in zip(axes[0], motions, NAMES, numbers, strict=True):
-                _curves(ax, motion.t, np.degrees(of(motion)), joints)
-                ax.set(title=f"{name} (figure {number})", xlabel="time, s")
-            axes[0, 0].set_ylabel(label)
-            axes[0, 0].legend(loc="best")
-
-    with sheet(folder / "fig13_manipulability.png", size=(6.3, 3.4), note=note) as (_, axes):
+    pose: list[Quantity] = [
+        ("position, m", ("x", "y"), lambda m: m.base[:, :2]),
+        ("angle, deg", ("angle",), lambda m: np.degrees(m.base[:, 2:])),
+    ]
+    velocity: list[Quantity] = [
+        ("velocity, m/s", ("x", "y"), lambda m: m.base_rates[:, :2]),
+        ("angular velocity, deg/s", ("angle",), lambda m: np.degrees(m.base_rates[:, 2:])),
+    ]
+    angles: Quantity = ("joint angle, deg", joints, lambda m: np.degrees(m.joints))
+    rates: Quantity = ("joint velocity, deg/s", joints, lambda m: np.degrees(m.joint_rates))
+    _pair(folder / "fig04_09_base_pose.png", motions, (4, 9), 4.6, pose)
+    _pair(folder / "fig06_11_base_velocity.png", motions, (6, 11), 4.6, velocity)
+    _pair(folder / "fig05_10_joint_angles.png", motions, (5, 10), 3.3, [angles])
+    _pair(folder / "fig07_12_joint_velocity.png", motions, (7, 12), 3.3, [rates])
+    with sheet(folder / "fig13_manipulability.png", (1, 1), (6.3, 3.4), NOTE) as (_, axes):
         ax = axes[0, 0]
         for motion, name, color, dash in zip(motions, NAMES, ("orange", "blue"), DASHES[1::-1], strict=True):
             ax.plot(motion.t, motion.manipulability, color=COLORS[color], ls=dash, label=name)
@@ -76,13 +95,14 @@ def draw(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion, no
         ax.legend(loc="best")
 
 
-def draw_convergence(folder: Path, rows: Sequence[Row], note: str) -> None:
+def _convergence(folder: Path, rows: Sequence[Row]) -> None:
     """Distance of the cost from the reference against the number of intervals, one curve a method."""
-    with sheet(folder / "convergence.png", size=(8.2, 3.8), note=note) as (_, axes):
+    with sheet(folder / "convergence.png", (1, 1), (8.2, 3.8), NOTE) as (_, axes):
         ax = axes[0, 0]
         direct = [row for row in rows if row["intervals"] and row["order"]]
         colors = ("blue", "green", "orange", "purple")
-        for method, color, marker, dash in zip(_methods(direct), colors, "osD^", DASHES, strict=True):
+        methods = dict.fromkeys(row["method"] for row in direct)
+        for method, color, marker, dash in zip(methods, colors, "osD^", DASHES, strict=True):
             mine = [row for row in direct if row["method"] == method]
             intervals = [row["intervals"] for row in mine]
             errors = [abs(row["difference"]) for row in mine]
@@ -94,11 +114,12 @@ def draw_convergence(folder: Path, rows: Sequence[Row], note: str) -> None:
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def draw_false_optima(folder: Path, trials: Sequence[Trial], note: str) -> None:
+def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
     """Cost and largest jump of every plan that the solver calls optimal, and what such a jump looks like."""
+    note = f"{ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
     passed = [t for t in trials if t.audit]
     false = sorted((t for t in trials if t.verdict == FALSE), key=lambda t: t.cost)
-    with sheet(folder / "false_optima.png", columns=2, size=(8.2, 3.7), note=note) as (_, axes):
+    with sheet(folder / "false_optima.png", (1, 2), (8.2, 3.7), note) as (_, axes):
         left, right = axes[0]
         kinds = {
             "passes its audit": (passed, "o", "blue"),
@@ -129,17 +150,119 @@ def draw_false_optima(folder: Path, trials: Sequence[Trial], note: str) -> None:
             right.legend(loc="best")
 
 
-def draw_animation(
-    folder: Path,
-    machine: FreeFloating,
-    local: Motion,
-    optimal: Motion,
-    note: str,
-    progress: Callable[[Iterable[float]], Iterable[float]],
-) -> None:
+def _costates(folder: Path, found: Agreement) -> None:
+    """Costates of the direct plan on those of the minimum principle, above their difference."""
+    direct, indirect = found.plan, found.multiple
+    fine = np.linspace(0.0, 1.0, 501)
+    solved, reported = costates(indirect, fine), costates(direct)
+    off = np.abs(costate_difference(direct, indirect))
+    settings: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
+    with sheet(folder / "costates.png", (2, 2), (8.2, 5.4), NOTE, **settings) as (figure, axes):
+        figure.suptitle(
+            "Costates: lines minimum principle, markers direct (Legendre 3, 100 intervals).\n"
+            f"Largest difference, relative to the largest costate: {off.max():.1e}",
+            fontsize=9.5,
+        )
+        for part, (above, below, (title, names)) in enumerate(zip(*axes, PARTS, strict=True)):
+            for i, (name, color, dash) in enumerate(zip(names, PALETTE, DASHES, strict=False)):
+                entry, shade = 3 * part + i, COLORS[color]
+                above.plot(fine * indirect.horizon, solved[:, entry], color=shade, ls=dash, label=name)
+                place = slice(5 * i, None, MARKED)  # not all at the same times: x and y are both zero
+                above.plot(direct.t[place], reported[place, entry], "osD"[i], color=shade, ms=4, mfc="none")
+                if off[:, entry].max() > FLOOR:
+                    below.semilogy(*_tops(direct.t, off[:, entry]), color=shade, ls=dash, label=name)
+            above.set_title(title)
+            above.legend(loc="lower right", ncols=3)
+            below.set_xlabel("time, s")
+            below.set_xlim(0.0, direct.horizon)
+            below.legend(loc="upper right", ncols=3)
+        axes[0, 0].set_ylabel("costate ∂J/∂state, rad$^2$/s\nper m (x, y) or rad")
+        axes[1, 0].set_ylabel(f"|direct − indirect| / largest,\nlargest in every {direct.horizon / BINS:g} s")
+        axes[1, 0].set_ylim(1e-11, 1e-6)
+        text = "x and y are zero: J does not\ndepend on where the machine is"
+        axes[0, 0].text(0.03, 0.92, text, transform=axes[0, 0].transAxes, fontsize=8, va="top")
+
+
+def _hamiltonian(folder: Path, found: Agreement) -> None:
+    """How far H strays from its mean along the solution of every method."""
+    colors = ("black", "purple", "blue", "green", "yellow", "orange", "sky")
+    with sheet(folder / "hamiltonian.png", (1, 1), (8.2, 4.4), NOTE) as (figure, axes):
+        ax = axes[0, 0]
+        for k, ((name, (t, value)), color) in enumerate(zip(hamiltonians(found).items(), colors, strict=True)):
+            mean = value.mean()
+            label = f"{name}\nmean H = {mean:.12f}"
+            dash = DASHES[(k + k // 4) % 4]  # curves that cover each other get different ones
+            ax.semilogy(*_tops(t, np.abs(value - mean)), color=COLORS[color], ls=dash, label=label)
+        ax.set(xlabel="time, s", ylim=(1e-14, 1e-3), xlim=(0, found.plan.horizon))
+        width = found.plan.horizon / BINS
+        ax.set_ylabel(f"|H − its mean|, rad$^2$/s$^2$, largest in every {width:g} s")
+        ax.set_title("The Hamiltonian is constant")
+        figure.legend(loc="outside right center", fontsize=7)
+
+
+def _extremals(folder: Path, searches: Sequence[Search]) -> None:
+    """Cost of every extremal against the horizon, above the joint velocities of the best of each."""
+    note = f"{ASSUMED}; horizons chosen, not printed. {NOT_GLOBAL}."
+    settings: dict[str, Any] = {"sharey": "row", "height_ratios": (5, 4)}
+    columns = len(searches)
+    path = folder / "extremals.png"
+    with sheet(path, (2, columns), (8.2, 5.8), note, **settings) as (figure, axes):
+        grid = axes[0, 0].get_gridspec()
+        for ax in axes[0]:
+            ax.remove()
+        _costs(figure.add_subplot(grid[0, :]), searches)
+        for ax, one in zip(axes[1], searches, strict=True):
+            best = one.best
+            for i, (column, dash) in enumerate(zip(best.joint_rates.T, DASHES, strict=False)):
+                ax.plot(best.t, np.degrees(column), ls=dash, label=f"joint {i + 1}")
+            ax.set(xlim=(0, best.horizon), xlabel="time, s")
+            ax.set_title(f"best found, horizon {best.horizon:g} s\nJ = {best.indirect_cost:.6f}")
+        axes[1, 0].set_ylabel("joint velocity, deg/s")
+        axes[1, -1].legend(loc="best", fontsize=7)
+
+
+def _costs(ax: Any, searches: Sequence[Search]) -> None:
+    """Every extremal's cost against its horizon, with how often it was found."""
+    everything = [e for one in searches for e in one.extremals]
+    kinds = (
+        ("best found", [e for e in everything if e.best], "*", "blue", 11.0),
+        ("other extremals", [e for e in everything if e.verdict == CONFIRMED and not e.best], "o", "sky", 4.5),
+        ("not confirmed by the minimum principle", [e for e in everything if e.verdict != CONFIRMED], "x", "grey", 5.0),
+    )
+    for label, mine, marker, color, size in kinds:
+        if mine:
+            costs = [e.cost for e in mine]
+            ax.semilogy([e.horizon for e in mine], costs, marker, color=COLORS[color], ms=size, label=label)
+    low, high = min(e.cost for e in everything) / 1.15, max(e.cost for e in everything) * 1.2
+    first, last = searches[0].horizon, searches[-1].horizon
+    ax.set(xlim=(first - 0.15, last + 0.45), xticks=[one.horizon for one in searches], ylim=(low, high))
+    marks = [mark for mark in (1, 1.5, 2, 3, 5, 10, 20, 50, 100) if low < mark < high]
+    ax.set_yticks(marks, [f"{mark:g}" for mark in marks])
+    ax.set_yticks([], minor=True)
+    for one in searches:
+        above = -np.inf
+        for e in one.extremals:  # by cost: a label that would cover the one below moves up
+            height = PANEL * np.log(e.cost / low) / np.log(high / low)
+            above = max(height, above + LINE)
+            text, place = f"{e.cost:.5f} ({e.found}×)", (8, above - height)
+            ax.annotate(text, (e.horizon, e.cost), place, textcoords="offset points", fontsize=7.5, va="center")
+    ax.set(xlabel="horizon, s", ylabel="cost J, rad$^2$/s")
+    ax.set_title(f"Extremals from {searches[0].starts} first guesses at each horizon (how often each was found)")
+    ax.legend(loc="upper right")
+
+
+def _tops(t: Array, values: Array) -> tuple[Array, Array]:
+    """The largest value in each of 100 equal parts of the time, and their middles: the values swing from 0 to these."""
+    parts = np.minimum((BINS * t / t[-1] + 1e-9).astype(int), BINS - 1)
+    tops = np.full(BINS, FLOOR)
+    np.maximum.at(tops, parts, values)
+    return (np.arange(BINS) + 0.5) * t[-1] / BINS, tops
+
+
+def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion) -> None:
     """Both motions side by side in real time, above their joint velocities."""
     times = np.arange(0.0, local.t[-1] + FRAME / 2, FRAME)
-    with sheet(None, rows=2, columns=2, size=(5.0, 4.9), sharey="row", height_ratios=(3, 1)) as (figure, axes):
+    with sheet(None, (2, 2), (5.0, 4.9), sharey="row", height_ratios=(3, 1)) as (figure, axes):
         moving = [_animated(axes[:, i], machine, m, NAMES[i]) for i, m in enumerate((local, optimal))]
         axes[0, 0].set_ylabel("y, m")
         axes[1, 0].set_ylabel("joint rates, deg/s")
@@ -147,12 +270,12 @@ def draw_animation(
         names = [f"joint {i + 1}" for i in range(len(curves))]
         axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
-        add_note(figure, note)  # now, not when the block ends: the frames are drawn before
+        add_note(figure, NOTE)  # now, not when the block ends: the frames are drawn before
         figure.canvas.draw()
         figure.set_layout_engine("none")  # as laid out now: nothing that moves changes it, and it takes half the time
 
         def frames() -> Iterator[Figure]:
-            for time in progress(times.tolist()):
+            for time in progress(times.tolist(), "animation"):
                 for show in moving:
                     show(time)
                 title.set_text(f"time {time:.2f} s")
@@ -161,24 +284,18 @@ def draw_animation(
         gif(folder / "motion.gif", frames(), seconds=FRAME)
 
 
-def _pose(
-    path: Path,
-    motions: tuple[Motion, Motion],
-    numbers: tuple[int, int],
-    of: Callable[[Motion], Array],
-    labels: tuple[str, str],
-    note: str,
+def _pair(
+    path: Path, motions: Sequence[Motion], numbers: Sequence[int], height: float, rows: Sequence[Quantity]
 ) -> None:
-    """Two rows of axes: translation above rotation, of both motions."""
-    with sheet(path, rows=2, columns=2, size=(8.2, 4.6), note=note, sharex=True, sharey="row") as (_, axes):
-        for column, motion, name, number in zip(axes.T, motions, NAMES, numbers, strict=True):
-            values = of(motion)
-            _curves(column[0], motion.t, values[:, :2], ["x", "y"])
-            _curves(column[1], motion.t, np.degrees(values[:, 2:]), ["angle"])
-            column[0].set_title(f"{name} (figure {number})")
-            column[1].set_xlabel("time, s")
-        for ax, label in zip(axes[:, 0], labels, strict=True):
-            ax.set_ylabel(label)
+    """Quantities of both motions over time, a row of axes each."""
+    size = (8.2, height)
+    with sheet(path, (len(rows), 2), size, NOTE, xlabel="time, s", sharex=True, sharey="row") as (_, axes):
+        for line, (label, names, of) in zip(axes, rows, strict=True):
+            for ax, motion in zip(line, motions, strict=True):
+                _curves(ax, motion.t, of(motion), names)
+            line[0].set_ylabel(label)
+        for ax, name, number in zip(axes[0], NAMES, numbers, strict=True):
+            ax.set_title(f"{name} (figure {number})")
         axes[0, 0].legend(loc="best")
 
 
@@ -201,15 +318,6 @@ def _strobe(ax: Any, machine: FreeFloating, motion: Motion) -> None:
         ax.plot(*arm.T, "-o", color=color, lw=1.6, ms=3, solid_capstyle="round")
         ax.plot(*arm[-1], "o", color=color, ms=5, markeredgecolor="white", markeredgewidth=0.6, zorder=5)
     ax.set_aspect("equal")
-
-
-def _time_bar(figure: Figure, axes: Any, horizon: float) -> None:
-    scale = ScalarMappable(Normalize(0.0, horizon), TIME_COLORS)
-    figure.colorbar(scale, ax=axes, label="time, s", fraction=0.04, pad=0.02)
-
-
-def _methods(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(str(row["method"]) for row in rows))
 
 
 def _animated(column: Any, machine: FreeFloating, motion: Motion, name: str) -> Callable[[float], None]:

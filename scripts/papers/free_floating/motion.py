@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from models import FreeFloating, centers_of_mass, link_frames
+from models.arrays import Array
 from ocp import Audit, Solution
 from ocp.curves import PiecewisePolynomial, differentiation_matrix
 from ocp.local.rates import LocalSolution, least_rates
-
-__all__ = ["Laws", "Motion", "laws", "momentum", "motion_of_local", "motion_of_plan", "outline", "total_center_of_mass"]
-
-Array: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -54,6 +50,11 @@ class Motion:
         where = np.abs(self.joint_rates).argmax(axis=0)
         return np.asarray(self.joint_accelerations[where, np.arange(len(where))])
 
+    @property
+    def largest_accelerations(self) -> Array:
+        """Of each joint, in size. Shape (n,), rad/s^2."""
+        return np.asarray(np.abs(self.joint_accelerations).max(axis=0))
+
     def at(self, time: float) -> int:
         """Index of the grid time nearest to `time`."""
         return int(np.abs(self.t - time).argmin())
@@ -61,21 +62,15 @@ class Motion:
 
 def motion_of_local(machine: FreeFloating, local: LocalSolution, tip_velocity: Array, rows: Sequence[int]) -> Motion:
     """The pseudo-inverse motion x2' = G# v; its accelerations by differentiating G# v along the motion."""
-    base, joints = _symbols(machine)
-    rates = least_rates(machine.tip_jacobian(base, joints)[list(rows), :], ca.DM(tip_velocity))
-    flow = ca.vertcat(machine.base_rate(base, joints, rates), rates)
-    accelerations = ca.jtimes(rates, ca.vertcat(base, joints), flow)
-    found = _along(ca.Function("accelerations", [base, joints], [accelerations]), local.base, local.joints)
-    return Motion(
-        local.t,
-        local.base,
-        local.joints,
-        local.base_rates,
-        local.joint_rates,
-        found,
-        local.tip_in_world[:, :2],
-        local.manipulability,
-    )
+
+    def accelerations(base: Any, joints: Any) -> Any:
+        rates = least_rates(machine.tip_jacobian(base, joints)[list(rows), :], ca.DM(tip_velocity))
+        flow = ca.vertcat(machine.base_rate(base, joints, rates), rates)
+        return ca.jtimes(rates, ca.vertcat(base, joints), flow)
+
+    places = local.base, local.joints
+    derivatives = local.base_rates, local.joint_rates, _along(accelerations, *places)
+    return Motion(local.t, *places, *derivatives, local.tip_in_world[:, :2], local.manipulability)
 
 
 def motion_of_plan(
@@ -86,20 +81,16 @@ def motion_of_plan(
     The accelerations are those of `extremal`, the same optimum by the minimum principle: the slope of a collocation
     plan's control, a polynomial of degree 2 in every interval, is right to a few digits only.
     """
-    sample = plan.at(times)
-    base, joints = _symbols(machine)
-    jacobian = machine.tip_jacobian(base, joints)[list(rows), :]
-    size = ca.sqrt(ca.det(ca.mtimes(jacobian, jacobian.T)))
-    return Motion(
-        times,
-        sample["base"],
-        sample["joints"],
-        _base_rates(machine, sample["base"], sample["joints"], sample["rates"]),
-        sample["rates"],
-        _derivative(extremal.control_interpolant, extremal.horizon)(times / extremal.horizon),
-        _tip(machine, sample["base"], sample["joints"]),
-        _along(ca.Function("manipulability", [base, joints], [size]), sample["base"], sample["joints"])[:, 0],
-    )
+
+    def manipulability(base: Any, joints: Any) -> Any:
+        jacobian = machine.tip_jacobian(base, joints)[list(rows), :]
+        return ca.sqrt(ca.det(ca.mtimes(jacobian, jacobian.T)))
+
+    base, joints, rates = (plan.at(times)[name] for name in ("base", "joints", "rates"))
+    base_rates = _along(machine.base_rate, base, joints, rates)
+    slopes = _derivative(extremal.control_interpolant, extremal.horizon)(times / extremal.horizon)
+    size = _along(manipulability, base, joints)[:, 0]
+    return Motion(times, base, joints, base_rates, rates, slopes, _tip(machine, base, joints), size)
 
 
 @dataclass(frozen=True)
@@ -122,7 +113,7 @@ def laws(machine: FreeFloating, audit: Audit, tip_velocity: Array) -> Laws:
     base, joints, rates = audit.states["base"], audit.states["joints"], audit.controls["rates"]
     tip, center = _tip(machine, base, joints), total_center_of_mass(machine, base, joints)
     off_the_line = tip - (tip[0] + audit.t[:, None] * tip_velocity)
-    total = momentum(machine, base, joints, _base_rates(machine, base, joints, rates), rates)
+    total = momentum(machine, base, joints, _along(machine.base_rate, base, joints, rates), rates)
     return Laws(
         float(np.linalg.norm(off_the_line, axis=1).max()),
         float(np.abs(total).max()),
@@ -136,27 +127,32 @@ def momentum(machine: FreeFloating, base: Array, joints: Array, base_rates: Arra
     From the placements of the links alone, differentiated along the motion; no Jacobian, no momentum matrix and no
     spatial inertia of `models` takes part. Shape (M, 3), kg m^2/s and kg m/s.
     """
-    symbols = *_symbols(machine), ca.SX.sym("base_rate", machine.base_size), ca.SX.sym("rates", machine.joint_size)
-    configuration, rate = ca.vertcat(*symbols[:2]), ca.vertcat(*symbols[2:])
-    placement = machine.world_from_base(symbols[0])
-    frames = link_frames(machine.robot, symbols[1], placement)
-    centers = centers_of_mass(machine.robot, symbols[1], placement)
-    total: Any = ca.SX(3, 1)
-    for link in machine.robot.links:
-        center, turn = centers[link.name], frames[link.name].rotation
-        velocity = ca.jtimes(center, configuration, rate)
-        spin = ca.dot(turn[:, 1], ca.jtimes(turn[:, 0], configuration, rate))  # y . dx/dt: rotation about z
-        turning = link.mass * (center[0] * velocity[1] - center[1] * velocity[0]) + link.inertia[2, 2] * spin
-        total += ca.vertcat(turning, link.mass * velocity[:2])
-    return _along(ca.Function("momentum", list(symbols), [total]), base, joints, base_rates, joint_rates)
+
+    def total(base: Any, joints: Any, base_rate: Any, rates: Any) -> Any:
+        configuration, rate = ca.vertcat(base, joints), ca.vertcat(base_rate, rates)
+        placement = machine.world_from_base(base)
+        frames = link_frames(machine.robot, joints, placement)
+        centers = centers_of_mass(machine.robot, joints, placement)
+        found: Any = ca.SX(3, 1)
+        for link in machine.robot.links:
+            center, turn = centers[link.name], frames[link.name].rotation
+            velocity = ca.jtimes(center, configuration, rate)
+            spin = ca.dot(turn[:, 1], ca.jtimes(turn[:, 0], configuration, rate))  # y . dx/dt: rotation about z
+            turning = link.mass * (center[0] * velocity[1] - center[1] * velocity[0]) + link.inertia[2, 2] * spin
+            found += ca.vertcat(turning, link.mass * velocity[:2])
+        return found
+
+    return _along(total, base, joints, base_rates, joint_rates)
 
 
 def total_center_of_mass(machine: FreeFloating, base: Array, joints: Array) -> Array:
     """Centre of mass of the whole machine in world, which stands still while the momentum is zero. Shape (M, 2), m."""
-    symbols = _symbols(machine)
-    centers = centers_of_mass(machine.robot, symbols[1], machine.world_from_base(symbols[0]))
-    moment = sum(link.mass * centers[link.name] for link in machine.robot.links)
-    return _along(ca.Function("center", list(symbols), [moment / machine.robot.total_mass]), base, joints)[:, :2]
+
+    def center(base: Any, joints: Any) -> Any:
+        centers = centers_of_mass(machine.robot, joints, machine.world_from_base(base))
+        return sum(link.mass * centers[link.name] for link in machine.robot.links) / machine.robot.total_mass
+
+    return _along(center, base, joints)[:, :2]
 
 
 def outline(machine: FreeFloating, plate: float) -> Callable[[Array, Array], tuple[Array, Array]]:
@@ -170,7 +166,7 @@ def outline(machine: FreeFloating, plate: float) -> Callable[[Array, Array], tup
         Function whose results are the corners of the base, first one repeated, shape (5, 2), and the arm from its
         mount over the joints to the tip, shape (n + 1, 2).
     """
-    symbols = _symbols(machine)
+    symbols = ca.SX.sym("base", machine.base_size), ca.SX.sym("joints", machine.joint_size)
     placement = machine.world_from_base(symbols[0])
     corners = plate / 2 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1], [0, 0, 0, 0, 0]])
     square = ca.horzcat(*(placement.point(ca.DM(corner)) for corner in corners.T))
@@ -187,24 +183,15 @@ def outline(machine: FreeFloating, plate: float) -> Callable[[Array, Array], tup
     return draw
 
 
-def _symbols(machine: FreeFloating) -> tuple[Any, Any]:
-    return ca.SX.sym("base", machine.base_size), ca.SX.sym("joints", machine.joint_size)
+def _tip(machine: FreeFloating, base: Array, joints: Array) -> Array:
+    """Tip at M samples. Shape (M, 2), m."""
+    return _along(lambda b, q: machine.tip_pose(b, q).position[:2], base, joints)
 
 
-def _base_rates(machine: FreeFloating, *motion: Array) -> Array:
-    """Derivative of the base configuration at M samples of (base, joints, joint rates). Shape (M, 3)."""
-    symbols = *_symbols(machine), ca.SX.sym("rates", machine.joint_size)
-    return _along(ca.Function("base_rates", list(symbols), [machine.base_rate(*symbols)]), *motion)
-
-
-def _tip(machine: FreeFloating, *configuration: Array) -> Array:
-    """Tip at M samples of (base, joints). Shape (M, 2), m."""
-    symbols = _symbols(machine)
-    return _along(ca.Function("tip", list(symbols), [machine.tip_pose(*symbols).position[:2]]), *configuration)
-
-
-def _along(function: Any, *samples: Array) -> Array:
-    """A casadi function at M samples of its arguments, each (M, n). Shape (M, m)."""
+def _along(of: Callable[..., Any], *samples: Array) -> Array:
+    """An expression of symbols at M samples of them, each (M, n). Shape (M, m)."""
+    symbols = [ca.SX.sym(f"x{k}", sample.shape[1]) for k, sample in enumerate(samples)]
+    function = ca.Function("along", symbols, [of(*symbols)])
     return np.array(function.map(len(samples[0]))(*(sample.T for sample in samples))).T
 
 

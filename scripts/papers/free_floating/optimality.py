@@ -12,23 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from models.arrays import Array
 from ocp import Certificate, Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
-from scripts.drawing import Row
-from scripts.papers.free_floating.motion import Array
-
-__all__ = [
-    "BACKWARD",
-    "FORWARD",
-    "PLAN",
-    "SECOND_OPINION",
-    "Agreement",
-    "agreement",
-    "certificate_rows",
-    "costate_difference",
-    "costates",
-    "hamiltonians",
-    "indirect_summary",
-]
+from scripts.papers.run import Row
 
 PLAN = Collocation(100, degree=3, scheme="legendre")
 RADAU = Collocation(100, degree=3, scheme="radau")

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from models import FreeFloating, paper_example
+from models.arrays import Array
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.local.rates import resolve
-from scripts.drawing import Row
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating.extremals import Search
 from scripts.papers.free_floating.false_optima import Trial
-from scripts.papers.free_floating.motion import Array, Laws, Motion, laws, motion_of_local, motion_of_plan
+from scripts.papers.free_floating.motion import Laws, Motion, laws, motion_of_local, motion_of_plan
 from scripts.papers.free_floating.optimality import BACKWARD, Agreement, agreement
-
-__all__ = ["Results", "compute", "problem", "progress", "pseudo_inverse"]
-
-Item = TypeVar("Item")
+from scripts.papers.run import Row, progress
 
 ROWS = (3, 4)  # the task: linear velocity of the tip in the plane, its orientation free
 TIP_VELOCITY = np.array([-1.0, -1.0])  # m/s, printed
@@ -39,15 +35,9 @@ ASSUMED = (
 CHOSEN = f"horizon {HORIZON:g} s (chosen, not printed)"
 NOTE = f"{ASSUMED}; {CHOSEN}."
 
-PAPER_PEAKS = {
-    "pseudo-inverse": (157.8240, 69.7189, -113.5345),
-    "optimum": (70.4688, -22.0748, -98.1823),
-}
+PAPER_PEAKS = {"pseudo-inverse": (157.8240, 69.7189, -113.5345), "optimum": (70.4688, -22.0748, -98.1823)}
 """Table 1, deg/s."""
-PAPER_ACCELERATIONS = {
-    "pseudo-inverse": (-154757.4, -14153.14, 148085.1),
-    "optimum": (-811.6214, 136.2558, -296.0277),
-}
+PAPER_ACCELERATIONS = {"pseudo-inverse": (-154757.4, -14153.14, 148085.1), "optimum": (-811.6214, 136.2558, -296.0277)}
 """Table 2, at the instant of the peak velocity, deg/s^2."""
 
 CAVEATS = {
@@ -99,6 +89,11 @@ class Results:
     sensitivity: list[Row]
     trials: list[Trial]
     searches: list[Search]
+
+    @property
+    def tabled(self) -> Mapping[str, Motion]:
+        """The motions of Tables 1 and 2, by method."""
+        return {"pseudo-inverse": self.near_peaks, "optimum": self.optimal}
 
 
 def problem(horizon: float = HORIZON, **settings: Any) -> Problem:
@@ -161,12 +156,6 @@ def convergence(rates: Problem, null_space: Problem, known: Agreement) -> list[R
         name = f"minimum principle, {shooting} shooting"
         rows.append(_convergence_row(name, BACKWARD.segments, 0, found, reference))
     return rows
-
-
-def progress(items: Iterable[Item], title: str, total: int | None = None) -> Iterable[Item]:
-    """The items, with a bar on the terminal while they are worked through."""
-    bar: Iterable[Item] = tqdm(items, title, total, leave=False, disable=None)
-    return bar
 
 
 def sensitivity() -> list[Row]:

@@ -12,11 +12,10 @@ from matplotlib.figure import Figure
 
 from models.machines.standing_motion import StandingMotion
 from scripts.drawing import COLORS, add_note, gif, sheet
+from scripts.papers.run import progress
 from scripts.papers.standing.cases import ASSUMED, HORIZON, Local, machine
 from scripts.papers.standing.drawing import arm_points, axes_frame, foot, nearest
 from scripts.papers.standing.plans import LIFT_SETTINGS, SETTINGS, Plan
-
-__all__ = ["draw_animations"]
 
 SYMBOLS = "◆ zero moment point, + centre of mass, grey: the foot; orange: from where the motion fails."
 DPI = 110
@@ -38,10 +37,7 @@ class Scene:
 
 
 def draw_animations(
-    folder: Path,
-    local: Mapping[str, Mapping[str, Local]],
-    plans: Mapping[str, Mapping[str, Plan]],
-    progress: Callable[[Iterable[float]], Iterable[float]],
+    folder: Path, local: Mapping[str, Mapping[str, Local]], plans: Mapping[str, Mapping[str, Plan]]
 ) -> None:
     """Table 1 in real time, and the fastest lifts ten times slowed down."""
     one, best = local["table1"], plans["table1"]
@@ -49,7 +45,7 @@ def draw_animations(
     scenes = [_scene(title, one[name]) for name, title in names.items()]
     scenes.append(Scene("optimal, in the foot", best["optimal_range"].motion))
     times = np.arange(0.0, HORIZON + FRAME / 2, FRAME)
-    _animate(folder / "motion.gif", scenes, progress(times.tolist()), FRAME, f"{SYMBOLS} {ASSUMED}. {SETTINGS}.")
+    _animate(folder / "motion.gif", scenes, times.tolist(), FRAME, f"{SYMBOLS} {ASSUMED}. {SETTINGS}.")
     scenes = [
         Scene(f"{plan.request.title}\n{plan.solution.horizon:.3f} s", plan.motion, *_tips(plan.motion))
         for plan in plans["minimum_time"].values()
@@ -57,7 +53,7 @@ def draw_animations(
     last = max(scene.motion.t[-1] for scene in scenes)
     times = np.append(np.arange(0.0, last, LIFT_FRAME), last)
     note = f"{SLOWER:g} times slower than it is. {SYMBOLS} {ASSUMED}. {LIFT_SETTINGS}."
-    _animate(folder / "lift.gif", scenes, progress(times.tolist()), SLOWER * LIFT_FRAME, note)
+    _animate(folder / "lift.gif", scenes, times.tolist(), SLOWER * LIFT_FRAME, note)
 
 
 def _scene(title: str, found: Local) -> Scene:
@@ -78,7 +74,7 @@ def _tips(motion: StandingMotion) -> tuple[str, float]:
 def _animate(path: Path, scenes: Sequence[Scene], times: Iterable[float], seconds: float, note: str) -> None:
     """What stands still is drawn once, as the background of a figure that holds what moves."""
     size = (1.75 * len(scenes) + 1.1, 4.5)
-    with sheet(None, rows=2, columns=len(scenes), size=size, sharey="row", height_ratios=(2.6, 1)) as (figure, axes):
+    with sheet(None, (2, len(scenes)), size, sharey="row", height_ratios=(2.6, 1)) as (figure, axes):
         figure.set_dpi(DPI)
         last = max(scene.motion.t[-1] for scene in scenes)
         for (above, below), scene in zip(axes.T, scenes, strict=True):
@@ -99,7 +95,7 @@ def _animate(path: Path, scenes: Sequence[Scene], times: Iterable[float], second
         title = front.text(0.5, 0.985, "", ha="center", va="top", fontsize=9)
 
     def frames() -> Iterator[Figure]:
-        for time in times:
+        for time in progress(times, "animation"):
             for show in moving:
                 show(time)
             title.set_text(f"time {time:.2f} s")

@@ -17,7 +17,7 @@ from models.papers import STANDING_STARTS, standing_example
 from ocp.builders.standing import motion_cost
 from ocp.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from ocp.tasks.tip_task import TipTask
-from scripts.drawing import Row
+from scripts.papers.run import Row
 from scripts.papers.standing.printed import printed_law
 
 __all__ = [

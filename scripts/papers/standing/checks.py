@@ -6,7 +6,7 @@ import numpy as np
 
 from models.machines.standing_motion import StandingMotion
 from ocp.builders.standing import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
-from scripts.drawing import Row
+from scripts.papers.run import Row
 from scripts.papers.standing.cases import machine
 from scripts.papers.standing.plans import FINER, LIFT_LIMITS, LIMITS, METHOD_NAMES, Plan
 

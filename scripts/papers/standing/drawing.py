@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
-import matplotlib
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
-from matplotlib.figure import Figure
 
 from models.machines.standing_motion import StandingMotion
 from models.robot.kinematics import link_frames
-from scripts.drawing import COLORS, DASHES
+from scripts.drawing import COLORS, DASHES, TIME_COLORS
 from scripts.papers.standing.cases import Array, Local, machine
 from scripts.papers.standing.plans import Plan
 
-__all__ = [
-    "Curve",
-    "arm_points",
-    "axes_frame",
-    "curve_of",
-    "curves",
-    "foot",
-    "lowest_point",
-    "nearest",
-    "strobe",
-    "time_bar",
-]
+Quantity: TypeAlias = tuple[str, Callable[[StandingMotion], Array], tuple[float, float] | None]
+"""Label, the quantity of a motion at its times, and the ends of the axis."""
 
-VIRIDIS: Any = matplotlib.colormaps["viridis"]
-TIME_COLORS = ListedColormap(VIRIDIS(np.linspace(0.0, 0.88, 256)))  # its yellow is too pale
 POSES = 9
 FRAME = ((-0.5, 0.86), (-0.3, 1.4))  # y and z of the pictures, m
 
@@ -80,6 +64,15 @@ def curves(ax: Any, shown: Sequence[Curve], of: Callable[[StandingMotion], Array
             if time is not None:
                 k = nearest(t, time)
                 ax.plot(t[k], values[k], marker, color=one.color, ms=6, mec="white", mew=0.5, zorder=5)
+    return lines
+
+
+def diagrams(axes: Iterable[Any], shown: Sequence[Curve], quantities: Iterable[Quantity], end: float) -> list[Any]:
+    """A quantity of every motion in each of the axes, from 0 to `end`, s; the lines of the last, for a legend."""
+    lines: list[Any] = []
+    for ax, (label, of, ends) in zip(axes, quantities, strict=True):
+        lines = curves(ax, shown, of)
+        ax.set(ylabel=label, xlim=(0.0, end), **({"ylim": ends} if ends else {}))
     return lines
 
 
@@ -134,9 +127,3 @@ def strobe(ax: Any, motion: StandingMotion, until: float, horizon: float) -> Non
         ax.plot(motion.center_of_mass[k, 1], motion.center_of_mass[k, 2], "+", color=color, ms=6, mew=1.2, zorder=6)
         ax.plot(motion.zero_moment_point[k, 1], 0.0, "D", color=color, ms=3.6, mec="white", mew=0.4, zorder=7)
     axes_frame(ax)
-
-
-def time_bar(figure: Figure, axes: Any, horizon: float) -> None:
-    """The colours of the postures."""
-    scale = ScalarMappable(Normalize(0.0, horizon), TIME_COLORS)
-    figure.colorbar(scale, ax=axes, label="time, s", fraction=0.03, pad=0.01)

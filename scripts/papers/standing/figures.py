@@ -1,25 +1,24 @@
-"""Figures 4, 5, 6, 7, 9, 10 and 11 of the standing paper: the local laws as far as they go, and the optimal plans."""
+"""Figures 4 to 11 of the standing paper: the local laws as far as they go; the optimal plans, the lift, convergence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from models.machines.standing_motion import StandingMotion
-from scripts.drawing import COLORS, sheet
-from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS, HORIZON, STIFFNESS, Array, Local, start_tip
-from scripts.papers.standing.drawing import Curve, curve_of, curves, strobe, time_bar
-from scripts.papers.standing.plans import SETTINGS, Plan
+from scripts.drawing import COLORS, sheet, time_bar
+from scripts.papers.run import Row
+from scripts.papers.standing.animation import draw_animations
+from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS, HORIZON, STIFFNESS, Local, machine, start_tip
+from scripts.papers.standing.drawing import Curve, Quantity, curve_of, curves, diagrams, strobe
+from scripts.papers.standing.plans import LIFT_LIMITS, LIFT_SETTINGS, SETTINGS, Plan
+from scripts.papers.standing.results import Results
 
-__all__ = ["draw"]
-
-MARKS = "▼ lifts off, ✖ a joint passes 20 rad/s; past the ▼ the law is shown as if the foot were fastened"
 SYMBOLS = "○ tip, + centre of mass, ◆ zero moment point, grey bar: the foot, | in it: most stable point"
-Quantity = tuple[str, Callable[[StandingMotion], Array], tuple[float, float]]
-
+MARKS = "▼ lifts off, ✖ a joint passes 20 rad/s; past the ▼ the law is shown as if the foot were fastened"
 INDEX: Quantity = ("stability index", lambda m: m.index[:, 1], (-5.7, 1.6))
 NEAR: Quantity = ("stability index", lambda m: m.index[:, 1], (0.2, 1.1))
 FORCE: Quantity = ("vertical ground force, N", lambda m: m.ground_force[:, 2], (-600.0, 1300.0))
@@ -27,14 +26,23 @@ LIMIT_INDEX: Quantity = ("joint-limit index p1", lambda m: m.joint_limit_index, 
 MANIPULABILITY: Quantity = ("manipulability p2, m²", lambda m: m.manipulability, (0.15, 0.85))
 
 
-def draw(
-    folder: Path, local: Mapping[str, Mapping[str, Local]], plans: Mapping[str, Mapping[str, Plan]], weight: float
-) -> None:
-    """Write the figures of the paper."""
-    one, best = local["table1"], plans["table1"]
+ZMP: Quantity = ("zero moment point y, m", lambda m: m.zero_moment_point[:, 1], None)
+STYLES = {
+    "no ZMP rule": ("sky", 1),
+    "in the foot less 0.02 m": ("blue", 0),
+    "index ≥ 0.5": ("green", 2),
+    "index ≥ 0.9": ("purple", 1),
+    "pinned at 0": ("black", 3),
+}
+"""Colour and line style by title."""
+
+
+def draw(results: Results, folder: Path) -> None:
+    """Write the figures of the paper, those of the plans and the animations."""
+    one, best = results.local["table1"], results.plans["table1"]
     pinned = curve_of(best["optimal_pinned_points"], "black", 3)
-    in_range = curve_of(best["optimal_range"], "sky", 0)
-    plain = curve_of(one["augmented"], "blue", 0)
+    in_range = curve_of(best["optimal_range"], "blue", 0)
+    plain = curve_of(one["augmented"], "yellow", 0)
     _compared(
         folder / "fig04_zmp_index.png",
         "figure 4",
@@ -47,8 +55,8 @@ def draw(
             in_range,
         ],
         (INDEX, FORCE),
-        f"{ASSUMED}. {GAINS}. {SETTINGS}. Weight {weight:.1f} N. Pinning the zero moment point leaves an inverted "
-        "pendulum: its index is 1 by construction, and it falls.",
+        f"{ASSUMED}. {GAINS}. {SETTINGS}. Weight {machine().weight:.1f} N. Pinning the zero moment point leaves an "
+        "inverted pendulum: its index is 1 by construction, and it falls.",
     )
     _compared(
         folder / "fig05_joint_limits.png",
@@ -65,25 +73,26 @@ def draw(
         f"{ASSUMED}. {CHOSEN}; others in layers.csv fall as well. {SETTINGS}.",
     )
     _draw_motions(folder, one, best)
-    _draw_spring(folder, local["table2"], plans["table2"])
+    _draw_spring(folder, results.local["table2"], results.plans["table2"])
+    _draw_plans(folder, results.plans)
+    _draw_convergence(folder, results.convergence)
+    draw_animations(folder, results.local, results.plans)
 
 
 def _compared(path: Path, title: str, shown: Sequence[Curve], quantities: Sequence[Quantity], note: str) -> None:
     """Quantities in rows, the first moments beside the whole motion."""
     last = max(one.diverges or 0.0 for one in shown)
     size = (8.4, 2.1 + 1.75 * len(quantities))
-    with sheet(path, rows=len(quantities), columns=2, size=size, note=f"{note} {MARKS}.", sharey="row") as (fig, axes):
-        for row, (label, of, ends) in zip(axes, quantities, strict=True):
-            for ax, end in zip(row, (1.1 * last, HORIZON), strict=True):
-                lines = curves(ax, shown, of)
-                ax.set(xlim=(0.0, end), ylim=ends)
-                if label.startswith("vertical"):
-                    ax.axhspan(ends[0], 0.0, color=COLORS["orange"], alpha=0.12, lw=0)
-            row[0].set_ylabel(label)
+    with sheet(path, (len(quantities), 2), size, f"{note} {MARKS}.", sharey="row", xlabel="time, s") as (fig, axes):
+        for column, end in zip(axes.T, (1.1 * last, HORIZON), strict=True):
+            lines = diagrams(column, shown, quantities, end)
+        for ax in axes[:, 1]:
+            ax.set_ylabel("")
+        for row, quantity in zip(axes, quantities, strict=True):
+            for ax in row if quantity is FORCE else ():
+                ax.axhspan(ax.get_ylim()[0], 0.0, color=COLORS["orange"], alpha=0.12, lw=0)
         axes[0, 0].set_title(f"{title}: as the local laws fail")
         axes[0, 1].set_title("the whole motion")
-        for ax in axes[-1]:
-            ax.set_xlabel("time, s")
         fig.legend(handles=lines, loc="outside upper left", ncols=2)
 
 
@@ -104,14 +113,12 @@ def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Pla
     for name, head in (("optimal_pinned_points", "optimal, pinned at 0"), ("optimal_range", "optimal, in the foot")):
         pictures.append((head, "stands to the end", best[name].motion, HORIZON))
     note = f"{SYMBOLS}. Only joint limits keep the arm out of the ground. {ASSUMED}. {CHOSEN}. {GAINS}. {SETTINGS}."
-    with sheet(folder / "fig07_motions.png", rows=2, columns=4, size=(9.4, 6.9), note=note, sharey=True) as (fig, axes):
+    with sheet(folder / "fig07_motions.png", (2, 4), (9.4, 6.9), note, sharey=True, xlabel="y, m") as (fig, axes):
         for ax, (head, verdict, motion, until) in zip(axes.flat, pictures, strict=True):
             strobe(ax, motion, until, HORIZON if until == HORIZON else until)
             ax.set_title(f"{head}\n{verdict}", fontsize=8.5)
         for ax in axes[:, 0]:
             ax.set_ylabel("z, m")
-        for ax in axes[1]:
-            ax.set_xlabel("y, m")
         time_bar(fig, axes, 1.0)
         fig.axes[-1].set_ylabel("share of the time shown: to the end, or until it diverges")
         fig.suptitle("figure 7: motions of Table 1", fontsize=9.5)
@@ -126,7 +133,7 @@ def _short(found: Local) -> str:
 def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan]) -> None:
     plan, pinned = best["optimal_spring"], best["optimal_spring_pinned_points"]
     rest = start_tip(2)[1]
-    with sheet(folder / "fig09_spring.png", columns=2, size=(8.2, 3.2), note=f"{ASSUMED}.") as (_, axes):
+    with sheet(folder / "fig09_spring.png", (1, 2), (8.2, 3.2), f"{ASSUMED}.") as (_, axes):
         left, right = axes[0]
         motion = plan.motion
         left.plot(motion.tip_in_world[:, 1] - rest, motion.external_force[:, 1], color=COLORS["blue"])
@@ -140,25 +147,21 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         f"{SYMBOLS}. {ASSUMED}. The caption and the text of the figure differ in whether the spring pulls: both shown. "
         "The index falls below 0 at ±0.1 m although the foot reaches 0.2 m."
     )
-    with sheet(folder / "fig10_no_zmp.png", columns=2, size=(8.2, 4.4), note=note) as (fig, axes):
+    with sheet(folder / "fig10_no_zmp.png", (1, 2), (8.2, 4.4), note) as (fig, axes):
         left, right = axes[0]
         strobe(left, free.motion, HORIZON, HORIZON)
         left.set(xlabel="y, m", ylabel="z, m", title="figure 10: pseudo-inverse, without the ZMP law")
         time_bar(fig, [left], HORIZON)
-        curves(right, [curve_of(free, "orange", 0), curve_of(bound, "blue", 1)], lambda m: m.index[:, 1])
+        curves(right, [curve_of(free, "orange", 0), curve_of(bound, "yellow", 1)], lambda m: m.index[:, 1])
         right.axhline(0.0, color=COLORS["grey"], lw=0.8)
         right.set(xlabel="time, s", ylabel="stability index", xlim=(0.0, HORIZON), ylim=(-8.4, 3.4))
         right.legend(loc="upper left", fontsize=7.5)
 
     held, upright = two["augmented_spring"], two["stabilised_spring"]
-    shown = [
-        curve_of(held, "blue", 0),
-        curve_of(upright, "green", 1),
-        curve_of(pinned, "black", 3),
-        curve_of(plan, "sky", 0),
-    ]
+    laws = [curve_of(held, "yellow", 0), curve_of(upright, "green", 1)]
+    shown = [*laws, curve_of(pinned, "black", 3), curve_of(plan, "blue", 0)]
     note = f"{SYMBOLS}. {MARKS}. {ASSUMED}. {GAINS}. {SETTINGS}."
-    with sheet(folder / "fig11_spring.png", rows=2, columns=3, size=(9.2, 7.4), note=note) as (fig, axes):
+    with sheet(folder / "fig11_spring.png", (2, 3), (9.2, 7.4), note, xlabel="time, s") as (fig, axes):
         pictures: tuple[tuple[str, Any, float], ...] = (
             (f"(a) augmented law\n{_short(held)}", held.shown, held.diverges or HORIZON),
             ("optimal, pinned at 0\nstands to the end", pinned.motion, HORIZON),
@@ -171,14 +174,101 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         axes[0, 0].set_ylabel("z, m")
         time_bar(fig, list(axes[0]), 1.0)
         fig.axes[-1].set_ylabel("share of the time shown")
-        kinds: tuple[tuple[str, Callable[[StandingMotion], Array], tuple[float, float] | None], ...] = (
-            ("(b) stability index", lambda m: m.index[:, 1], (0.2, 1.1)),
-            ("vertical ground force, N", lambda m: m.ground_force[:, 2], (-600.0, 1300.0)),
-            ("(c) force of the spring, N", lambda m: m.external_force[:, 1], None),
-        )
-        for ax, (label, of, ends) in zip(axes[1], kinds, strict=True):
-            lines = curves(ax, shown, of)
-            ax.set(xlabel="time, s", ylabel=label, xlim=(0.0, HORIZON), ylim=ends)
+        index: Quantity = ("(b) stability index", *NEAR[1:])
+        spring: Quantity = ("(c) force of the spring, N", lambda m: m.external_force[:, 1], None)
+        lines = diagrams(axes[1], shown, (index, FORCE, spring), HORIZON)
         fig.legend(handles=lines, loc="outside upper left", ncols=2)
         largest = float(np.abs(plan.motion.external_force[:, 1]).max())
         axes[1, 2].set_title(f"figure 11: at most {largest:.0f} N")
+
+
+def _draw_plans(folder: Path, plans: Mapping[str, Mapping[str, Plan]]) -> None:
+    """Write the figures of the plans of each task."""
+    for task in ("table1", "table2"):
+        drawn = [plan for plan in plans[task].values() if plan.request.drawn]
+        shown = [curve_of(plan, *STYLES[plan.request.title]) for plan in drawn]
+        _draw_task(folder / f"optimal_{task}.png", f"Table {task[-1]}", shown)
+    _draw_lift(folder, plans["minimum_time"])
+
+
+def _draw_task(path: Path, title: str, shown: Sequence[Curve]) -> None:
+    kinds: tuple[Quantity, ...] = (
+        ZMP,
+        ("fastest joint, rad/s", lambda m: np.abs(m.joint_velocities).max(axis=1), None),
+        ("joint-limit index p1", lambda m: m.joint_limit_index, None),
+        ("manipulability p2, m²", lambda m: m.manipulability, None),
+    )
+    title = f"{title} by optimal control; grey: the foot"
+    _four(path, title, f"{ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
+
+
+def _four(
+    path: Path,
+    title: str,
+    note: str,
+    shown: Sequence[Curve],
+    kinds: Sequence[Quantity],
+    end: float,
+    legend_columns: int,
+) -> None:
+    """Four quantities of every motion, the first of them the zero moment point over the foot."""
+    with sheet(path, (2, 2), (8.4, 5.8), note, xlabel="time, s") as (fig, axes):
+        lines = diagrams(axes.flat, shown, kinds, end)
+        edges = machine().support.vertices[:, 1]
+        axes[0, 0].axhspan(edges.min(), edges.max(), color=COLORS["grey"], alpha=0.15, lw=0, zorder=0)
+        axes[0, 0].set_title(title)
+        fig.legend(handles=lines, loc="outside upper left", ncols=legend_columns)
+
+
+def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
+    shown = []
+    for plan in lifts.values():
+        line = curve_of(plan, *STYLES[plan.request.title])
+        shown.append(Curve(f"{line.label}: {plan.solution.horizon:.4f} s", line.motion, line.color, line.dash))
+    longest = max(one.motion.t[-1] for one in shown)
+    effort = LIFT_LIMITS.bounds(machine()).torque
+    kinds: tuple[Quantity, ...] = (
+        ZMP,
+        ("tip height, m", lambda m: m.tip_in_world[:, 2], None),
+        ("largest share of a torque limit", lambda m: np.abs(m.joint_torques / effort).max(axis=1), (0.0, 1.05)),
+        ("vertical ground force, N", lambda m: m.ground_force[:, 2], None),
+    )
+    note = f"{ASSUMED}. {LIFT_SETTINGS}. Local optima."
+    _four(folder / "minimum_time.png", "the fastest lift of 0.8 m; grey: the foot", note, shown, kinds, longest, 2)
+    note = f"{SYMBOLS}. {note}"
+    with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.5), note, sharey=True) as (fig, axes):
+        for ax, plan in zip(axes[0], lifts.values(), strict=True):
+            strobe(ax, plan.motion, plan.solution.horizon, longest)
+            ax.set_title(f"{plan.request.title}: {plan.solution.horizon:.4f} s")
+            ax.set_xlabel("y, m")
+        axes[0, 0].set_ylabel("z, m")
+        time_bar(fig, axes, longest)
+
+
+def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
+    """Distance of the cost from the finest mesh against the number of intervals."""
+    kinds = {"table1": "Table 1", "table2": "Table 2", "minimum_time": "lift"}
+    names = {(row["task"], row["plan"]): None for row in rows}
+    colors = ("sky", "green", "black", "blue", "orange", "purple", "yellow")
+    note = (
+        "Costs against those of Legendre 3 at 40 intervals; lifts (cost T + 1e-5 ∫|q''|² dt) against held ones at 100. "
+        "Held accelerations converge with about the first order where a constraint of the ground is active."
+    )
+    with sheet(folder / "convergence.png", (1, 1), (8.4, 3.9), note) as (_, axes):
+        ax = axes[0, 0]
+        for (task, plan), color in zip(names, colors, strict=True):
+            for marker, dash, method in (("o", "-", "held"), ("s", "--", "points")):
+                mine = [
+                    (row["intervals"], abs(row["percent"]))
+                    for row in rows
+                    if (row["task"], row["plan"]) == (task, plan) and method in row["method"] and row["difference"]
+                ]
+                if mine:
+                    label = f"{kinds[task]}, {plan.removeprefix('optimal_').replace('_', ' ')}, {method}"
+                    x, y = zip(*mine, strict=True)
+                    ax.loglog(x, y, marker=marker, ms=4.5, color=COLORS[color], ls=dash, label=label)
+        ax.axhline(1.0, color=COLORS["grey"], lw=0.8)
+        ax.set_xticks([10, 20, 40, 80, 160], ["10", "20", "40", "80", "160"])
+        ax.set_xticks([], minor=True)
+        ax.set(xlabel="intervals", ylabel="cost off by, %", title="Convergence of the cost; grey line: 1 %")
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)

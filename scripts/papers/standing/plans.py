@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -24,7 +24,7 @@ from ocp.builders.standing import (
 )
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import TipTask
-from scripts.drawing import Row
+from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 
 __all__ = [
@@ -192,9 +192,7 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
     return standing_motion(machine(), times, q, qd, qdd, external, ROWS), progress
 
 
-def convergence_rows(
-    plans: Mapping[str, Mapping[str, Plan]], progress: Callable[[Iterable[Any]], Iterable[Any]]
-) -> list[Row]:
+def convergence_rows(plans: Mapping[str, Mapping[str, Plan]]) -> list[Row]:
     """Cost by mesh and transcription, and its distance from that of the finest Legendre mesh."""
     work: list[tuple[str, str, Transcription, int]] = []
     for task, key in CONVERGING:
@@ -202,7 +200,7 @@ def convergence_rows(
     work += [("minimum_time", key, "held", n) for key in PLANS["minimum_time"] for n in LIFT_MESHES]
     known = {(p.request.task, p.request.rule, p.request.transcription, p.request.intervals): p for p in _all(plans)}
     costs: dict[tuple[str, str, Transcription, int], float] = {}
-    for item in progress(work):
+    for item in progress(work, "convergence"):
         task, key, kind, intervals = item
         rule = PLANS[task][key].rule
         request = Request(PLANS[task][key].task, "", rule, kind, intervals)

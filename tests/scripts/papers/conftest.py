@@ -1,28 +1,29 @@
-"""Runs that several test modules read: each script runs once a session."""
+"""The run of a paper's script that its tests read: each script runs once a session."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from scripts import free_floating
-from scripts.papers.free_floating import results as free_floating_results
-from scripts.papers.free_floating.results import Results
-from tests.scripts.papers.free_floating_run import Run
+from tests.scripts.papers.script_run import Run, Summary, run_script
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The free-floating script, run into a temporary folder."""
-    out = tmp_path_factory.mktemp("results")
-    computed: list[Results] = []
+def runs() -> dict[str, Run[Any]]:
+    """By paper, as far as they have been asked for."""
+    return {}
 
-    def compute() -> Results:
-        computed.append(free_floating_results.compute())
-        return computed[-1]
 
-    with pytest.MonkeyPatch.context() as patch, pytest.MonkeyPatch.context() as printing:
-        lines: list[str] = []
-        patch.setattr(free_floating, "compute", compute)
-        printing.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
-        status = free_floating.main(["--out", str(out)])
-    return Run(out / "free_floating", "\n".join(lines), status, computed[0])
+@pytest.fixture(scope="module")
+def run(request: pytest.FixtureRequest, runs: dict[str, Run[Any]], tmp_path_factory: Any) -> Run[Any]:
+    """The script of the module's PAPER, run into a temporary folder."""
+    paper = request.module.PAPER
+    if paper.name not in runs:
+        runs[paper.name] = run_script(paper, tmp_path_factory.mktemp("results"))
+    return runs[paper.name]
+
+
+@pytest.fixture(scope="module")
+def summary(run: Run[Any]) -> Summary:
+    return run.summary

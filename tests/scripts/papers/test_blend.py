@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -17,7 +11,6 @@ from models.paths import Path as TaskPath
 from models.paths import smooth
 from ocp.schedule import JointTrajectory, LineLimits, joint_motion, schedule
 from scripts import blend
-from scripts.papers.blend import results as blend_results
 from scripts.papers.blend.example import (
     ARM,
     ELBOW,
@@ -31,8 +24,9 @@ from scripts.papers.blend.example import (
     example,
 )
 from scripts.papers.blend.results import Results
-from scripts.reproduce import PAPERS, present
+from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 
+PAPER = blend.PAPER
 pytestmark = pytest.mark.xdist_group("blend")
 
 PICTURES = (
@@ -51,48 +45,7 @@ PICTURES = (
 )
 
 
-@dataclass(frozen=True)
-class Run:
-    """Where the script wrote, what it printed and what it computed."""
-
-    folder: Path
-    printed: str
-    results: Results
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
-        return content
-
-    def table(self, name: str) -> list[dict[str, str]]:
-        with (self.folder / name).open(newline="", encoding="utf-8") as stream:
-            return list(csv.DictReader(stream))
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    out = tmp_path_factory.mktemp("results")
-    lines: list[str] = []
-    computed: list[Results] = []
-
-    def compute() -> Results:
-        computed.append(blend_results.compute())
-        return computed[-1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(blend, "compute", compute)
-        patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
-        status = blend.main(["--out", str(out)])
-    assert status == 0
-    return Run(out / "blend", "\n".join(lines), computed[0])
-
-
-@pytest.fixture(scope="module")
-def summary(run: Run) -> dict[str, Any]:
-    return run.summary
-
-
-def test_gamma_is_that_of_the_page(summary: dict[str, Any]) -> None:
+def test_gamma_is_that_of_the_page(summary: Summary) -> None:
     expected = [
         (30, 0.530, 0.530, 0.693),
         (25, 0.495, 0.530, 0.693),
@@ -103,7 +56,7 @@ def test_gamma_is_that_of_the_page(summary: dict[str, Any]) -> None:
     assert summary["gamma_table"][2][1] == pytest.approx(abs(1 - 1.5 / 4) * np.cos(np.pi / 4), abs=1e-12)
 
 
-def test_gamma_measured_on_the_curve_is_the_closed_form(run: Run) -> None:
+def test_gamma_measured_on_the_curve_is_the_closed_form(run: Run[Results]) -> None:
     for row in run.table("table2_gamma.csv"):
         for name in ("constant_30_90deg", "shape_1_90deg", "shape_1_45deg"):
             assert float(row[f"{name}_measured"]) == pytest.approx(float(row[name]), abs=1e-9)
@@ -111,14 +64,14 @@ def test_gamma_measured_on_the_curve_is_the_closed_form(run: Run) -> None:
             assert float(row[f"{name}_paper"]) in printed
 
 
-def test_lengths(summary: dict[str, Any]) -> None:
+def test_lengths(summary: Summary) -> None:
     expected = [250, 270.32146, 351.92024, 269.65284, 526.93047]
     np.testing.assert_allclose(summary["lengths_mm"], expected, rtol=0, atol=1e-5)
     assert summary["total_length_mm"] == pytest.approx(1668.82501, abs=1e-5)
     assert sum(summary["lengths_mm"]) == pytest.approx(summary["total_length_mm"], abs=1e-9)
 
 
-def test_times_in_both_readings(run: Run, summary: dict[str, Any]) -> None:
+def test_times_in_both_readings(run: Run[Results], summary: Summary) -> None:
     assert summary["duration_s"] == pytest.approx(1.868825, abs=1e-6)
     np.testing.assert_allclose(summary["blend_times_s"], [0.3500, 0.6203, 0.9722, 1.2419], rtol=0, atol=5e-5)
     assert summary["duration_peak_reading_s"] == pytest.approx(1.893825, abs=1e-6)
@@ -135,7 +88,7 @@ def test_times_in_both_readings(run: Run, summary: dict[str, Any]) -> None:
         assert abs(float(row["mean_difference_s"])) < 2.5e-3
 
 
-def test_ramps_of_the_mean_reading_have_the_mean_acceleration(run: Run) -> None:
+def test_ramps_of_the_mean_reading_have_the_mean_acceleration(run: Run[Results]) -> None:
     profile = run.results.mean.profile
     cruise = np.flatnonzero(np.isclose(profile.speed, SPEED, rtol=1e-12))
     assert profile.speed[cruise[0]] / profile.t[cruise[0]] == pytest.approx(5.0, rel=1e-12)
@@ -144,7 +97,7 @@ def test_ramps_of_the_mean_reading_have_the_mean_acceleration(run: Run) -> None:
     np.testing.assert_allclose(inner, SPEED, rtol=1e-12)
 
 
-def test_speed_errors_of_both_mappings(summary: dict[str, Any]) -> None:
+def test_speed_errors_of_both_mappings(summary: Summary) -> None:
     error = summary["speed_error_mm_s"]
     assert error["predictor_corrector_2ms"] == pytest.approx(-0.4207, abs=2e-4)
     assert error["predictor_corrector_2ms_true"] == pytest.approx(-0.316, abs=1e-3)
@@ -155,7 +108,7 @@ def test_speed_errors_of_both_mappings(summary: dict[str, Any]) -> None:
     np.testing.assert_allclose(error["predictor_corrector_2ms_blend_ends"], [7.45, 7.6], rtol=0, atol=0.1)
 
 
-def test_drift_and_speed_error_by_period(run: Run) -> None:
+def test_drift_and_speed_error_by_period(run: Run[Results]) -> None:
     expected = {1: (-3.73, -0.079, -0.105), 2: (-14.9, -0.316, -0.421), 4: (-59.5, -1.25, -1.67)}
     keys = ("drift_um", "true_speed_error_mm_s", "chord_speed_error_mm_s")
     for row in run.table("mapping_example.csv"):
@@ -163,7 +116,7 @@ def test_drift_and_speed_error_by_period(run: Run) -> None:
             assert [float(row[key]) for key in keys] == pytest.approx(expected[int(float(row["period_ms"]))], rel=5e-3)
 
 
-def test_drift_of_small_blends(run: Run, summary: dict[str, Any]) -> None:
+def test_drift_of_small_blends(run: Run[Results], summary: Summary) -> None:
     drift = summary["drift_mm"]
     assert abs(drift["gauss_1ms_150mm"]) < 1e-9
     assert abs(drift["gauss_1ms_5mm"]) < 1e-4
@@ -181,7 +134,7 @@ def is_paper_at_1ms(row: dict[str, str]) -> bool:
     return (row["blend"], row["mapping"], float(row["period_ms"])) == ("cubic", "predictor_corrector", 1)
 
 
-def test_the_default_mapping_is_the_better_one_everywhere(run: Run) -> None:
+def test_the_default_mapping_is_the_better_one_everywhere(run: Run[Results]) -> None:
     found: dict[tuple[str, str, str], dict[str, float]] = {}
     for row in run.table("mapping_small_blends.csv"):
         case = (row["blend"], row["remaining_mm"], row["period_ms"])
@@ -190,14 +143,14 @@ def test_the_default_mapping_is_the_better_one_everywhere(run: Run) -> None:
         assert drifts["gauss_newton"] < drifts["predictor_corrector"], case
 
 
-def test_curvature_jumps(run: Run, summary: dict[str, Any]) -> None:
+def test_curvature_jumps(run: Run[Results], summary: Summary) -> None:
     np.testing.assert_allclose(summary["curvature_jumps_cubic_per_mm"], [0, 0, 1.62e-4, 3.25e-4], rtol=0, atol=1e-6)
     assert summary["max_curvature_jump_cubic"] == max(summary["curvature_jumps_cubic_per_mm"])
     peak = run.results.quintic.curvature(run.results.quintic.dense()).max() * MM
     assert summary["max_curvature_jump_quintic"] < 1e-9 * peak
 
 
-def test_centripetal_acceleration_that_the_example_asks(summary: dict[str, Any]) -> None:
+def test_centripetal_acceleration_that_the_example_asks(summary: Summary) -> None:
     line_line, line_arc = summary["asked_centripetal_mm_s2"]
     assert line_line == pytest.approx(25142, abs=1)
     assert line_arc > line_line
@@ -206,7 +159,7 @@ def test_centripetal_acceleration_that_the_example_asks(summary: dict[str, Any])
     np.testing.assert_allclose(np.square(speeds) * np.array([line_line, line_arc]) / SPEED**2 * MM**2, 5000, rtol=1e-9)
 
 
-def test_limits_asked_for_are_kept(run: Run, summary: dict[str, Any]) -> None:
+def test_limits_asked_for_are_kept(run: Run[Results], summary: Summary) -> None:
     rows = {row["case"]: row for row in summary["limited"]}
     assert list(rows) == list(run.results.plans)
     for name, row in rows.items():
@@ -226,7 +179,7 @@ def test_limits_asked_for_are_kept(run: Run, summary: dict[str, Any]) -> None:
     assert rows["cubic, + centripetal"]["joint_jerk_over_limit"] == "unbounded"
 
 
-def test_more_limits_never_make_it_faster(run: Run, summary: dict[str, Any]) -> None:
+def test_more_limits_never_make_it_faster(run: Run[Results], summary: Summary) -> None:
     for kind in ("cubic", "quintic"):
         rows = [row for row in summary["limited"] if row["case"].startswith(kind)]
         for key in ("duration_s", "minimum_s"):
@@ -234,7 +187,7 @@ def test_more_limits_never_make_it_faster(run: Run, summary: dict[str, Any]) -> 
             assert values == sorted(values)
 
 
-def test_the_trajectory_draws_the_path(run: Run) -> None:
+def test_the_trajectory_draws_the_path(run: Run[Results]) -> None:
     trajectory = JointTrajectory.read_csv(run.folder / "trajectory.csv")
     assert trajectory.t[-1] == pytest.approx(1.868825, abs=1e-6)
     np.testing.assert_allclose(np.diff(trajectory.t)[:-1], 2e-3, rtol=0, atol=1e-12)
@@ -249,7 +202,7 @@ def test_the_trajectory_draws_the_path(run: Run) -> None:
         np.testing.assert_allclose(rest, 0, rtol=0, atol=1e-6)
 
 
-def test_velocities_of_the_trajectory_are_those_of_its_positions(run: Run) -> None:
+def test_velocities_of_the_trajectory_are_those_of_its_positions(run: Run[Results]) -> None:
     plan, joints = run.results.mean, run.results.joints
     middle = np.linspace(0.01, plan.duration - 0.01, 301)
     step = 1e-5
@@ -278,15 +231,14 @@ def test_a_corner_has_the_angle_it_is_given() -> None:
         assert path.remaining[0] == pytest.approx(20 * MM)
 
 
-def test_files_are_whole(run: Run) -> None:
+def test_files_are_whole_and_the_script_succeeds(run: Run[Results]) -> None:
+    assert run.status == 0
     for name in PICTURES:
-        with Image.open(run.folder / name) as picture:
-            assert picture.width >= 900
-            assert len(np.unique(np.asarray(picture.convert("L")))) > 50  # something is drawn
+        assert_whole_picture(run.folder / name)
     with Image.open(run.folder / "motion.gif") as animation:
         assert getattr(animation, "n_frames", 1) > 40
     assert (run.folder / "motion.gif").stat().st_size < 1.5e6
-    assert {path.name for path in run.folder.iterdir()} == {
+    assert run.names == {
         *PICTURES,
         "motion.gif",
         "summary.json",
@@ -299,7 +251,7 @@ def test_files_are_whole(run: Run) -> None:
     }
 
 
-def test_the_tables_say_what_the_summary_says(run: Run, summary: dict[str, Any]) -> None:
+def test_the_tables_say_what_the_summary_says(run: Run[Results], summary: Summary) -> None:
     gamma = run.table("table2_gamma.csv")
     names = ("remaining_mm", "constant_30_90deg", "shape_1_90deg", "shape_1_45deg")
     np.testing.assert_allclose(
@@ -312,15 +264,10 @@ def test_the_tables_say_what_the_summary_says(run: Run, summary: dict[str, Any])
         assert float(row["duration_s"]) == pytest.approx(told["duration_s"], rel=1e-9)
 
 
-def test_paper_value_ours_and_difference_are_printed(run: Run) -> None:
+def test_paper_value_ours_and_difference_are_printed(run: Run[Results]) -> None:
     for word in ("paper", "ours", "difference", "misprint", "1668.82501", "1.868825", "1.893825", "25142", "-0.4207"):
         assert word in run.printed
     assert "nan" not in run.printed
-
-
-def test_the_script_is_registered() -> None:
-    assert PAPERS["blend"] == "scripts.blend"
-    assert "blend" in present()
 
 
 def test_the_examples_time_depends_on_its_length_alone() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 import shutil
 import subprocess
@@ -19,9 +17,12 @@ from models.cts.export import export, rig_functions
 from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
 from scripts import cts
+from scripts.papers.cts.results import Results
 from tests.models.cts.cts_oracle import random_targets
+from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 
-ROOT = Path(__file__).resolve().parents[2]
+PAPER = cts.PAPER
+EXAMPLE = Path(__file__).resolve().parents[3] / "scripts" / "c_export"
 PICTURES = (
     "fig06_rig.png",
     "fig07_joints_i1.png",
@@ -33,24 +34,11 @@ PICTURES = (
 TABLES = ("table6_time.csv", "iterations.csv", "reference_rolls.csv", "sweep.csv")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("results")
-    assert cts.main(["--out", str(out)]) == 0
-    return out / "cts"
-
-
-@pytest.fixture(scope="module")
-def summary(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return content
-
-
-def test_reference_rolls(summary: dict[str, Any]) -> None:
+def test_reference_rolls(summary: Summary) -> None:
     assert summary["phi_reference"] == pytest.approx([0.331364, 0.682290, math.pi / 2, 2.459303, 2.810229], abs=1e-6)
 
 
-def test_iterations_are_those_of_the_reference(summary: dict[str, Any]) -> None:
+def test_iterations_are_those_of_the_reference(summary: Summary) -> None:
     assert summary["i1"]["combined"]["iterations_mean"] == pytest.approx(3.0, abs=0.05)
     assert summary["i1"]["jacobian"]["iterations_mean"] == pytest.approx(11.9, abs=1.0)
     assert summary["i1"]["jacobian_gain_1"]["iterations_mean"] == pytest.approx(98.7, abs=1.0)
@@ -58,7 +46,7 @@ def test_iterations_are_those_of_the_reference(summary: dict[str, Any]) -> None:
     assert summary["i2"]["jacobian"]["converged"] == 0
 
 
-def test_divergence_is_told_by_the_stability_bound(summary: dict[str, Any]) -> None:
+def test_divergence_is_told_by_the_stability_bound(summary: Summary) -> None:
     for index, method, stable in (
         ("i1", "jacobian", True),
         ("i1", "jacobian_gain_1", True),
@@ -68,26 +56,26 @@ def test_divergence_is_told_by_the_stability_bound(summary: dict[str, Any]) -> N
         assert (summary[index][method]["gain_n6_squared_bend_max"] < 2) == stable
 
 
-def test_no_global_minimum_is_missed_and_newton_often_ends_in_a_maximum(summary: dict[str, Any]) -> None:
+def test_no_global_minimum_is_missed_and_newton_often_ends_in_a_maximum(summary: Summary) -> None:
     assert summary["global_missed"] == 0
     assert 0.5 < summary["newton_maximum_share"] < 0.7
 
 
-def test_the_null_space_method_takes_more_iterations(summary: dict[str, Any]) -> None:
+def test_the_null_space_method_takes_more_iterations(summary: Summary) -> None:
     combined = summary["i1"]["combined"]["iterations_mean"]
     assert summary["i1"]["jacobian"]["iterations_mean"] > 2 * combined
     assert summary["i1"]["jacobian_gain_1"]["iterations_mean"] > 10 * combined
     assert summary["compiled_ns_per_target"] > 0
 
 
-def test_the_release_is_tracked_and_keeps_clear(summary: dict[str, Any]) -> None:
+def test_the_release_is_tracked_and_keeps_clear(summary: Summary) -> None:
     release = summary["release"]
     assert release["tracking_m"] < 1e-12
     assert release["tracking_rad"] < 1e-12
     assert release["least_clearance_m"] > 0.05
 
 
-def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: dict[str, Any]) -> None:
+def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: Summary) -> None:
     found = summary["plan"]
     plan, single = found["plan"], found["each_target_by_itself"]
     assert found["audit_passed"]
@@ -96,15 +84,15 @@ def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: dict[str
     assert plan["index_integral_s"] > single["index_integral_s"]
 
 
-def test_all_files_are_written(folder: Path) -> None:
+def test_all_files_are_written_and_the_script_succeeds(run: Run[Results]) -> None:
+    assert run.status == 0
+    assert run.names == {*PICTURES, *TABLES, "release.gif", "summary.json"}
     for name in PICTURES:
-        with Image.open(folder / name) as picture:
-            assert picture.width > 900
-    with Image.open(folder / "release.gif") as animation:
+        assert_whole_picture(run.folder / name)
+    with Image.open(run.folder / "release.gif") as animation:
         assert getattr(animation, "n_frames", 1) > 20
     for name in TABLES:
-        with (folder / name).open(newline="", encoding="utf-8") as stream:
-            assert list(csv.DictReader(stream))
+        assert run.table(name)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +102,7 @@ def functions() -> dict[str, Any]:
 
 def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path, functions: dict[str, Any]) -> None:
     example = tmp_path / "example"
-    shutil.copytree(ROOT / "examples" / "c_export", example, ignore=shutil.ignore_patterns("build"))
+    shutil.copytree(EXAMPLE, example, ignore=shutil.ignore_patterns("build"))
     export(functions, example / "build" / "cts_inverse.c")
     subprocess.run(["make", f"PYTHON={sys.executable}"], cwd=example, check=True, capture_output=True, text=True)
     targets = random_targets(np.random.default_rng(9), 500)

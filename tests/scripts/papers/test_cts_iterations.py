@@ -16,14 +16,10 @@ from models.cts.rig import HOME, INCH, forward, inverse
 from models.errors import ModelError
 from models.papers import reference_rig, reference_tunnel
 from scripts.papers.cts.iterations import Run, combined, newton_step, null_space, null_space_step
+from scripts.papers.cts.results import sweep_targets
 from tests.models.cts.cts_oracle import Array, random_targets
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
-
-
-def sweep() -> Array:
-    """Table 5: z from -15 to 15 in at 3 in/s, every 0.05 s."""
-    return np.array([[100 * INCH, 6 * INCH, (-15 + 0.15 * k) * INCH, 0, 0] for k in range(1, 201)])
 
 
 def start() -> Array:
@@ -32,15 +28,15 @@ def start() -> Array:
 
 
 def jacobian_run(rate_weight: float, gain: float) -> Run:
-    return null_space(RIG, TUNNEL, sweep(), start(), rate_weight=rate_weight, gain=gain)
+    return null_space(RIG, TUNNEL, sweep_targets(), start(), rate_weight=rate_weight, gain=gain)
 
 
 def test_newton_takes_three_iterations_on_the_sweep_and_agrees_with_the_global_optimum() -> None:
-    run = combined(RIG, TUNNEL, sweep())
+    run = combined(RIG, TUNNEL, sweep_targets())
     assert run.converged.all()
     assert run.iterations.mean() == pytest.approx(3.0, abs=0.05)
     assert run.iterations.max() == 4
-    best = np.array(optimal_inverse(RIG, TUNNEL).map(200)(sweep().T, np.zeros((1, 200)))[0]).T
+    best = np.array(optimal_inverse(RIG, TUNNEL).map(200)(sweep_targets().T, np.zeros((1, 200)))[0]).T
     np.testing.assert_allclose(run.joints, best, atol=1e-6)
 
 
@@ -54,14 +50,14 @@ def test_null_space_with_gain_20_converges_on_i1_in_about_twelve() -> None:
     run = jacobian_run(0.0, 20.0)
     assert run.converged.all()
     assert run.iterations.mean() == pytest.approx(11.9, abs=1.0)
-    np.testing.assert_allclose(run.joints, combined(RIG, TUNNEL, sweep()).joints, atol=1e-5)
+    np.testing.assert_allclose(run.joints, combined(RIG, TUNNEL, sweep_targets()).joints, atol=1e-5)
 
 
 def test_null_space_with_gain_20_diverges_on_i2_and_newton_is_smooth() -> None:
     run = jacobian_run(5.0, 20.0)
     assert run.converged.sum() == 0
     assert jacobian_run(5.0, 1.0).converged.all()
-    smooth = combined(RIG, TUNNEL, sweep(), rate_weight=5.0)
+    smooth = combined(RIG, TUNNEL, sweep_targets(), rate_weight=5.0)
     assert smooth.converged.all()
     assert smooth.iterations.mean() == pytest.approx(2.74, abs=0.02)
     assert np.abs(np.diff(smooth.joints[:, 5])).max() < 0.05
@@ -109,7 +105,7 @@ def test_newton_often_ends_in_a_maximum() -> None:
 
 
 def test_newton_never_leaves_the_symmetric_start() -> None:
-    targets = sweep()
+    targets = sweep_targets()
     targets[:, 1] = 0.0  # P_C's y: psi = theta = 0 make roll 0 stationary
     run = combined(RIG, TUNNEL, targets)
     assert (run.iterations == 1).all()
@@ -120,7 +116,7 @@ def test_newton_never_leaves_the_symmetric_start() -> None:
 
 def test_tables_3_and_4_as_printed_stop_before_they_converge() -> None:
     """They loop while the step is small; one pass from roll 0 is far from the optimum."""
-    target = sweep()[100]
+    target = sweep_targets()[100]
     first = float(newton_step(RIG, TUNNEL)(target, 0.0, 0.0)[0])
     last = float(optimal_inverse(RIG, TUNNEL)(target, 0.0)[0][5])
     assert abs(first) > 1e-6  # so the printed condition is false at once
@@ -128,7 +124,7 @@ def test_tables_3_and_4_as_printed_stop_before_they_converge() -> None:
 
 
 def test_null_space_uses_the_least_joint_motion_and_reaches_the_target() -> None:
-    target, q = sweep()[3], start()
+    target, q = sweep_targets()[3], start()
     step = null_space_step(RIG, TUNNEL, gain=20.0)
     for _ in range(60):
         q = np.array(step(target, q, 0.0)[0]).ravel()
@@ -142,7 +138,7 @@ def test_a_bad_option_is_named(bad: dict[str, float]) -> None:
 
 
 def test_bad_targets_are_named_by_row() -> None:
-    rows = sweep()
+    rows = sweep_targets()
     rows[7, 1] = np.nan
     with pytest.raises(ModelError, match="row 7"):
         combined(RIG, TUNNEL, rows)

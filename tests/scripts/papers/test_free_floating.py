@@ -10,14 +10,18 @@ from PIL import Image
 from models import FreeFloating, paper_example
 from ocp import Collocation, solve
 from ocp.local.rates import LocalSolution, resolve
+from scripts import free_floating
 from scripts.papers.free_floating import results as free_floating_results
 from scripts.papers.free_floating.false_optima import FALSE, GUESSES, Trial
 from scripts.papers.free_floating.motion import laws, momentum, motion_of_local, total_center_of_mass
-from scripts.papers.free_floating.results import ROWS, START_JOINTS, TIP_VELOCITY
-from tests.scripts.papers.free_floating_run import REFERENCE, Run, column
+from scripts.papers.free_floating.results import ROWS, START_JOINTS, TIP_VELOCITY, Results
+from tests.scripts.papers.script_run import Run, assert_whole_picture, column
 
+PAPER = free_floating.PAPER
 pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once
 
+REFERENCE = 1.735114311245
+"""J at 5 s: backward shooting of the minimum principle and Legendre-3 collocation, in an implementation of its own."""
 EXTREMALS = (1.36393, 1.49337)
 """J of the two extremals that are known at 4 s, by an implementation of its own."""
 TABLE_1 = (157.8240, 69.7189, -113.5345, 70.4688, -22.0748, -98.1823)
@@ -55,18 +59,20 @@ def machine() -> FreeFloating:
 # ---- the pseudo-inverse
 
 
-def test_pseudo_inverse_peaks_are_the_converged_ones(run: Run) -> None:
+def test_pseudo_inverse_peaks_are_the_converged_ones(run: Run[Results]) -> None:
     peaks = run.summary["pseudo_inverse"]["peak_joint_velocity_deg_s"]
     assert peaks == pytest.approx([153.73, 66.97, -109.08], abs=0.05)
     assert run.summary["pseudo_inverse"]["peak_time_s"] == pytest.approx([3.044, 2.996, 3.043], abs=1e-3)
 
 
-def test_pseudo_inverse_passes_nearest_to_the_singularity_at_three_seconds(run: Run) -> None:
+def test_pseudo_inverse_passes_nearest_to_the_singularity_at_three_seconds(run: Run[Results]) -> None:
     assert run.summary["pseudo_inverse"]["min_manipulability"] == pytest.approx(0.476, abs=5e-4)
     assert run.summary["pseudo_inverse"]["min_manipulability_time_s"] == pytest.approx(3.045, abs=1e-3)
 
 
-def test_pseudo_inverse_motion_does_the_task_with_the_least_joint_rates(run: Run, machine: FreeFloating) -> None:
+def test_pseudo_inverse_motion_does_the_task_with_the_least_joint_rates(
+    run: Run[Results], machine: FreeFloating
+) -> None:
     motion = run.results.local
     jacobian = ca.Function("G", [b := ca.SX.sym("b", 3), q := ca.SX.sym("q", 3)], [machine.tip_jacobian(b, q)])
     for k in range(0, len(motion.t), 500):
@@ -74,7 +80,7 @@ def test_pseudo_inverse_motion_does_the_task_with_the_least_joint_rates(run: Run
         assert motion.joint_rates[k] == pytest.approx(np.linalg.pinv(rows) @ TIP_VELOCITY, abs=1e-9)
 
 
-def test_accelerations_of_both_motions_are_the_slopes_of_their_velocities(run: Run) -> None:
+def test_accelerations_of_both_motions_are_the_slopes_of_their_velocities(run: Run[Results]) -> None:
     rates = run.results.agreement.backward.at(run.results.optimal.t)["rates"]
     for motion, velocities in ((run.results.local, run.results.local.joint_rates), (run.results.optimal, rates)):
         slope = np.gradient(velocities, motion.t, axis=0)[1:-1]  # its own error: 1e-3 where the curve is sharpest
@@ -83,14 +89,14 @@ def test_accelerations_of_both_motions_are_the_slopes_of_their_velocities(run: R
     assert np.abs(rates - run.results.optimal.joint_rates).max() < 1e-4
 
 
-def test_acceleration_vanishes_at_a_peak_inside_the_motion(run: Run) -> None:
+def test_acceleration_vanishes_at_a_peak_inside_the_motion(run: Run[Results]) -> None:
     motion = run.results.near_peaks
     largest = np.abs(motion.joint_accelerations).max(axis=0)
     assert (np.abs(motion.accelerations_at_peaks()) < 1e-3 * largest).all()
     assert np.degrees(largest) == pytest.approx([1592, 3764, 1565], rel=5e-3)  # by finite differences of a simulation
 
 
-def test_a_thousandth_of_a_link_explains_the_first_peak_and_is_not_used(run: Run) -> None:
+def test_a_thousandth_of_a_link_explains_the_first_peak_and_is_not_used(run: Run[Results]) -> None:
     rows = run.table("sensitivity.csv")
     identified, fitted, paper = rows[1], rows[-2], rows[-1]
     assert float(identified["link_length_m"]) == 2.0
@@ -104,7 +110,7 @@ def test_a_thousandth_of_a_link_explains_the_first_peak_and_is_not_used(run: Run
 # ---- the optimum
 
 
-def test_every_method_finds_the_same_optimum(run: Run) -> None:
+def test_every_method_finds_the_same_optimum(run: Run[Results]) -> None:
     optimal = run.summary["optimal"]
     assert optimal["horizon_s"] == 5.0
     assert optimal["indirect"]["backward"]["cost"] == pytest.approx(REFERENCE, abs=5e-12)
@@ -130,21 +136,21 @@ def test_every_method_finds_the_same_optimum(run: Run) -> None:
         ("minimum principle, forward multiple shooting", 20, 5e-12),
     ],
 )
-def test_cost_of_each_method_and_mesh(run: Run, method: str, intervals: int, error: float) -> None:
+def test_cost_of_each_method_and_mesh(run: Run[Results], method: str, intervals: int, error: float) -> None:
     found = column(run.table("convergence.csv"), "cost", method=method, intervals=str(intervals))
     assert found.shape == (1,)
     assert abs(found[0] - REFERENCE) < error
 
 
 @pytest.mark.parametrize("method", [name for name, *_ in free_floating_results.METHODS])
-def test_cost_converges_with_the_order_of_its_method(run: Run, method: str) -> None:
+def test_cost_converges_with_the_order_of_its_method(run: Run[Results], method: str) -> None:
     rows = [row for row in run.table("convergence.csv") if row["method"] == method]
     errors = {int(row["intervals"]): abs(float(row["difference"])) for row in rows}
     coarse, fine = min(errors), 2 * min(errors)
     assert np.log2(errors[coarse] / errors[fine]) == pytest.approx(float(rows[0]["order"]), abs=0.4)
 
 
-def test_optimal_peaks_are_lower_and_the_singularity_is_not_passed(run: Run) -> None:
+def test_optimal_peaks_are_lower_and_the_singularity_is_not_passed(run: Run[Results]) -> None:
     peaks = run.summary["optimal"]["peak_joint_velocity_deg_s"]
     assert peaks == pytest.approx([46.10, 24.26, -77.95], abs=0.05)
     factors = np.abs(run.summary["pseudo_inverse"]["peak_joint_velocity_deg_s"]) / np.abs(peaks)
@@ -152,12 +158,12 @@ def test_optimal_peaks_are_lower_and_the_singularity_is_not_passed(run: Run) -> 
     assert run.summary["optimal"]["min_manipulability"] > 3
 
 
-def test_momentum_stays_zero_along_the_reintegrated_plan(run: Run) -> None:
+def test_momentum_stays_zero_along_the_reintegrated_plan(run: Run[Results]) -> None:
     assert run.summary["optimal"]["momentum_drift"] < 1e-9
     assert run.summary["optimal"]["center_of_mass_drift_m"] < 1e-9
 
 
-def test_tip_stays_on_its_line_along_the_reintegrated_plan(run: Run) -> None:
+def test_tip_stays_on_its_line_along_the_reintegrated_plan(run: Run[Results]) -> None:
     assert run.summary["optimal"]["tip_error_m"] < 2e-7
 
 
@@ -169,7 +175,7 @@ def test_tip_stays_on_its_line_on_half_the_intervals(machine: FreeFloating) -> N
     assert kept.momentum_drift < 1e-9
 
 
-def test_plan_passes_its_audit_and_the_script_succeeds(run: Run) -> None:
+def test_plan_passes_its_audit_and_the_script_succeeds(run: Run[Results]) -> None:
     assert run.summary["optimal"]["audit_passed"] is True
     assert run.status == 0
     table = (run.folder / "audit.txt").read_text(encoding="utf-8")
@@ -212,19 +218,19 @@ def test_motion_of_a_local_solution_keeps_its_arrays(machine: FreeFloating) -> N
 # ---- false optima
 
 
-def test_every_guess_was_tried_once(run: Run) -> None:
+def test_every_guess_was_tried_once(run: Run[Results]) -> None:
     assert [trial.guess for trial in run.results.trials] == list(GUESSES)
     assert [trial.seed for trial in run.results.trials] == list(range(-1, 20))
 
 
-def test_plans_that_jump_across_the_singularity_fail_their_audit(run: Run) -> None:
+def test_plans_that_jump_across_the_singularity_fail_their_audit(run: Run[Results]) -> None:
     jumping = [trial for trial in run.results.trials if trial.jump_deg_s > 200]
     assert jumping, "no guess led to a false optimum: there is nothing to reject"
     assert all("Succeeded" in trial.status for trial in jumping)  # the solver is content with them
     assert not any(trial.audit for trial in jumping)
 
 
-def test_plans_that_pass_are_extremals_that_keep_their_cost_on_a_finer_mesh(run: Run) -> None:
+def test_plans_that_pass_are_extremals_that_keep_their_cost_on_a_finer_mesh(run: Run[Results]) -> None:
     passed = [trial for trial in run.results.trials if trial.audit]
     assert passed
     for trial in passed:
@@ -233,14 +239,14 @@ def test_plans_that_pass_are_extremals_that_keep_their_cost_on_a_finer_mesh(run:
         assert trial.refined_cost == pytest.approx(trial.cost, rel=1e-6)
 
 
-def test_plans_that_fail_change_their_cost_or_pass_on_a_finer_mesh(run: Run) -> None:
+def test_plans_that_fail_change_their_cost_or_pass_on_a_finer_mesh(run: Run[Results]) -> None:
     for trial in run.results.trials:
         if not trial.audit:
             kept = abs(trial.refined_cost / trial.cost - 1) < 1e-2
             assert (trial.verdict == FALSE) == (not (kept and trial.refined_audit)), describe(trial)
 
 
-def test_both_known_extremals_are_reached(run: Run) -> None:
+def test_both_known_extremals_are_reached(run: Run[Results]) -> None:
     costs = run.summary["false_optima"]["extremal_costs"]
     for known in EXTREMALS:
         assert min(abs(cost - known) for cost in costs) < 2e-5
@@ -253,7 +259,7 @@ def describe(trial: Trial) -> str:
 # ---- the files
 
 
-def test_paper_ours_and_difference_stand_side_by_side(run: Run) -> None:
+def test_paper_ours_and_difference_stand_side_by_side(run: Run[Results]) -> None:
     for name, unit, printed in (
         ("table1_peak_velocity.csv", "deg_s", TABLE_1),
         ("table2_acceleration.csv", "deg_s2", TABLE_2),
@@ -266,7 +272,7 @@ def test_paper_ours_and_difference_stand_side_by_side(run: Run) -> None:
             assert f"{value:.6g}" in run.printed
 
 
-def test_what_cannot_be_reproduced_is_said_beside_it(run: Run) -> None:
+def test_what_cannot_be_reproduced_is_said_beside_it(run: Run[Results]) -> None:
     for name in ("table1_peak_velocity.csv", "table2_acceleration.csv"):
         for row in run.table(name):
             if row["method"] == "optimum":
@@ -285,17 +291,14 @@ def test_what_cannot_be_reproduced_is_said_beside_it(run: Run) -> None:
         assert words in run.printed
 
 
-def test_summary_agrees_with_the_tables(run: Run) -> None:
+def test_summary_agrees_with_the_tables(run: Run[Results]) -> None:
     summary = run.summary
     peaks = run.table("table1_peak_velocity.csv")
     for method, part in (("pseudo-inverse", "pseudo_inverse"), ("optimum", "optimal")):
         found = column(peaks, "ours_deg_s", method=method)
         assert found == pytest.approx(summary[part]["peak_joint_velocity_deg_s"], rel=1e-9)
     costs = run.table("convergence.csv")
-    for part, method in (
-        ("collocation", "Legendre 3"),
-        ("multiple_shooting", "multiple shooting RK4, linear control"),
-    ):
+    for part, method in (("collocation", "Legendre 3"), ("multiple_shooting", "multiple shooting RK4, linear control")):
         found = column(costs, "cost", method=method, intervals="100")
         assert found == pytest.approx([summary["optimal"][part]["cost"]], abs=1e-12)
     verdicts = [row["verdict"] for row in run.table("false_optima.csv")]
@@ -305,29 +308,23 @@ def test_summary_agrees_with_the_tables(run: Run) -> None:
     assert audits.count("yes") == summary["false_optima"]["passed"]
 
 
-def test_all_files_are_there_and_nothing_else(run: Run) -> None:
+def test_all_files_are_there_and_nothing_else(run: Run[Results]) -> None:
     expected = {*PICTURES, *TABLES, "motion.gif", "summary.json", "audit.txt", "certificate.txt"}
-    assert {path.name for path in run.folder.iterdir()} == expected
+    assert run.names == expected
 
 
-def test_files_are_small_enough_to_be_committed(run: Run) -> None:
+def test_files_are_small_enough_to_be_committed(run: Run[Results]) -> None:
     sizes = {path.name: path.stat().st_size for path in run.folder.iterdir()}
     assert sizes["motion.gif"] < 1.5e6
     assert sum(sizes.values()) < 4e6
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures_are_drawn_to_their_edges_and_not_beyond(run: Run, name: str) -> None:
-    with Image.open(run.folder / name) as picture:
-        pixels = np.asarray(picture.convert("L"))
-    assert min(pixels.shape) > 400
-    ink = pixels < 250
-    assert 0.005 < ink.mean() < 0.5
-    border = [ink[0], ink[-1], ink[:, 0], ink[:, -1]]  # anything that touches the edge is clipped
-    assert not any(side.any() for side in border)
+def test_pictures_are_drawn_to_their_edges_and_not_beyond(run: Run[Results], name: str) -> None:
+    assert_whole_picture(run.folder / name)
 
 
-def test_animation_shows_the_whole_motion_in_real_time(run: Run) -> None:
+def test_animation_shows_the_whole_motion_in_real_time(run: Run[Results]) -> None:
     seconds = 0.0
     seen = set()
     with Image.open(run.folder / "motion.gif") as animation:

@@ -9,12 +9,23 @@ import numpy as np
 import pytest
 
 from models import paper_example
+from scripts import free_floating
 from scripts.papers.free_floating.extremals import CONFIRMED, HORIZONS, NOT_GLOBAL, STARTS
 from scripts.papers.free_floating.false_optima import first_guess
 from scripts.papers.free_floating.optimality import costate_difference, costates, hamiltonians
-from scripts.papers.free_floating.results import PAPER_PEAKS, ROWS, START, START_BASE, START_JOINTS, TIP_VELOCITY
-from tests.scripts.papers.free_floating_run import REFERENCE, Run, column
+from scripts.papers.free_floating.results import (
+    PAPER_PEAKS,
+    ROWS,
+    START,
+    START_BASE,
+    START_JOINTS,
+    TIP_VELOCITY,
+    Results,
+)
+from tests.scripts.papers.script_run import Run, column
+from tests.scripts.papers.test_free_floating import REFERENCE
 
+PAPER = free_floating.PAPER
 pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once
 
 KNOWN = {3.5: (1.23315, 1.32544), 4.0: (1.36393, 1.49337), 5.0: (REFERENCE, 1.7467)}
@@ -22,7 +33,7 @@ KNOWN = {3.5: (1.23315, 1.32544), 4.0: (1.36393, 1.49337), 5.0: (REFERENCE, 1.74
 INDIRECT = ("multiple", "backward")
 
 
-def indirect(run: Run, shooting: str) -> dict[str, Any]:
+def indirect(run: Run[Results], shooting: str) -> dict[str, Any]:
     found: dict[str, Any] = run.summary["optimal"]["indirect"]
     return found if shooting == "multiple" else found["backward"]
 
@@ -31,7 +42,7 @@ def indirect(run: Run, shooting: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("shooting", INDIRECT)
-def test_minimum_principle_gives_the_known_cost_in_a_few_newton_steps(run: Run, shooting: str) -> None:
+def test_minimum_principle_gives_the_known_cost_in_a_few_newton_steps(run: Run[Results], shooting: str) -> None:
     found = indirect(run, shooting)
     assert found["shooting"] == shooting
     assert found["cost"] == pytest.approx(REFERENCE, abs=1e-9)
@@ -39,18 +50,18 @@ def test_minimum_principle_gives_the_known_cost_in_a_few_newton_steps(run: Run, 
 
 
 @pytest.mark.parametrize("shooting", INDIRECT)
-def test_hamiltonian_is_constant_along_the_minimum_principle(run: Run, shooting: str) -> None:
+def test_hamiltonian_is_constant_along_the_minimum_principle(run: Run[Results], shooting: str) -> None:
     assert indirect(run, shooting)["hamiltonian_drift"] < 1e-9
 
 
 @pytest.mark.parametrize("shooting", INDIRECT)
-def test_costates_vanish_at_the_free_end_and_the_start_is_met(run: Run, shooting: str) -> None:
+def test_costates_vanish_at_the_free_end_and_the_start_is_met(run: Run[Results], shooting: str) -> None:
     assert indirect(run, shooting)["costate_at_end"] < 1e-9
     assert indirect(run, shooting)["start_error"] < 1e-9
 
 
 @pytest.mark.parametrize("shooting", INDIRECT)
-def test_costates_of_direct_and_indirect_agree(run: Run, shooting: str) -> None:
+def test_costates_of_direct_and_indirect_agree(run: Run[Results], shooting: str) -> None:
     found = run.results.agreement
     difference = costate_difference(found.plan, found.multiple if shooting == "multiple" else found.backward)
     assert difference.shape == (len(found.plan.t), 6)
@@ -60,7 +71,7 @@ def test_costates_of_direct_and_indirect_agree(run: Run, shooting: str) -> None:
     assert told > 1e-12  # they are two solutions, not one
 
 
-def test_costates_are_the_same_in_both_formulations(run: Run) -> None:
+def test_costates_are_the_same_in_both_formulations(run: Run[Results]) -> None:
     found = run.results.agreement
     fractions = np.linspace(0.0, 1.0, 51)
     reference = costates(found.multiple, fractions)
@@ -69,14 +80,14 @@ def test_costates_are_the_same_in_both_formulations(run: Run) -> None:
             assert costates(solution, fractions) == pytest.approx(reference, abs=1e-9 * np.abs(reference).max())
 
 
-def test_costates_of_the_base_position_vanish_for_the_cost_does_not_depend_on_the_place(run: Run) -> None:
+def test_costates_of_the_base_position_vanish_for_the_cost_does_not_depend_on_the_place(run: Run[Results]) -> None:
     found = run.results.agreement
     for solution in (found.plan, found.multiple, found.backward, found.shooting):
         assert np.abs(solution.costate("base")[:, :2]).max() < 1e-9
         assert np.abs(solution.costate("base")[:, 2]).max() > 3.0
 
 
-def test_control_of_the_minimum_principle_is_the_projection_of_its_costates(run: Run) -> None:
+def test_control_of_the_minimum_principle_is_the_projection_of_its_costates(run: Run[Results]) -> None:
     """Equation (31), u = E2' E1^-T lambda1 - lambda2, and the motion (26): x2' = (1 - G#G) u + G# v, at every time."""
     machine = paper_example()
     b, q, r = (ca.SX.sym(name, 3) for name in "bqr")
@@ -93,14 +104,14 @@ def test_control_of_the_minimum_principle_is_the_projection_of_its_costates(run:
         assert solution["rates"][k] == pytest.approx(expected, abs=1e-9)
 
 
-def test_hamiltonian_is_half_the_squared_joint_rates_at_the_end(run: Run) -> None:
+def test_hamiltonian_is_half_the_squared_joint_rates_at_the_end(run: Run[Results]) -> None:
     """At the free end lambda = 0, so that H = L = 1/2 |x2'|^2 of the least joint rates."""
     solution = run.results.agreement.multiple
     mean = run.summary["optimal"]["indirect"]["hamiltonian"]
     assert mean == pytest.approx(0.5 * float(np.sum(solution["rates"][-1] ** 2)), abs=1e-9)
 
 
-def test_hamiltonian_of_every_method_has_the_same_mean(run: Run) -> None:
+def test_hamiltonian_of_every_method_has_the_same_mean(run: Run[Results]) -> None:
     curves = hamiltonians(run.results.agreement)
     assert len(curves) == 7
     expected = run.summary["optimal"]["indirect"]["hamiltonian"]
@@ -112,7 +123,7 @@ def test_hamiltonian_of_every_method_has_the_same_mean(run: Run) -> None:
 # ---- the certificates
 
 
-def test_all_methods_of_a_formulation_agree_and_pass_their_audits(run: Run) -> None:
+def test_all_methods_of_a_formulation_agree_and_pass_their_audits(run: Run[Results]) -> None:
     assert run.summary["optimal"]["certified"] == {"rates": True, "null space": True}
     rows = run.table("certificate.csv")
     assert [row["formulation"] for row in rows] == ["rates"] * 4 + ["null space"] * 3
@@ -122,7 +133,7 @@ def test_all_methods_of_a_formulation_agree_and_pass_their_audits(run: Run) -> N
         assert column(rows, f"{quantity}_difference").max() < 1e-4
 
 
-def test_certificates_are_printed_and_written(run: Run) -> None:
+def test_certificates_are_printed_and_written(run: Run[Results]) -> None:
     text = (run.folder / "certificate.txt").read_text(encoding="utf-8")
     assert text.strip() in run.printed
     for name in ("rates", "null space"):
@@ -135,19 +146,19 @@ def test_certificates_are_printed_and_written(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("horizon", "cost"), [(h, cost) for h, costs in KNOWN.items() for cost in costs])
-def test_known_extremals_are_found(run: Run, horizon: float, cost: float) -> None:
+def test_known_extremals_are_found(run: Run[Results], horizon: float, cost: float) -> None:
     rows = [row for row in run.table("extremals.csv") if float(row["horizon_s"]) == horizon]
     found = column(rows, "cost_indirect", verdict=CONFIRMED)
     assert np.abs(found - cost).min() < 2e-5
 
 
-def test_direct_and_indirect_cost_of_every_confirmed_extremal_agree(run: Run) -> None:
+def test_direct_and_indirect_cost_of_every_confirmed_extremal_agree(run: Run[Results]) -> None:
     rows = [row for row in run.table("extremals.csv") if row["verdict"] == CONFIRMED]
     assert {float(row["horizon_s"]) for row in rows} == set(HORIZONS)
     assert column(rows, "cost_direct") == pytest.approx(column(rows, "cost_indirect"), rel=1e-5)
 
 
-def test_best_is_the_confirmed_extremal_of_least_cost_at_each_horizon(run: Run) -> None:
+def test_best_is_the_confirmed_extremal_of_least_cost_at_each_horizon(run: Run[Results]) -> None:
     rows = run.table("extremals.csv")
     for told in run.summary["extremals"]["by_horizon"]:
         mine = [row for row in rows if float(row["horizon_s"]) == told["horizon_s"]]
@@ -160,13 +171,13 @@ def test_best_is_the_confirmed_extremal_of_least_cost_at_each_horizon(run: Run) 
         assert f"best J = {told['best_cost']:.9f}" in run.printed
 
 
-def test_every_start_is_accounted_for(run: Run) -> None:
+def test_every_start_is_accounted_for(run: Run[Results]) -> None:
     for one in run.results.searches:
         assert one.starts == STARTS
         assert one.rejected + sum(extremal.found for extremal in one.extremals) == one.solved <= one.starts
 
 
-def test_extremals_of_one_horizon_are_different_motions(run: Run) -> None:
+def test_extremals_of_one_horizon_are_different_motions(run: Run[Results]) -> None:
     for one in run.results.searches:
         curves = [extremal.joint_rates for extremal in one.extremals]
         for i, first in enumerate(curves):
@@ -174,14 +185,14 @@ def test_extremals_of_one_horizon_are_different_motions(run: Run) -> None:
                 assert np.abs(first - second).max() > 1e-2
 
 
-def test_cost_of_every_extremal_is_the_integral_of_its_joint_rates(run: Run) -> None:
+def test_cost_of_every_extremal_is_the_integral_of_its_joint_rates(run: Run[Results]) -> None:
     for one in run.results.searches:
         for extremal in one.extremals:
             energy = 0.5 * np.sum(extremal.joint_rates**2, axis=1)
             assert np.trapezoid(energy, extremal.t) == pytest.approx(extremal.cost, rel=1e-3)
 
 
-def test_no_extremal_has_the_peaks_of_the_paper_and_none_is_called_global(run: Run) -> None:
+def test_no_extremal_has_the_peaks_of_the_paper_and_none_is_called_global(run: Run[Results]) -> None:
     rows = run.table("extremals.csv")
     peaks = np.column_stack([column(rows, f"joint{i}_peak_deg_s") for i in (1, 2, 3)])
     differences = np.abs(peaks - PAPER_PEAKS["optimum"]).max(axis=1)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,15 +15,17 @@ from models.machines.standing_motion import StandingMotion
 from models.papers import STANDING_STARTS
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from ocp.local.accelerations import resolve_accelerations
-from scripts import reproduce, standing
-from scripts.papers.standing import results as standing_results
+from scripts import standing
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task
 from scripts.papers.standing.checks import ALLOWED, STATIONARITY, check, failures, region_excess
 from scripts.papers.standing.drawing import arm_points
 from scripts.papers.standing.plans import PLANS, Plan
 from scripts.papers.standing.printed import printed_law
 from scripts.papers.standing.results import Results
+from scripts.papers.standing.tables import CAVEATS, sound
+from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 
+PAPER = standing.PAPER
 pytestmark = pytest.mark.xdist_group("standing")  # one process, so that the script runs once
 
 PICTURES = (
@@ -58,54 +57,16 @@ COSTS = {
 """By an implementation of its own, 80 intervals."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """Where the script wrote, what it printed, its exit status and what it computed."""
-
-    folder: Path
-    printed: str
-    status: int
-    results: Results
-
-    def table(self, name: str) -> list[dict[str, str]]:
-        with (self.folder / name).open(newline="", encoding="utf-8") as stream:
-            return list(csv.DictReader(stream))
-
-    @property
-    def plans(self) -> Iterator[tuple[str, str, Plan]]:
-        for task, group in self.results.plans.items():
-            for key, plan in group.items():
-                yield task, key, plan
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The script, run once into a temporary folder."""
-    out = tmp_path_factory.mktemp("results")
-    computed: list[Results] = []
-
-    def compute() -> Results:
-        computed.append(standing_results.compute())
-        return computed[-1]
-
-    lines: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(standing, "compute", compute)
-        patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
-        status = standing.main(["--out", str(out)])
-    return Run(out / "standing", "\n".join(lines), status, computed[0])
-
-
-@pytest.fixture(scope="module")
-def summary(run: Run) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((run.folder / "summary.json").read_text(encoding="utf-8"))
-    return content
+def plans_of(run: Run[Results]) -> Iterator[tuple[str, str, Plan]]:
+    for task, group in run.results.plans.items():
+        for key, plan in group.items():
+            yield task, key, plan
 
 
 # ---- local laws
 
 
-def test_the_pseudo_inverse_leaves_the_foot(summary: dict[str, Any]) -> None:
+def test_the_pseudo_inverse_leaves_the_foot(summary: Summary) -> None:
     found = summary["table1"]["pseudo_inverse"]
     assert found["index_min"] == pytest.approx(-5.3, abs=0.05)
     assert (found["zmp_min_m"], found["zmp_max_m"]) == pytest.approx((-0.066, 0.250), abs=5e-4)
@@ -114,7 +75,7 @@ def test_the_pseudo_inverse_leaves_the_foot(summary: dict[str, Any]) -> None:
     assert found["cost"] == pytest.approx(2.49, rel=0.01)
 
 
-def test_an_index_of_one_is_no_success(summary: dict[str, Any]) -> None:
+def test_an_index_of_one_is_no_success(summary: Summary) -> None:
     for form in ("augmented", "null_space"):
         found = summary["table1"][form]
         assert found["index_min"] == pytest.approx(1.0, abs=1e-9)
@@ -125,11 +86,11 @@ def test_an_index_of_one_is_no_success(summary: dict[str, Any]) -> None:
         assert "lifts off at 1.131 s" in found["verdict"]
 
 
-def test_the_two_forms_of_the_law_agree(summary: dict[str, Any]) -> None:
+def test_the_two_forms_of_the_law_agree(summary: Summary) -> None:
     assert 0 <= max(summary["forms_difference"].values()) < 1e-9
 
 
-def test_every_layer_over_a_pinned_point_falls(run: Run) -> None:
+def test_every_layer_over_a_pinned_point_falls(run: Run[Results]) -> None:
     rows = run.table("layers.csv")
     assert len(rows) > 12
     for row in rows:
@@ -138,7 +99,7 @@ def test_every_layer_over_a_pinned_point_falls(run: Run) -> None:
         assert float(row["index_min"]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_stabilised_law_stands_and_what_it_misses_is_told(run: Run, summary: dict[str, Any]) -> None:
+def test_the_stabilised_law_stands_and_what_it_misses_is_told(run: Run[Results], summary: Summary) -> None:
     found = summary["table1"]["stabilised"]
     assert found["reason"] == "stands"
     assert found["index_min"] == pytest.approx(1.0, abs=1e-9)
@@ -147,18 +108,18 @@ def test_the_stabilised_law_stands_and_what_it_misses_is_told(run: Run, summary:
     assert found["leaves_joint_limits_s"] == "never"
     rows = {row["quantity"]: row for row in run.table("comparison.csv") if row["motion"] == "stabilised"}
     assert float(rows["cost"]["difference"]) == pytest.approx(found["cost"] - 0.17, abs=1e-6)
-    assert standing.CAVEATS["stabilised"] in run.printed
+    assert CAVEATS["stabilised"] in run.printed
     used = [row for row in run.table("stabiliser.csv") if row["used"] == "yes"]
     assert len(used) == 1
     assert (float(used[0]["poles_1_s"]), float(used[0]["p1_gain_1_s2"])) == (4.0, 0.0)
     assert float(used[0]["cost"]) == pytest.approx(found["cost"], rel=1e-5)
 
 
-def test_the_stabilised_law_fails_against_the_spring(summary: dict[str, Any]) -> None:
+def test_the_stabilised_law_fails_against_the_spring(summary: Summary) -> None:
     assert summary["table2"]["stabilised_spring"]["reason"] == "lift_off"
 
 
-def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not_one(summary: dict[str, Any]) -> None:
+def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not_one(summary: Summary) -> None:
     found = summary["table1"]["as_printed"]
     assert found["reason"] == "joint_limit"
     assert found["reaches_s"] == pytest.approx(2 * np.pi)
@@ -176,7 +137,7 @@ def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
     np.testing.assert_allclose(ours.joint_accelerations, other.joint_accelerations, atol=1e-8)
 
 
-def test_motions_are_judged_by_what_fails_first_on_the_ground(run: Run) -> None:
+def test_motions_are_judged_by_what_fails_first_on_the_ground(run: Run[Results]) -> None:
     sound = run.results.local["table1"]["stabilised"].motion
     assert fails(sound)[0] == "stands"
     assert fails(sound)[1] == pytest.approx(HORIZON)
@@ -197,18 +158,18 @@ def test_motions_are_judged_by_what_fails_first_on_the_ground(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("task", "key"), COSTS)
-def test_optimal_costs_are_the_known_ones(task: str, key: str, summary: dict[str, Any]) -> None:
+def test_optimal_costs_are_the_known_ones(task: str, key: str, summary: Summary) -> None:
     assert summary[task][key]["intervals"] == 80
     assert summary[task][key]["cost"] == pytest.approx(COSTS[task, key], rel=0.01)
 
 
-def test_minimum_times_are_the_known_ones_and_grow_with_the_restriction(summary: dict[str, Any]) -> None:
+def test_minimum_times_are_the_known_ones_and_grow_with_the_restriction(summary: Summary) -> None:
     found = [summary["minimum_time"][f"{key}_s"] for key in ("free", "in_foot", "index_nine_tenths")]
     assert found == pytest.approx([0.457, 0.503, 0.539], rel=0.01)
     assert found == sorted(found)
 
 
-def test_a_stricter_rule_costs_more(summary: dict[str, Any]) -> None:
+def test_a_stricter_rule_costs_more(summary: Summary) -> None:
     order = ("optimal_free", "optimal_range", "optimal_index_half", "optimal_index_nine_tenths", "optimal_pinned")
     costs = [summary["table1"][key]["cost"] for key in order]
     assert costs == sorted(costs)
@@ -217,19 +178,19 @@ def test_a_stricter_rule_costs_more(summary: dict[str, Any]) -> None:
     assert costs == sorted(costs)
 
 
-def test_local_motions_that_get_to_the_end_cost_more_than_the_plan_of_their_rule(summary: dict[str, Any]) -> None:
+def test_local_motions_that_get_to_the_end_cost_more_than_the_plan_of_their_rule(summary: Summary) -> None:
     one = summary["table1"]
     for key in ("pseudo_inverse", "damped", "as_printed"):
         assert one[key]["cost"] > one["optimal_free"]["cost"]
     assert one["stabilised"]["cost"] > one["optimal_pinned_points"]["cost"]
 
 
-def test_the_zero_moment_point_of_the_plan_keeps_inside_the_foot(summary: dict[str, Any]) -> None:
+def test_the_zero_moment_point_of_the_plan_keeps_inside_the_foot(summary: Summary) -> None:
     found = summary["table1"]["optimal_range"]
     assert -0.081 < found["zmp_min_m"] < found["zmp_max_m"] < 0.181
 
 
-def test_every_plan_that_is_drawn_holds_between_its_nodes(run: Run, summary: dict[str, Any]) -> None:
+def test_every_plan_that_is_drawn_holds_between_its_nodes(run: Run[Results], summary: Summary) -> None:
     assert run.status == 0
     rows = [row for row in run.table("checks.csv") if row["drawn"] == "yes"]
     assert len(rows) == 12
@@ -242,9 +203,9 @@ def test_every_plan_that_is_drawn_holds_between_its_nodes(run: Run, summary: dic
     assert max(limit for name, limit in ALLOWED.items() if name not in ("zmp_excess_m", "tip_error_m")) == 1e-6
 
 
-def test_audits_pass_but_for_the_multiplier_of_held_controls(run: Run) -> None:
+def test_audits_pass_but_for_the_multiplier_of_held_controls(run: Run[Results]) -> None:
     text = (run.folder / "audit.txt").read_text(encoding="utf-8")
-    for task, key, plan in run.plans:
+    for task, key, plan in plans_of(run):
         assert f"{task}, {key}:" in text
         missed = {name for name, _, _ in failures(plan)}
         if not plan.request.drawn:
@@ -257,8 +218,8 @@ def test_audits_pass_but_for_the_multiplier_of_held_controls(run: Run) -> None:
                 assert plan.audit.passed
 
 
-def test_plans_are_looked_at_on_ten_times_their_grid_with_both_ends_of_every_interval(run: Run) -> None:
-    for _, _, plan in run.plans:
+def test_plans_are_looked_at_on_ten_times_their_grid_with_both_ends_of_every_interval(run: Run[Results]) -> None:
+    for _, _, plan in plans_of(run):
         motion, n = plan.motion, plan.request.intervals
         assert motion.t.shape == (11 * n,)
         assert (np.diff(motion.t) > 0).all()
@@ -268,13 +229,13 @@ def test_plans_are_looked_at_on_ten_times_their_grid_with_both_ends_of_every_int
             assert within.max() < 1e-9  # each interval shows its own control at both ends
 
 
-def test_the_cost_of_a_plan_is_that_of_its_fine_motion(run: Run) -> None:
-    for task, _, plan in run.plans:
+def test_the_cost_of_a_plan_is_that_of_its_fine_motion(run: Run[Results]) -> None:
+    for task, _, plan in plans_of(run):
         if task != "minimum_time":
             assert motion_cost(plan.motion) == pytest.approx(plan.solution.cost, abs=2e-4)
 
 
-def test_checks_and_exit_status_find_a_plan_that_does_not_hold(run: Run) -> None:
+def test_checks_and_exit_status_find_a_plan_that_does_not_hold(run: Run[Results]) -> None:
     plan = run.results.plans["table1"]["optimal_range"]
     assert check("", plan)["holds"]
     motion = plan.motion
@@ -291,14 +252,14 @@ def test_checks_and_exit_status_find_a_plan_that_does_not_hold(run: Run) -> None
         assert not row["holds"]
     row = check("", replace(plan, tip_error=2e-5))
     assert not row["holds"]
-    assert not standing.sound(replace(run.results, checks=[{**row, "drawn": True}]))
+    assert not sound(replace(run.results, checks=[{**row, "drawn": True}]))
     failed = replace(plan, audit=run.results.plans["table1"]["optimal_pinned"].audit)
     plans = {"table1": {"optimal_range": failed}}
-    assert standing.sound(run.results)
-    assert not standing.sound(replace(run.results, plans=plans))
+    assert sound(run.results)
+    assert not sound(replace(run.results, plans=plans))
 
 
-def test_regions_of_the_zero_moment_point(run: Run) -> None:
+def test_regions_of_the_zero_moment_point(run: Run[Results]) -> None:
     motion = run.results.plans["table1"]["optimal_free"].motion
     least = -float(motion.zero_moment_point[:, 1].min())
     assert region_excess(InFoot(0.02), motion) == pytest.approx(least - 0.08)
@@ -309,7 +270,7 @@ def test_regions_of_the_zero_moment_point(run: Run) -> None:
         region_excess(Following(lambda t: [0.0, t]), motion)
 
 
-def test_costs_converge_with_the_intervals(run: Run) -> None:
+def test_costs_converge_with_the_intervals(run: Run[Results]) -> None:
     rows = run.table("convergence.csv")
     names = {(row["task"], row["plan"]) for row in rows}
     assert ("table1", "optimal_range") in names
@@ -332,7 +293,7 @@ def test_costs_converge_with_the_intervals(run: Run) -> None:
 # ---- files
 
 
-def test_summary_holds_the_numbers_that_matter(summary: dict[str, Any]) -> None:
+def test_summary_holds_the_numbers_that_matter(summary: Summary) -> None:
     for path in (
         "table1.pseudo_inverse.index_min",
         "table1.augmented.index_min",
@@ -359,7 +320,7 @@ def test_summary_holds_the_numbers_that_matter(summary: dict[str, Any]) -> None:
         assert set(group) <= set(summary[task])
 
 
-def test_tables_are_written_and_the_differences_are_theirs(run: Run, summary: dict[str, Any]) -> None:
+def test_tables_are_written_and_the_differences_are_theirs(run: Run[Results], summary: Summary) -> None:
     for name in TABLES:
         assert run.table(name)
     for row in run.table("comparison.csv"):
@@ -373,7 +334,7 @@ def test_tables_are_written_and_the_differences_are_theirs(run: Run, summary: di
     assert len(motions) == sum(map(len, LOCAL.values())) + sum(map(len, PLANS.values()))
 
 
-def test_what_was_assumed_is_printed_and_written(run: Run, summary: dict[str, Any]) -> None:
+def test_what_was_assumed_is_printed_and_written(run: Run[Results], summary: Summary) -> None:
     for words in summary["assumptions"]:
         assert words in run.printed
     for words in summary["caveats"].values():
@@ -381,7 +342,7 @@ def test_what_was_assumed_is_printed_and_written(run: Run, summary: dict[str, An
     assert "slender rods" in summary["assumptions"][0]
 
 
-def test_the_drawn_arm_ends_at_the_tip_and_has_the_lengths_of_its_links(run: Run) -> None:
+def test_the_drawn_arm_ends_at_the_tip_and_has_the_lengths_of_its_links(run: Run[Results]) -> None:
     motion = run.results.plans["minimum_time"]["in_foot"].motion
     for k in range(0, len(motion.t), 100):
         arm = arm_points(motion.joints[k])
@@ -391,19 +352,13 @@ def test_the_drawn_arm_ends_at_the_tip_and_has_the_lengths_of_its_links(run: Run
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures_are_drawn_to_their_edges_and_not_beyond(run: Run, name: str) -> None:
-    with Image.open(run.folder / name) as picture:
-        pixels = np.asarray(picture.convert("L"))
-    assert min(pixels.shape) > 400
-    ink = pixels < 250
-    assert 0.005 < ink.mean() < 0.5
-    border = [ink[0], ink[-1], ink[:, 0], ink[:, -1]]  # anything that touches the edge is clipped
-    assert not any(side.any() for side in border)
+def test_pictures_are_drawn_to_their_edges_and_not_beyond(run: Run[Results], name: str) -> None:
+    assert_whole_picture(run.folder / name)
 
 
 @pytest.mark.parametrize(("name", "frames", "seconds"), [("motion.gif", 64, 7.4), ("lift.gif", 55, 6.5)])
 def test_animations_show_the_whole_motion_and_mark_where_it_fails(
-    run: Run, name: str, frames: int, seconds: float
+    run: Run[Results], name: str, frames: int, seconds: float
 ) -> None:
     assert (run.folder / name).stat().st_size < 1.5e6
     with Image.open(run.folder / name) as animation:
@@ -416,7 +371,3 @@ def test_animations_show_the_whole_motion_and_mark_where_it_fails(
             orange.append(int(((pixels[..., 0] > 150) & (pixels[..., 1] < 130) & (pixels[..., 2] < 90)).sum()))
     assert lasting == pytest.approx(seconds, abs=0.3)
     assert orange[-1] > orange[0] + 300  # the arm of a motion that has failed
-
-
-def test_reproduce_runs_it() -> None:
-    assert reproduce.present()["standing"] == "scripts.standing"

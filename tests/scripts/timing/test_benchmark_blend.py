@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from models.paths import smooth
-from scripts import drawing
 from scripts.papers.blend.example import REMAINING, example
+from scripts.papers.run import write
 from scripts.timing import blend as benchmark_blend
-from scripts.timing import blend_peers as benchmark_blend_peers
-from scripts.timing.compiled import has_compiler
+from scripts.timing.measure import has_compiler
 
 pytestmark = pytest.mark.xdist_group("benchmark_blend")
 
@@ -77,7 +76,7 @@ def test_long_paths_keep_their_speed(summary: dict[str, Any]) -> None:
 
 
 def test_it_is_written_and_drawn(summary: dict[str, Any], tmp_path: Path) -> None:
-    drawing.write_json(tmp_path / "blend.json", summary)
+    write(tmp_path / "blend.json", summary)
     read = json.loads((tmp_path / "blend.json").read_text(encoding="utf-8"))
     assert list(read) == ["rows", "planning", "scale", "toppra", "profiles", "targets"]
     benchmark_blend.plot(tmp_path / "blend.png", read)
@@ -90,5 +89,5 @@ def test_peers_that_are_not_installed_are_left_out(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(importlib, "import_module", missing)
     path = smooth(example(), REMAINING)
-    assert benchmark_blend_peers.peer_plans(path, 1) is None
-    assert benchmark_blend_peers.roots(path.coefficients[0]) is None
+    assert benchmark_blend.peer_plans(path, 1) is None
+    assert benchmark_blend.roots(path.coefficients[0]) is None

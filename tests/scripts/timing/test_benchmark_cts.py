@@ -1,4 +1,4 @@
-"""The benchmark of the captive trajectory rig, and how scripts/benchmark.py runs modules of its shape."""
+"""The benchmark of the captive trajectory rig, and how scripts/benchmark.py runs its parts."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from PIL import Image
 from models.cts.best_roll import optimal_inverse
 from models.papers import reference_rig, reference_tunnel
 from scripts import benchmark
-from scripts.papers.cts import compiled as cts_compiled
 from scripts.papers.cts.results import sweep_targets
 from scripts.timing import cts as benchmark_cts
 
 
-def test_a_module_is_run_and_its_tables_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_is_run_and_its_tables_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark_cts, "COUNT", 8)
     monkeypatch.setattr(benchmark_cts, "PEER_COUNT", 2)
     monkeypatch.setattr(benchmark_cts, "has_compiler", lambda: False)
-    assert "cts" in benchmark.MODULES
-    benchmark.run_module("cts", tmp_path, 1)
+    assert "cts" in benchmark.PARTS
+    benchmark.run_part("cts", tmp_path, 1)
     with (tmp_path / "cts.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     named = {(row["method"], row["targets"]): float(row["ns_per_target"]) for row in rows}
@@ -40,7 +39,7 @@ def test_compiled_is_what_python_gives_and_a_bad_row_leaves_the_others() -> None
     function = optimal_inverse(reference_rig(**benchmark_cts.LIMITS), reference_tunnel())
     rows = np.vstack([benchmark_cts.random_reachable(60), sweep_targets(20)])
     rows[[5, 17], [0, 3]] = np.nan, np.inf
-    found = cts_compiled.compiled_inverse(function, rows, np.zeros(1), 1).result
+    found = benchmark_cts.compiled_inverse(function, rows, 1)[0]
     joints, cost, active, status = (np.array(part) for part in function.map(80)(rows.T, np.zeros((1, 80))))
     np.testing.assert_array_equal(found[:, 8], status[0])
     np.testing.assert_array_equal(found[:, 7][status[0] == 0], active[0][status[0] == 0])

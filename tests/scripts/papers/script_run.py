@@ -1,0 +1,75 @@
+"""One run of a paper's script, for all tests of what it computed, wrote and printed."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from functools import cached_property
+from io import StringIO
+from pathlib import Path
+from typing import Any, Generic, TypeAlias, TypeVar
+
+import numpy as np
+from PIL import Image
+
+from scripts.papers.run import Paper
+
+__all__ = ["Run", "Summary", "Table", "assert_whole_picture", "column", "run_script"]
+
+Results = TypeVar("Results")
+Table: TypeAlias = list[dict[str, str]]
+Summary: TypeAlias = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Run(Generic[Results]):
+    """Where the script wrote, what it printed, its exit status and what it computed."""
+
+    folder: Path
+    printed: str
+    status: int
+    results: Results
+
+    def table(self, name: str) -> Table:
+        with (self.folder / name).open(newline="", encoding="utf-8") as stream:
+            return list(csv.DictReader(stream))
+
+    @cached_property
+    def summary(self) -> Summary:
+        content: Summary = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+        return content
+
+    @property
+    def names(self) -> set[str]:
+        """Of the files that were written."""
+        return {path.name for path in self.folder.iterdir()}
+
+
+def run_script(paper: Paper[Results], out: Path) -> Run[Results]:
+    """The script, run into a folder."""
+    computed: list[Results] = []
+
+    def compute() -> Results:
+        computed.append(paper.compute())
+        return computed[-1]
+
+    with redirect_stdout(StringIO()) as printed:
+        status = replace(paper, compute=compute).main(["--out", str(out)])
+    return Run(out / paper.name, printed.getvalue(), status, computed[0])
+
+
+def column(table: Table, name: str, **where: str) -> np.ndarray:
+    """Numbers of one column, of the rows where other columns have given texts."""
+    return np.array([float(row[name]) for row in table if all(row[key] == value for key, value in where.items())])
+
+
+def assert_whole_picture(path: Path) -> None:
+    """Something is drawn, and nothing that touches the edge: that would be clipped."""
+    with Image.open(path) as picture:
+        ink = np.asarray(picture.convert("L")) < 250
+    assert min(ink.shape) > 400
+    assert 0.005 < ink.mean() < 0.5
+    assert not any(side.any() for side in (ink[0], ink[-1], ink[:, 0], ink[:, -1]))
