@@ -14,6 +14,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
+LONGEST_SHOWN = 12  # entries of a vector in a message
+
 _Choice = TypeVar("_Choice")
 
 
@@ -80,9 +82,12 @@ def _read(value: ArrayInput, owner: str, what: str) -> Array:
 
 
 def _shown(array: Array, wrong: Any, what: str) -> str:
-    """Name and values, of a table only the first row that is wrong."""
-    if array.ndim < 2:
+    """Name and values; of a table only the first row that is wrong, of a long vector the first entry."""
+    if array.ndim < 2 and array.size <= LONGEST_SHOWN:
         return f"{what} {array.tolist()}"
+    if array.ndim == 1:
+        entry = int(np.flatnonzero(wrong)[0])
+        return f"{what} (entry {entry}) {array[entry].item()}"
     row = int(np.flatnonzero(wrong.reshape(len(array), -1).any(axis=1))[0])
     return f"{what} (row {row}) {array[row].tolist()}"
 
@@ -95,26 +100,17 @@ def checked_number(
 
 
 def one_for_each(
-    value: ArrayInput,
-    count: int,
-    owner: str,
-    what: str,
-    items: str,
-    *,
-    finite: bool = True,
-    positive: bool = False,
-    unit: str = "",
+    value: ArrayInput, count: int, owner: str, what: str, items: str, *, finite: bool = True, **checks: Any
 ) -> Array:
     """`value`, one number for all `items` or one for each of the `count`, as one for each. Shape (count,).
 
-    Raises:
-        ModelError: As checked_array.
+    Further arguments and errors as of checked_array.
     """
     array = _read(value, owner, what)
     if array.ndim and array.shape != (count,):
         message = f"{owner}: {what} has shape {array.shape}; give one number, or one for each of the {count} {items}"
         raise ModelError(message, name=what, value=array, limit=(count,))
-    known = checked_array(array, array.shape, owner, what, finite=finite, positive=positive, unit=unit)
+    known = checked_array(array, array.shape, owner, what, finite=finite, **checks)
     return frozen(np.array(np.broadcast_to(known, (count,))))
 
 

@@ -43,6 +43,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         (lambda: checked_array([1], ("n", 3), "a", "b", least=2), r"\(1,\), expected \(n, 3\), 2 at", "b", ("n", 3)),
         (lambda: checked_array([[1, 2], [3, np.inf]], (2, 2), "a", "b"), r"b \(row 1\) \[3.0, inf\] is not", "b", None),
         (lambda: checked_array([1, np.inf], (2,), "a", "b", nan=True), r"a: b \[1.0, inf\] is not finite", "b", None),
+        (lambda: checked_array([1.0] * 30 + [-2], ("n",), "a", "b", positive=True), r"\(entry 30\) -2.0", "b", 0.0),
         (lambda: checked_array([1, np.nan], (2,), "a", "b", finite=False), "is not finite", "b", None),
         (lambda: checked_number(-1, "a", "b", positive=True, unit="m"), "a: b -1.0 m is not positive", "b", 0.0),
         (lambda: one_for_each([1, 2], 3, "a", "b", "joints"), "or one for each of the 3 joints", "b", (3,)),
