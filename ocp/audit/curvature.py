@@ -1,10 +1,10 @@
 """Second order: does the cost curve upwards along every feasible variation of a plan, and what does the plan lose?
 
-A stationary plan may be a maximum, a saddle, or a minimum only until a conjugate point. Here the second variation of the
-cost is formed along the plan (the accessory problem of Bryson, Ho 1975, chapter 6): a linear-quadratic problem in the
-variations of states, horizon and controls, whose constraints are those that are active. It is made discrete by Gauss
-collocation of its own, three points or more an interval whatever the method of the plan, and swept backwards stage by
-stage. At each stage what the stage's own constraints and those carried over from later ones leave free must curve
+A stationary plan may be a maximum, a saddle, or a minimum only until a conjugate point. Here the second variation of
+the cost is formed along the plan (the accessory problem of Bryson, Ho 1975, chapter 6): a linear-quadratic problem in
+the variations of states, horizon and controls, whose constraints are those that are active. It is made discrete by
+Gauss collocation of its own, three points or more in each interval whatever the method of the plan, and swept backwards
+stage by stage. At each stage what the stage's own constraints and those carried over from later ones leave free must curve
 upwards; where it first does not is the conjugate point, and the eigenvector continued with the optimal feedback is a
 variation that lowers the cost. The sweep is linear in the number of intervals.
 """
@@ -65,9 +65,7 @@ class Curvature:
         return bool(self.least > FLAT)
 
 
-def curvature(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-) -> Curvature:
+def curvature(form: Formulation, solution: Solution, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> Curvature:
     """Sweep the second variation of the cost along a plan whose costates are trusted.
 
     Args:
@@ -82,7 +80,7 @@ def curvature(
         return Curvature(np.nan, None, along.obstacle, lost, None, along.t)
     found = _sweep(along, held=False)
     if found.least <= FLAT and along.held.any():
-        # a bound of a state takes directions away; where only it keeps the cost from falling, first order has to say why
+        # a bound of a state takes directions away; where only it keeps the cost from falling, that is not enough
         inside = _sweep(along, held=True)
         if inside.least > FLAT:
             why = "the cost curves upwards only because a state is held at its bound"
@@ -99,8 +97,8 @@ class _Along:
 
     Attributes:
         width, weight, places: Of the N intervals (N,) and of the Gauss points in one, (q,) each.
-        rate: Jacobian of dz/ds in (z, u). Shape (N, q, nz, nz + nu).
-        hessian: Of T H in (z, u). Shape (N, q, nz + nu, nz + nu).
+        rate: Jacobian of dz/ds in (z, u) at the N q points. Shape (N q, nz, nz + nu).
+        hessian: Of T H in (z, u). Shape (N q, nz + nu, nz + nu).
         rows: Active constraints with a control, (r, nz + nu) for every point; held: which states are at a bound,
             (N, q, nz) bool.
         unit: Of (z, u): spread along the plan. Shape (nz + nu,).
@@ -154,9 +152,7 @@ class _Along:
         sym = form.problem.symbols.sym
         fraction, lam, mu = sym("s"), sym("lam", nx), sym("mu", len(form.path))
         y = ca.vertcat(form.x, form.T, form.u)
-        running, f, path = ca.substitute(
-            [form.running, form.f, form.path.expression], [form.t], [fraction * form.T]
-        )
+        running, f, path = ca.substitute([form.running, form.f, form.path.expression], [form.t], [fraction * form.T])
         value = running + ca.dot(lam, f)
         first = [ca.gradient(value, form.u), ca.jacobian(form.T * f, y), path, ca.jacobian(path, y)]
         symbols = [form.x, form.u, fraction, form.T, form.p, lam, mu]
@@ -190,7 +186,9 @@ class _Along:
             if not self.obstacle and ca.jacobian(ca.jacobian(rows, form.x), form.x).nnz():
                 self.obstacle = "a curved constraint of the states is active, whose multiplier is not known"
 
-        (hessian,) = _at(symbols, [ca.hessian(form.T * (value + ca.dot(mu, path)), y)[0]], [*columns, multipliers[:, nu:].T])
+        (hessian,) = _at(
+            symbols, [ca.hessian(form.T * (value + ca.dot(mu, path)), y)[0]], [*columns, multipliers[:, nu:].T]
+        )
         hessian = hessian.reshape(m, nx + 1 + nu, nx + 1 + nu)
         self.curved = hessian[:, nx + 1 :, nx + 1 :] / self.solution.horizon  # H_uu
 
@@ -220,14 +218,14 @@ class _Along:
         self.held = (bound.any(axis=1) | (in_state & ~form.path.equality).any(axis=1)).reshape(n, q)
         eye = np.eye(size)
         self.rows = [
-            np.vstack([active_rows[k][holds[k] & mixed | in_state[k] & form.path.equality], eye[self.nz :][self.fixed[k]]])
+            np.vstack(
+                [active_rows[k][holds[k] & mixed | in_state[k] & form.path.equality], eye[self.nz :][self.fixed[k]]]
+            )
             for k in range(m)
         ]
         self.held_rows = [
             np.vstack([active_rows[k][in_state[k] & ~form.path.equality], eye[bound[k]]]) for k in range(m)
         ]
-        self.rate = self.rate.reshape(n, q, self.nz, size)
-        self.hessian = self.hessian.reshape(n, q, size, size)
 
     def lost(self) -> float:
         """What the controls could win within their bounds, to second order, in units of cost."""
@@ -242,10 +240,10 @@ class _Along:
 
 
 def balance(gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray) -> np.ndarray:
-    """Multipliers of active constraints that make gradient + directions' multipliers least, with their signs. Shape (m,).
+    """Multipliers (m,) of active constraints that make gradient (n,) + directions (m, n)' multipliers least.
 
-    At least zero at an upper bound, at most zero at a lower one, free at an equality. Wrongly signed ones are dropped one
-    by one, the worst first.
+    At least zero at an upper bound, at most zero at a lower one, free at an equality. Wrongly signed ones are dropped
+    one by one, the worst first.
     """
     found = np.zeros(len(directions))
     active = list(np.flatnonzero(at_lower | at_upper))
@@ -304,7 +302,7 @@ def null_space(rows: np.ndarray) -> np.ndarray:
 
 
 def _ends(along: _Along) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Second variation and active rows at both ends, in scaled z: (hessian, rows) at the end, (hessian, rows) at the start.
+    """Second variation and active rows in scaled z: (hessian, rows) at the end, (hessian, rows) at the start.
 
     The multipliers of the conditions are those that explain the costates: lambda(T) = d(Phi + nu psi)/dx, and
     -lambda(0) = d(Phi + nu psi)/dx0 + nu_0 dpsi_0/dx.
@@ -317,7 +315,7 @@ def _ends(along: _Along) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     both = ca.vertcat(form.x, form.T, form.x0)
-    total = last[1] + ca.dot(nu_end, last[0]) + ca.dot(nu_start, begin)
+    total = [last[1] + ca.dot(nu_end, last[0]), ca.dot(nu_start, begin)]
     symbols = [form.x, form.x0, form.T, form.p]
     arguments = (x1, x0, solution.horizon, along.p)
     values = ca.Function("ends", symbols, [last[0], ca.jacobian(last[0], both), begin, ca.jacobian(begin, both)])
@@ -339,21 +337,25 @@ def _ends(along: _Along) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     free = np.concatenate([~fixed["terminal"], ~fixed["initial"]])
     target = np.concatenate([lam1, -lam0]) - slope[[*range(nx), *range(nx + 1, 2 * nx + 1)]]
     columns = np.vstack([psi_y[at_end], psi0_y[at_start]])[:, [*range(nx), *range(nx + 1, 2 * nx + 1)]].T
-    found = np.linalg.lstsq(columns[free], target[free], rcond=None)[0] if columns[free].size else np.zeros(columns.shape[1])
+    found = (
+        np.linalg.lstsq(columns[free], target[free], rcond=None)[0]
+        if columns[free].size
+        else np.zeros(columns.shape[1])
+    )
     multipliers = np.zeros(len(form.end) + len(form.start))
     multipliers[np.concatenate([at_end, at_start])] = found
-    curved = ca.Function("curved", [*symbols, nu_end, nu_start], [ca.densify(ca.hessian(total, both)[0])])
-    hessian = np.asarray(curved(*arguments, multipliers[: len(form.end)], multipliers[len(form.end) :]).full())
+    curved = ca.Function("curved", [*symbols, nu_end, nu_start], [ca.densify(ca.hessian(v, both)[0]) for v in total])
+    at_ends = curved(*arguments, multipliers[: len(form.end)], multipliers[len(form.end) :])
+    end_curved, start_curved = (np.asarray(v.full()) for v in at_ends)
 
     # rows and columns of (x, T, x0) that z has; at the start x is the x0 of the conditions
     z = [*range(nx), *([nx] if along.free else []), *(range(nx + 1, 2 * nx + 1) if along.tied else [])]
     z_unit = along.unit[: along.nz]
     eye = np.eye(along.nz)
-    end_hessian, end_rows = hessian[np.ix_(z, z)], np.vstack([psi_y[at_end][:, z], eye[:nx][fixed["terminal"]]])
+    end_hessian, end_rows = end_curved[np.ix_(z, z)], np.vstack([psi_y[at_end][:, z], eye[:nx][fixed["terminal"]]])
     begin_of = [*range(nx + 1, 2 * nx + 1), *([nx] if along.free else [])]
     start_hessian, start_rows = np.zeros((along.nz, along.nz)), np.zeros((int(at_start.sum()), along.nz))
-    if not along.tied:
-        start_hessian[: len(begin_of), : len(begin_of)] = hessian[np.ix_(begin_of, begin_of)]
+    start_hessian[: len(begin_of), : len(begin_of)] = start_curved[np.ix_(begin_of, begin_of)]
     start_rows[:, : len(begin_of)] = psi0_y[at_start][:, begin_of]
     extra = [eye[:nx][fixed["initial"]]]
     if along.tied:
@@ -387,7 +389,8 @@ def _sweep(along: _Along, held: bool) -> _Swept:
     a, b = gauss(along.places)
     h = along.width
     # variations at the Gauss points from those at the start of the interval and those of the controls
-    rate_z, rate_u = along.rate[..., :nz], along.rate[..., nz:]
+    rate = along.rate.reshape(n, q, nz, nz + nu)
+    rate_z, rate_u = rate[..., :nz], rate[..., nz:]
     system = np.eye(q * nz) - np.einsum("k,ij,kjab->kiajb", h, a, rate_z).reshape(n, q * nz, q * nz)
     right = np.zeros((n, q, nz, nz + q * nu))
     right[..., :nz] = np.eye(nz)
@@ -400,14 +403,15 @@ def _sweep(along: _Along, held: bool) -> _Swept:
     for j in range(q):
         whole[:, j, nz:, nz + j * nu : nz + (j + 1) * nu] = np.eye(nu)
     whole[..., nz:] /= np.repeat(metric, nu, axis=1)[:, None, None, :]
-    step = np.einsum("k,j,kjab,kjbc->kac", h, b, along.rate, whole)
+    step = np.einsum("k,j,kjab,kjbc->kac", h, b, rate, whole)
     step[:, :, :nz] += np.eye(nz)
-    stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, along.hessian, whole)
+    stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, along.hessian.reshape(n, q, nz + nu, nz + nu), whole)
 
     cost, rows, start_cost, start_rows = _ends(along)
     sizes = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
     scale = float(max(sizes.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
-    least, at, flat, gains = np.inf, None, "", []
+    least, at, flat = np.inf, None, ""
+    gains: list[np.ndarray] = []
     for k in reversed(range(n)):
         joined = stage[k] + step[k].T @ cost @ step[k]
         own = [along.rows[k * q + j] @ whole[k, j] for j in range(q)]
@@ -433,7 +437,10 @@ def _sweep(along: _Along, held: bool) -> _Swept:
             curved = values > FLAT * scale
             if not curved.all():
                 label = _label(form, basis @ vectors[:, 0], nu)
-                flat = flat or f"the cost does not curve along control {label!r} at {mesh[k] * along.solution.horizon:.4g} s"
+                flat = (
+                    flat
+                    or f"the cost does not curve along control {label!r} at {mesh[k] * along.solution.horizon:.4g} s"
+                )
             inverse = (vectors[:, curved] / values[curved]) @ vectors[:, curved].T
             gain = follow - basis @ inverse @ mixed
             cost = cost - mixed.T @ inverse @ mixed
@@ -460,7 +467,7 @@ def _variation(
     metric: np.ndarray,
     start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A variation that begins at an interval with these controls, or at the start, and goes on with the best feedback."""
+    """A variation that begins at an interval with these controls, or at the start, then follows the best feedback."""
     (n, q), nz, nu = along.shape, along.nz, along.nu
     z = np.zeros(nz) if start is None else start
     states, values = np.zeros((n + 1, nz)), np.zeros((n, q * nu))

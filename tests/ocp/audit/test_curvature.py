@@ -1,0 +1,228 @@
+"""Second order: conjugate points in closed form, the reduced Hessian of the program, and what must not change it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ocp import Collocation, MultipleShooting, Problem, Solution, prepare, solve
+from ocp.audit.curvature import Curvature, balance, curvature
+from ocp.problem.formulation import Formulation
+
+METHOD = Collocation(intervals=20, degree=3)
+
+
+def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
+    solution = solve(problem, method, **how)
+    form = Formulation(problem)
+    p = form.parameter_vector(solution.parameters)
+    return solution, curvature(form, solution, p, form.bound_values(p))
+
+
+def oscillator(horizon: float, stiffness: float = 1.0, unit: float = 1.0, price: float = 1.0) -> Problem:
+    """min int u^2 - k x^2 from 0 to 0: a minimum until sqrt(k) T = pi, without one after it."""
+    problem = Problem("oscillator")
+    x = problem.state("x", initial=0.0, terminal=0.0)
+    u = problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(horizon)
+    problem.minimize(price * (u**2 - stiffness * x**2) / unit**2)
+    return problem
+
+
+@given(st.floats(0.2, 8.0), st.floats(0.1, 30.0), st.sampled_from([1e-6, 1.0, 1e6]), st.sampled_from([1e-3, 1.0, 1e5]))
+def test_a_plan_is_a_minimum_until_the_conjugate_point(share: float, k: float, unit: float, price: float) -> None:
+    if abs(share - np.pi) < 0.02:
+        return
+    _, found = look(oscillator(share / np.sqrt(k), k, unit, price))
+    assert found.upwards is (share < np.pi)
+    if share > np.pi:  # the point conjugate to the end lies half a turn before it, in the interval that is named
+        interval = share / np.sqrt(k) / 20
+        assert found.time is not None
+        assert -1e-9 <= (share - np.pi) / np.sqrt(k) - found.time <= interval * (1 + 1e-9)
+
+
+def random_quadratic(rng: np.random.Generator, fixed: bool, bounded: bool) -> Problem:
+    """An indefinite linear-quadratic problem whose plan is zero."""
+    n, m = int(rng.integers(1, 5)), int(rng.integers(1, 3))
+    a, b, q, f = rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=(n, n)), rng.normal(size=(n, n))
+    r, s = rng.normal(size=(m, m)), 0.3 * rng.normal(size=(n, m))
+    problem = Problem("quadratic")
+    x = problem.state("x", n, initial=np.zeros(n), terminal=np.zeros(n) if fixed else None, guess=0.0)
+    u = problem.control("u", m, guess=0.0, **({"lower": -1.0, "upper": 1.0} if bounded else {}))
+    problem.dynamics(x, ca.mtimes(a, x) + ca.mtimes(b, u))
+    problem.horizon(float(rng.uniform(0.3, 3.0)))
+    bend = 4.0 if fixed else 1.0  # an end that is given needs more of it to spoil a minimum
+    running = bend * ca.bilin(ca.DM(q + q.T), x, x) / 2 + ca.bilin(ca.DM(r @ r.T + 0.3 * np.eye(m)), u, u) / 2
+    problem.minimize(running + ca.dot(x, ca.mtimes(s, u)), ca.bilin(ca.DM(f + f.T), x, x) / 2)
+    return problem
+
+
+def reduced_hessian(problem: Problem) -> np.ndarray:
+    """Eigenvalues of the program's Hessian along its equalities and active bounds, densely: an independent answer."""
+    built = prepare(problem, Collocation(intervals=8, degree=3))
+    solution = built.solve()
+    v, fragment, program = solution.variables, built.fragment, built.program
+    hessian = np.array(ca.triu2symm(program.hessian(v, [], 1.0, solution.multipliers)).full())
+    low, high = built.formulation.bound_values(np.zeros(0))  # type: ignore[union-attr]
+    rows, columns = (low == high)[fragment.row_bounds], (low == high)[fragment.variable_bounds]
+    active = np.vstack([np.array(program.jacobian(v, [])[1].full())[rows], np.eye(len(v))[columns]])
+    _, sizes, directions = np.linalg.svd(active)
+    basis = directions[int((sizes > 1e-10 * sizes[0]).sum()) :].T
+    return np.asarray(np.linalg.eigvalsh(basis.T @ hessian @ basis))
+
+
+@pytest.mark.parametrize("fixed", [True, False], ids=["to zero", "free end"])
+@pytest.mark.parametrize("bounded", [True, False], ids=["bounded", "unbounded"])
+def test_the_verdict_is_that_of_the_reduced_hessian(fixed: bool, bounded: bool) -> None:
+    rng = np.random.default_rng(11)
+    verdicts = []
+    for _ in range(12):
+        problem = random_quadratic(rng, fixed, bounded)
+        _, found = look(problem)
+        verdicts.append(found.upwards)
+        assert found.upwards is bool(reduced_hessian(problem)[0] > 0)
+    assert {True, False} <= set(verdicts)
+
+
+def test_the_direction_that_is_returned_lowers_the_cost() -> None:
+    rng = np.random.default_rng(3)
+    seen = 0
+    for fixed in (True, False) * 8:
+        problem = random_quadratic(rng, fixed, False)
+        solution, found = look(problem)
+        if found.upwards:
+            continue
+        seen += 1
+        assert found.direction is not None
+        controls, states = found.direction
+        np.testing.assert_allclose(states[0], 0, atol=1e-12)
+        if fixed:
+            np.testing.assert_allclose(states[-1], 0, atol=1e-7 * np.abs(states).max())
+        form = Formulation(problem)
+        # the cost of the linear system driven by this variation, by a Runge-Kutta method of its own
+        rates = ca.Function("rates", [form.x, form.u], [form.f, form.running])
+        x, cost, fractions = np.zeros(form.nx), 0.0, found.t.reshape(20, -1) / solution.horizon
+        step = solution.horizon / 20 / 50
+        for k, piece in enumerate(controls.reshape(20, -1, form.nu)):
+            places = fractions[k] * 20 - k
+            for j in range(50):
+                share = [(j + c) / 50 for c in (0.0, 0.5, 1.0)]
+                u = [np.array([np.polyval(np.polyfit(places, piece[:, i], len(places) - 1), c) for i in range(form.nu)])
+                     for c in share]  # fmt: skip
+                k1, k2 = rates(x, u[0]), None
+                k2 = rates(x + step / 2 * np.array(k1[0]).ravel(), u[1])
+                k3 = rates(x + step / 2 * np.array(k2[0]).ravel(), u[1])
+                k4 = rates(x + step * np.array(k3[0]).ravel(), u[2])
+                total = [np.array(a + 2 * b + 2 * c + d).ravel() / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)]
+                x, cost = x + step * total[0], cost + step * float(total[1][0])
+        np.testing.assert_allclose(x, states[-1], atol=1e-4 * np.abs(states).max())
+        cost += float(ca.Function("end", [form.x], [form.terminal])(x))
+        assert cost < 0
+    assert seen >= 4
+
+
+def double_integrator(**bounds: Any) -> Problem:
+    problem = Problem("double integrator")
+    q = problem.state("q", initial=0.0, terminal=1.0)
+    v = problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u", **bounds)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.horizon(1.0)
+    problem.minimize(u**2 / 2)
+    return problem
+
+
+@pytest.mark.parametrize(
+    "method",
+    [Collocation(20, control="held"), MultipleShooting(40), MultipleShooting(10, control="linear"), METHOD],
+    ids=str,
+)
+def test_the_lost_cost_is_what_a_held_control_costs_more(method: Any) -> None:
+    solution, found = look(double_integrator(), method)
+    assert found.upwards
+    assert found.lost == pytest.approx(solution.cost - 6.0, rel=5e-3, abs=1e-9)  # the costates are those of the plan
+
+
+def test_what_pushes_against_a_bound_is_not_lost() -> None:
+    _, found = look(double_integrator(lower=-5.0, upper=5.0), Collocation(40, mesh=None))
+    assert found.upwards
+    assert 0 <= found.lost < 1e-4
+
+
+def test_a_maximum_in_the_control_is_named_where_it_is() -> None:
+    problem = Problem("maximum")
+    x = problem.state("x", initial=0.0, terminal=0.0)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.minimize(-(u**2))
+    _, found = look(problem)
+    assert found.upwards is False
+    assert found.lost == pytest.approx(1.0)  # u = 1, then -1
+
+
+def hurried(bend: float) -> Problem:
+    """x from 0 to 1 in free T, at the cost int u^2 / 2 + (T - 1) / 2 - bend (T - 1)^2 / 2, stationary at T = 1."""
+    problem = Problem("free horizon")
+    x = problem.state("x", initial=0.0, terminal=1.0)
+    u = problem.control("u")
+    problem.dynamics(x, u)
+    horizon = problem.horizon(lower=0.1, upper=10.0, guess=1.0)
+    problem.minimize(u**2 / 2, (horizon - 1) / 2 - bend * (horizon - 1) ** 2 / 2)
+    return problem
+
+
+def test_a_free_horizon_may_turn_a_minimum_into_a_saddle() -> None:
+    """The least cost over T is 1 / (2 T) + ..., whose second derivative at T = 1 is 1 - bend; its plan is the same."""
+    plan = solve(hurried(0.0), METHOD)
+    assert plan.horizon == pytest.approx(1.0, abs=1e-6)
+    for bend, verdict in ((0.0, True), (0.9, True), (1.1, False)):
+        form = Formulation(hurried(bend))
+        found = curvature(form, plan, np.zeros(0), form.bound_values(np.zeros(0)))
+        assert found.upwards is verdict
+
+
+def test_a_closed_way_may_drift_where_an_open_one_may_not() -> None:
+    """x(T) = x(0) free: the constant variation costs -k x^2 T, whatever T; with the start given it does not exist."""
+    for start, verdict in ((None, False), (0.0, True)):
+        problem = Problem("cyclic")
+        x = problem.state("x", initial=start, guess=0.0)
+        u = problem.control("u", guess=0.0)
+        problem.dynamics(x, u)
+        problem.horizon(1.0)
+        problem.end("closed", x - problem.at_start(x), 0.0, 0.0)
+        problem.minimize(u**2 - 0.5 * x**2)
+        _, found = look(problem)
+        assert found.upwards is verdict
+
+
+def test_the_conditions_at_the_end_count_with_their_multipliers() -> None:
+    """The nearest and the farthest point of a circle from (c, 0): both stationary, one a minimum."""
+    for side, verdict in ((1.0, True), (-1.0, False)):
+        problem = Problem("to a circle")
+        x = problem.state("x", initial=0.3, guess=0.3 + 0.7 * side)
+        y = problem.state("y", initial=0.0)
+        u, w = problem.control("u", guess=side), problem.control("w", guess=0.0)
+        problem.dynamics(x, u)
+        problem.dynamics(y, w)
+        problem.horizon(1.0)
+        problem.end("circle", x**2 + y**2, 1.0, 1.0)
+        problem.minimize((u**2 + w**2) / 2)
+        solution, found = look(problem, guess={"x": lambda t, s=side: 0.3 + (s - 0.3) * t, "u": side - 0.3})
+        assert solution["x"][-1, 0] == pytest.approx(side)
+        assert found.upwards is verdict
+
+
+def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
+    eye, yes, no = np.eye(2), np.array([True, True]), np.array([False, False])
+    gradient = np.array([-2.0, 3.0])
+    np.testing.assert_allclose(balance(gradient, eye, no, yes), [2.0, 0.0])  # an upper bound pushes back only
+    np.testing.assert_allclose(balance(gradient, eye, yes, no), [0.0, -3.0])
+    np.testing.assert_allclose(balance(gradient, eye, yes, yes), [2.0, -3.0])
