@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ocp.audit.costates import Adjoint, adjoint
+from ocp.audit.curvature import FLAT, Curvature, curvature
 from ocp.audit.principle import Optimality, minimum_principle
 from ocp.audit.reintegration import Reintegration, reintegrate, violations
 from ocp.curves import PiecewisePolynomial
@@ -61,6 +62,7 @@ class Audit:
         t, states, controls: The re-integrated plan: times, s (M,), and values by name, each (M, n). Interior mesh
             times stand twice, with the controls of both sides.
         optimality: Stationarity and Hamiltonian. adjoint: The costates and their conditions at the ends.
+        curvature: The second variation of the cost.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Audit:
     controls: dict[str, np.ndarray]
     optimality: Optimality
     adjoint: Adjoint
+    curvature: Curvature
 
     @property
     def passed(self) -> bool:
@@ -176,6 +179,8 @@ def audit(
     findings += optimality_findings(form, optimality, stationarity, drift)
     costate = adjoint(form, solution, p, bounds)
     findings += costate_findings(costate, optimality, costates)
+    second = curvature(form, solution, p, bounds)
+    findings += curvature_findings(second, solution)
     return Audit(
         form.name,
         tuple(findings),
@@ -187,6 +192,7 @@ def audit(
         unstack(solution.controls, again.controls),
         optimality,
         costate,
+        second,
     )
 
 
@@ -221,6 +227,18 @@ def costate_findings(found: Adjoint, optimality: Optimality, limit: float) -> li
         relative = found.horizon / optimality.hamiltonian_scale
         findings.append(Finding("condition of the free horizon, relative", relative, limit, None, note))
     return findings
+
+
+def curvature_findings(found: Curvature, solution: Solution) -> list[Finding]:
+    """Second order: a negative curvature fails; where it is not decided, and what the controls lose, is only told."""
+    note = f"not decided: {found.flat}" if found.upwards is None else f"least {found.least:.3g} of the largest"
+    limit = None if found.upwards is None else 0.0
+    size = max(abs(solution.cost), np.finfo(float).tiny)
+    downwards = 0.0 if found.upwards is not False else max(-found.least, FLAT)
+    return [
+        Finding("curvature downwards, relative", downwards, limit, found.time, note),
+        Finding("cost lost by the controls, relative", found.lost / size, None, None, f"{found.lost:.3g} of the cost"),
+    ]
 
 
 def state_scale(form: Formulation, plan: np.ndarray) -> np.ndarray:

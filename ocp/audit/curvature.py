@@ -3,8 +3,8 @@
 A stationary plan may be a maximum, a saddle, or a minimum only until a conjugate point. Here the second variation of
 the cost is formed along the plan (the accessory problem of Bryson, Ho 1975, chapter 6): a linear-quadratic problem in
 the variations of states, horizon and controls, whose constraints are those that are active. It is made discrete by
-Gauss collocation of its own, three points or more in each interval whatever the method of the plan, and swept backwards
-stage by stage. At each stage what the stage's own constraints and those carried over from later ones leave free must curve
+Gauss collocation of its own, three points or more in each interval whatever the method of the plan, and swept
+backwards, stage by stage. What a stage's own constraints and those carried over from later ones leave free must curve
 upwards; where it first does not is the conjugate point, and the eigenvector continued with the optimal feedback is a
 variation that lowers the cost. The sweep is linear in the number of intervals.
 """
@@ -73,9 +73,11 @@ def curvature(form: Formulation, solution: Solution, p: np.ndarray, bounds: tupl
         solution: The plan; its costates make the Hamiltonian.
     """
     along = _Along(form, solution, p, bounds)
-    lost = along.lost()
     if form.indifferent:
-        return Curvature(np.inf, None, "", lost, None, along.t)
+        return Curvature(np.inf, None, "", 0.0, None, along.t)
+    if not (np.isfinite(along.rate).all() and np.isfinite(along.hessian).all()):
+        return Curvature(np.nan, None, "the Hamiltonian is not finite along the plan", np.nan, None, along.t)
+    lost = along.lost()
     if along.obstacle:
         return Curvature(np.nan, None, along.obstacle, lost, None, along.t)
     found = _sweep(along, held=False)
@@ -433,7 +435,9 @@ def _sweep(along: _Along, held: bool) -> _Swept:
             if values[0] / scale < least:
                 least, at = float(values[0] / scale), float(mesh[k] * along.solution.horizon)
             if values[0] < -FLAT * scale:
-                return _Swept(least, at, "", _variation(along, k, basis @ vectors[:, 0], gains, step, metric))
+                worst = basis @ vectors[:, 0]
+                why = _singular(along, k, worst)
+                return _Swept(least, at, why, None if why else _variation(along, k, worst, gains, step, metric))
             curved = values > FLAT * scale
             if not curved.all():
                 label = _label(form, basis @ vectors[:, 0], nu)
@@ -478,6 +482,23 @@ def _variation(
     states[n] = z
     values /= np.repeat(metric, nu, axis=1)
     return values.reshape(n * q, nu) * along.range, states[:, : along.nx] * along.unit[: along.nx]
+
+
+def _singular(along: _Along, k: int, controls: np.ndarray) -> str:
+    """Why the curvature along a stage's controls does not decide: the Hamiltonian itself does not curve along them.
+
+    Where a control enters linearly, what is left is of the order of the interval's width, and the generalized condition
+    of Legendre and Clebsch, not this one, tells a singular arc's minimum.
+    """
+    q, nz, nu = along.shape[1], along.nz, along.nu
+    own = along.hessian[k * q : (k + 1) * q, nz:, nz:]
+    parts = controls.reshape(q, nu)
+    curved = float(np.einsum("ju,juv,jv->", parts, own, parts))
+    size = float(np.abs(along.hessian[:, nz:, nz:]).max(initial=0.0))
+    if abs(curved) > FLAT * size:
+        return ""
+    label, time = _label(along.form, controls, nu), along.t[k * q]
+    return f"singular in control {label!r} at {time:.4g} s: the Hamiltonian does not curve along it"
 
 
 def _label(form: Formulation, direction: np.ndarray, nu: int) -> str:

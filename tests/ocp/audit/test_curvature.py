@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp import Collocation, MultipleShooting, Problem, Solution, prepare, solve
+from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, prepare, solve
 from ocp.audit.curvature import Curvature, balance, curvature
 from ocp.problem.formulation import Formulation
 
@@ -226,3 +226,41 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     np.testing.assert_allclose(balance(gradient, eye, no, yes), [2.0, 0.0])  # an upper bound pushes back only
     np.testing.assert_allclose(balance(gradient, eye, yes, no), [0.0, -3.0])
     np.testing.assert_allclose(balance(gradient, eye, yes, yes), [2.0, -3.0])
+
+
+METHODS = (METHOD, Collocation(20, 3, "legendre"), MultipleShooting(40, control="linear"), Indirect())
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_no_method_passes_its_audit_with_a_plan_past_the_conjugate_point(method: Any) -> None:
+    assert solve(oscillator(3.0), method).audit().passed
+    audit = solve(oscillator(3.3), method).audit()
+    assert [finding.name for finding in audit.failures] == ["curvature downwards, relative"]
+    assert audit.curvature.upwards is False
+
+
+def test_methods_that_agree_on_a_saddle_get_no_certificate() -> None:
+    problem = oscillator(3.3)
+    assert not certificate(problem, [solve(problem, METHOD), solve(problem, METHODS[2])]).passed
+
+
+def pan_tilt(turn: float) -> Problem:
+    """A unit vector from one point of the equator to another along a great circle, at the least integral of speed^2."""
+    problem = Problem("pan and tilt")
+    pan = problem.state("pan", initial=0.0, terminal=turn)
+    tilt = problem.state("tilt", initial=0.0, terminal=0.0)
+    rates = problem.control("rates", 2)
+    problem.dynamics(pan, rates[0])
+    problem.dynamics(tilt, rates[1])
+    problem.horizon(1.0)
+    problem.minimize((ca.cos(tilt) * rates[0]) ** 2 + rates[1] ** 2)
+    return problem
+
+
+@pytest.mark.parametrize(("turn", "verdict"), [(3.0, True), (3.3, False), (5.5, False)])
+def test_the_long_way_round_a_sphere_is_none(turn: float, verdict: bool) -> None:
+    """Great circles are shortest up to half a turn (Jacobi); the equator is stationary for any turn."""
+    guess = {"pan": lambda t: turn * t, "rates": [turn, 0.0]}
+    plan = solve(pan_tilt(turn), METHOD, guess=guess)
+    assert np.abs(plan["tilt"]).max() < 1e-6
+    assert plan.audit().passed is verdict
