@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from ocp.audit.principle import balance
 from ocp.curves import lagrange, quadrature_weights
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
@@ -151,16 +152,14 @@ class _Along:
         form, (low, high), places = self.form, self.bounds, self.form.bounds.places
         n, q = self.shape
         nx, nu, m = self.nx, self.nu, n * q
-        sym = form.problem.symbols.sym
+        sym = form.sym
         fraction, lam, mu = sym("s"), sym("lam", nx), sym("mu", len(form.path))
         y = ca.vertcat(form.x, form.T, form.u)
         running, f, path = ca.substitute([form.running, form.f, form.path.expression], [form.t], [fraction * form.T])
         value = running + ca.dot(lam, f)
         first = [ca.gradient(value, form.u), ca.jacobian(form.T * f, y), path, ca.jacobian(path, y)]
-        symbols = [form.x, form.u, fraction, form.T, form.p, lam, mu]
-        columns = [self.x.T, self.u.T, s[None, :], np.full((1, m), self.solution.horizon)]
-        columns += [np.tile(self.p[:, None], (1, m)), self.lam.T]
-        slope, rate, level, level_y = _at(symbols, first, [*columns, np.zeros((len(form.path), m))])
+        here = (self.x, self.u, self.t, self.solution.horizon, self.p, (fraction, s[:, None]), (lam, self.lam))
+        slope, rate, level, level_y = form.sampled(first, *here, (mu, np.zeros((m, len(form.path)))))
         self.slope = slope
         rate = rate.reshape(m, nx + 1 + nu, nx).transpose(0, 2, 1)
         level_y = level_y.reshape(m, nx + 1 + nu, len(form.path)).transpose(0, 2, 1)
@@ -188,9 +187,8 @@ class _Along:
             if not self.obstacle and ca.jacobian(ca.jacobian(rows, form.x), form.x).nnz():
                 self.obstacle = "a curved constraint of the states is active, whose multiplier is not known"
 
-        (hessian,) = _at(
-            symbols, [ca.hessian(form.T * (value + ca.dot(mu, path)), y)[0]], [*columns, multipliers[:, nu:].T]
-        )
+        total = form.T * (value + ca.dot(mu, path))
+        (hessian,) = form.sampled([ca.hessian(total, y)[0]], *here, (mu, multipliers[:, nu:]))
         hessian = hessian.reshape(m, nx + 1 + nu, nx + 1 + nu)
         self.curved = hessian[:, nx + 1 :, nx + 1 :] / self.solution.horizon  # H_uu
 
@@ -241,36 +239,9 @@ class _Along:
         return float(np.dot(weights, won))
 
 
-def balance(gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray) -> np.ndarray:
-    """Multipliers (m,) of active constraints that make gradient (n,) + directions (m, n)' multipliers least.
-
-    At least zero at an upper bound, at most zero at a lower one, free at an equality. Wrongly signed ones are dropped
-    one by one, the worst first.
-    """
-    found = np.zeros(len(directions))
-    active = list(np.flatnonzero(at_lower | at_upper))
-    while active:
-        multiplier = np.linalg.lstsq(directions[active].T, -gradient, rcond=None)[0]
-        both = (at_lower & at_upper)[active]
-        wrong = np.where(both, 0.0, np.where(at_upper[active], -multiplier, multiplier))
-        worst = int(np.argmax(wrong))
-        if wrong[worst] <= 1e-12 * (1.0 + np.abs(multiplier).max()):
-            found[active] = multiplier
-            return found
-        del active[worst]
-    return found
-
-
-def _at(symbols: list[Any], outputs: list[Any], columns: list[np.ndarray]) -> list[np.ndarray]:
-    """Dense outputs, stacked column by column, at M samples; each (M, size)."""
-    function = ca.Function("at", symbols, [ca.densify(ca.vec(out)) for out in outputs], {"cse": True})
-    m = columns[0].shape[1]
-    return [np.asarray(v.full()).T for v in function.map(m, "serial").call([ca.DM(column) for column in columns])]
-
-
 def _won(slope: np.ndarray, curved: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray) -> float:
     """- min of slope' d + d' curved d / 2 over low <= d <= high, rows d = 0; inf where it is unbounded."""
-    basis = null_space(rows)
+    basis = _unseen(rows)
     if not basis.shape[1]:
         return 0.0
     inside = basis.T @ curved @ basis
@@ -294,13 +265,16 @@ def _won(slope: np.ndarray, curved: np.ndarray, low: np.ndarray, high: np.ndarra
     return float(max(0.0, -(slope @ d + d @ curved @ d / 2)))
 
 
-def null_space(rows: np.ndarray) -> np.ndarray:
+def _split(rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Rank of rows (m, n) each of length 1 or less, and their singular vectors and values: left, values, right."""
+    left, sizes, right = np.linalg.svd(rows)
+    return int(np.sum(sizes > RANK)), left, sizes, right
+
+
+def _unseen(rows: np.ndarray) -> np.ndarray:
     """Orthonormal directions (n, k) that rows (m, n) do not see."""
-    if not rows.shape[0]:
-        return np.eye(rows.shape[1])
-    _, sizes, directions = np.linalg.svd(rows)
-    rank = int(np.sum(sizes > RANK * max(1.0, float(sizes.max(initial=0.0)))))
-    return np.asarray(directions[rank:].T)
+    rank, _, _, right = _split(_level(rows))
+    return np.asarray(right[rank:].T)
 
 
 def _ends(along: _Along) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -313,7 +287,7 @@ def _ends(along: _Along) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     places, nx = form.bounds.places, along.nx
     x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
     lam0, lam1 = (solution.costate_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
-    nu_end, nu_start = (form.problem.symbols.sym(name, len(r)) for name, r in (("nu", form.end), ("nu0", form.start)))
+    nu_end, nu_start = (form.sym(name, len(r)) for name, r in (("nu", form.end), ("nu0", form.start)))
     last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     both = ca.vertcat(form.x, form.T, form.x0)
@@ -394,10 +368,10 @@ def _sweep(along: _Along, held: bool) -> _Swept:
     rate = along.rate.reshape(n, q, nz, nz + nu)
     rate_z, rate_u = rate[..., :nz], rate[..., nz:]
     system = np.eye(q * nz) - np.einsum("k,ij,kjab->kiajb", h, a, rate_z).reshape(n, q * nz, q * nz)
-    right = np.zeros((n, q, nz, nz + q * nu))
-    right[..., :nz] = np.eye(nz)
-    right[..., nz:] = np.einsum("k,ij,kjau->kiaju", h, a, rate_u).reshape(n, q, nz, q * nu)
-    inside = np.linalg.solve(system, right.reshape(n, q * nz, -1)).reshape(n, q, nz, -1)
+    driven = np.zeros((n, q, nz, nz + q * nu))
+    driven[..., :nz] = np.eye(nz)
+    driven[..., nz:] = np.einsum("k,ij,kjau->kiaju", h, a, rate_u).reshape(n, q, nz, q * nu)
+    inside = np.linalg.solve(system, driven.reshape(n, q * nz, -1)).reshape(n, q, nz, -1)
     # controls in the metric of the quadrature: the length of their variation is that of a function of time
     metric = np.sqrt(np.outer(h, along.weight))
     whole = np.zeros((n, q, nz + nu, nz + q * nu))
@@ -410,8 +384,8 @@ def _sweep(along: _Along, held: bool) -> _Swept:
     stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, along.hessian.reshape(n, q, nz + nu, nz + nu), whole)
 
     cost, rows, start_cost, start_rows = _ends(along)
-    sizes = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
-    scale = float(max(sizes.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
+    bends = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
+    scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
     least, at, flat = np.inf, None, ""
     gains: list[np.ndarray] = []
     for k in reversed(range(n)):
@@ -420,10 +394,9 @@ def _sweep(along: _Along, held: bool) -> _Swept:
         if held:
             own += [along.held_rows[k * q + j] @ whole[k, j] for j in range(q)]
         stacked = _level(np.vstack([*own, rows @ step[k]]))
-        left, sizes_, right_ = np.linalg.svd(stacked[:, nz:])
-        rank = int(np.sum(sizes_ > RANK))
-        basis = right_[rank:].T
-        follow = -(right_[:rank].T / sizes_[:rank]) @ left[:, :rank].T @ stacked[:, :nz]
+        rank, left, sizes, right = _split(stacked[:, nz:])
+        basis = right[rank:].T
+        follow = -(right[:rank].T / sizes[:rank]) @ left[:, :rank].T @ stacked[:, :nz]
         rows = _level(left[:, rank:].T @ stacked[:, :nz])
         lift = np.vstack([np.eye(nz), follow])
         free = basis.T @ joined[nz:, nz:] @ basis
@@ -450,7 +423,7 @@ def _sweep(along: _Along, held: bool) -> _Swept:
             cost = cost - mixed.T @ inverse @ mixed
         cost = (cost + cost.T) / 2
         gains.append(gain)
-    basis = null_space(_level(np.vstack([rows, start_rows])))
+    basis = _unseen(np.vstack([rows, start_rows]))
     if basis.shape[1]:
         values, vectors = np.linalg.eigh(basis.T @ (cost + start_cost) @ basis)
         if values[0] / scale < least:

@@ -15,7 +15,7 @@ from ocp.audit.costates import active_sides, costates_at_samples
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution, stack
 
-__all__ = ["Optimality", "minimum_principle"]
+__all__ = ["Optimality", "balance", "minimum_principle"]
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,8 @@ def minimum_principle(form: Formulation, solution: Solution, p: np.ndarray, boun
     for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
         normals = g_u[k].reshape(len(around), form.nu, -1).transpose(0, 2, 1).reshape(-1, form.nu)
         directions = np.vstack([np.eye(form.nu), normals])
-        reduced[k] = np.abs(reduce_gradient(gradient[k], directions, at_lower[k], at_upper[k])).max()
+        left = gradient[k] + directions.T @ balance(gradient[k], directions, at_lower[k], at_upper[k])
+        reduced[k] = np.abs(left).max()
     size = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
     return Optimality(t, reduced, size or 1.0, hamiltonian, scale or 1.0)
 
@@ -114,22 +115,21 @@ def over_hats(gradient: np.ndarray, widths: np.ndarray, beside: np.ndarray) -> n
     return np.stack(chosen, axis=1).reshape(gradient.shape)
 
 
-def reduce_gradient(
-    gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray
-) -> np.ndarray:
-    """What no multiplier of an active constraint can balance. Shape (nu,).
+def balance(gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray) -> np.ndarray:
+    """Multipliers (m,) of active constraints that make gradient (n,) + directions (m, n)' multipliers least.
 
-    A multiplier is at least zero at an upper bound, at most zero at a lower one, and free at an equality. Wrongly
-    signed ones are dropped one by one, so the result is never smaller than the best one.
+    At least zero at an upper bound, at most zero at a lower one, free at an equality. Wrongly signed ones are dropped
+    one by one, the worst first.
     """
+    found = np.zeros(len(directions))
     active = list(np.flatnonzero(at_lower | at_upper))
     while active:
-        columns = directions[active].T
-        multiplier = np.linalg.lstsq(columns, -gradient, rcond=None)[0]
+        multiplier = np.linalg.lstsq(directions[active].T, -gradient, rcond=None)[0]
         both = (at_lower & at_upper)[active]
         wrong = np.where(both, 0.0, np.where(at_upper[active], -multiplier, multiplier))
         worst = int(np.argmax(wrong))
         if wrong[worst] <= 1e-12 * (1.0 + np.abs(multiplier).max()):
-            return np.asarray(gradient + columns @ multiplier)
+            found[active] = multiplier
+            return found
         del active[worst]
-    return gradient
+    return found

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, prepare, solve
-from ocp.audit.curvature import Curvature, balance, curvature
+from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
+from ocp.audit.curvature import Curvature, curvature
+from ocp.audit.principle import balance
 from ocp.problem.formulation import Formulation
 
 METHOD = Collocation(intervals=20, degree=3)
@@ -65,11 +66,11 @@ def random_quadratic(rng: np.random.Generator, fixed: bool, bounded: bool) -> Pr
 
 def reduced_hessian(problem: Problem) -> np.ndarray:
     """Eigenvalues of the program's Hessian along its equalities and active bounds, densely: an independent answer."""
-    built = prepare(problem, Collocation(intervals=8, degree=3))
+    built = Collocation(intervals=8, degree=3).prepare(problem)
     solution = built.solve()
     v, fragment, program = solution.variables, built.fragment, built.program
     hessian = np.array(ca.triu2symm(program.hessian(v, [], 1.0, solution.multipliers)).full())
-    low, high = built.formulation.bound_values(np.zeros(0))  # type: ignore[union-attr]
+    low, high = built.formulation.bound_values(np.zeros(0))
     rows, columns = (low == high)[fragment.row_bounds], (low == high)[fragment.variable_bounds]
     active = np.vstack([np.array(program.jacobian(v, [])[1].full())[rows], np.eye(len(v))[columns]])
     _, sizes, directions = np.linalg.svd(active)
