@@ -97,10 +97,7 @@ def attached(
     mount = Joint(f"{added.root}_mount", "fixed", robot.link(link).name, added.root, shift, turn)
     owner = robot if keep_tip else added
     return replace(
-        owner,
-        links=(*robot.links, *added.links),
-        joints=(*robot.joints, mount, *added.joints),
-        name=robot.name,
+        owner, links=(*robot.links, *added.links), joints=(*robot.joints, mount, *added.joints), name=robot.name
     )
 
 

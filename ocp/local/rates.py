@@ -245,13 +245,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
 
 
 def _report(
-    machine: Machine,
-    model: _Model,
-    times: Array,
-    states: Array,
-    costs: Array,
-    tolerance: float,
-    stopped: str | None,
+    machine: Machine, model: _Model, times: Array, states: Array, costs: Array, tolerance: float, stopped: str | None
 ) -> LocalSolution:
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
     tip, jacobians, error = (np.array(part) for part in model.outputs.map(len(times))(times[None, :], states.T))

@@ -11,9 +11,8 @@ import numpy as np
 
 from models import Robot
 from models.arrays import Array
-from ocp import Audit
+from ocp import Audit, TipTask
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import TipTask
 from scripts.robots import standing
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.frames import frames_along
@@ -100,12 +99,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
 
 
 def animated(
-    path: Path,
-    found: standing.Results,
-    outline: Array,
-    *,
-    note: str,
-    view: tuple[float, float] = (16.0, -50.0),
+    path: Path, found: standing.Results, outline: Array, *, note: str, view: tuple[float, float] = (16.0, -50.0)
 ) -> None:
     """A GIF of the local motion beside the plan, with their zero moment points; arguments as of Scene and animate."""
     robot, machine, scenes = found.robot, found.machine, []

@@ -10,11 +10,7 @@ import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp import Collocation
-from ocp.builders.redundancy import plan_minimum_velocity
-from ocp.local.inverse_kinematics import inverse_kinematics
-from ocp.local.rates import resolve
-from ocp.tasks.tip_task import TipTask
+from ocp import Collocation, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import frames_along

@@ -18,10 +18,8 @@ import numpy as np
 from models import Footprint, Robot, Standing, Wrench, footprint, with_load
 from models.arrays import Array
 from models.machines.standing import External
-from ocp import Collocation, Problem, solve
+from ocp import Collocation, Problem, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, standing_problem
-from ocp.local.accelerations import resolve_accelerations
-from ocp.tasks.tip_task import TipTask
 from scripts.robots import standing
 from scripts.robots.frames import frames_along
 from scripts.robots.mobile_manipulator import StandingExample, animated

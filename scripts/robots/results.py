@@ -11,11 +11,10 @@ import numpy as np
 
 from models import FreeFloating, Machine
 from models.arrays import Array
-from ocp import Audit, Solution
+from ocp import Audit, Solution, TipTask
 from ocp.curves import differentiation_matrix
 from ocp.local.rates import LocalSolution
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import TipTask
 from scripts.robots.robots import RobotFile
 from scripts.viewer.plan import save_plan
 

@@ -20,10 +20,9 @@ from models import Footprint, Robot, Standing, Wrench, footprint, locked, with_l
 from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
-from ocp import Collocation, Problem, Solution, solve
+from ocp import Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
-from ocp.local.accelerations import resolve_accelerations
-from ocp.tasks.tip_task import TipTask, quintic, timed
+from ocp.tasks.tip_task import quintic, timed
 from scripts.drawing import COLORS, DASHES, sheet
 
 __all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]
@@ -153,13 +152,7 @@ def plan() -> Results:
     machine, ground = tiago()
     pulled = rope(machine)
     local = resolve_accelerations(
-        machine,
-        from_rest(circle(machine)),
-        START,
-        SECONDS,
-        external=pulled,
-        step=5e-3,
-        stop_at_lift_off=False,
+        machine, from_rest(circle(machine)), START, SECONDS, external=pulled, step=5e-3, stop_at_lift_off=False
     ).motion
     solution = solve(problem(machine), METHOD)
     return Results(robot_file(), machine, ground, solution, sampled(machine, solution, pulled), local, pulled)

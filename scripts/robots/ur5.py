@@ -10,11 +10,9 @@ import numpy as np
 
 from models import FixedBase, Machine
 from models.arrays import Array
-from ocp import Collocation, Solution, SolveError
-from ocp.builders.redundancy import plan_minimum_velocity
-from ocp.local.inverse_kinematics import Posture, inverse_kinematics
-from ocp.local.rates import LocalSolution, resolve
-from ocp.tasks.tip_task import TipTask
+from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
+from ocp.local.inverse_kinematics import Posture
+from ocp.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import TIP, Frames, frames_along

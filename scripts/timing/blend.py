@@ -14,12 +14,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import paths
+from models import SmoothPath, paths, scara_along, smooth
 from models.arrays import Array
-from models.machines.scara_path import scara_along
-from models.paths import SmoothPath, gauss_newton, march, path_function, predictor_corrector, smooth
+from models.paths import gauss_newton, march, path_function, predictor_corrector
 from models.paths.arc_length import arc_length, speed
-from ocp.builders.timing import plan_minimum_time
+from ocp import plan_minimum_time
 from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.papers.blend.example import (

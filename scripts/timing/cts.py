@@ -10,10 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import optimal_inverse, reference_rig, reference_tunnel
 from models.arrays import Array
-from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, forward, inverse
-from models.papers import reference_rig, reference_tunnel
 from scripts import drawing
 from scripts.papers.cts.iterations import combined, null_space
 from scripts.papers.cts.results import PAPER_TIMES, sweep_targets

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from models import Frame
 from models.spatial import (
-    Frame,
     angular_velocity_from_quaternion,
     cross,
     determinant,

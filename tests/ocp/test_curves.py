@@ -11,14 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ocp.curves import (
-    PiecewisePolynomial,
-    differentiation_matrix,
-    integrator,
-    lagrange,
-    lagrange_expressions,
-    rk4_step,
-)
+from ocp.curves import PiecewisePolynomial, differentiation_matrix, integrator, lagrange, lagrange_expressions, rk4_step
 from tests.ocp.problems import Array, order
 
 DEGREES = range(1, 11)

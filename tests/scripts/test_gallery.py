@@ -16,8 +16,7 @@ import pytest
 from PIL import Image
 
 from models.arrays import Array
-from ocp import Solution, SolveError
-from ocp.local.accelerations import resolve_accelerations
+from ocp import Solution, SolveError, resolve_accelerations
 from scripts import gallery
 from scripts.robots import panda, pushing, robots, ur5
 from scripts.robots.drawing import Scene, animate

@@ -16,8 +16,7 @@ import trimesh
 
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, link_frames
 from models.arrays import Array
-from ocp import Collocation, ProblemError, Solution, solve
-from ocp.builders.redundancy import minimum_velocity_problem
+from ocp import Collocation, ProblemError, Solution, minimum_velocity_problem, solve
 from scripts import view
 from scripts.robots.frames import TIP, frames_along, inertia_box
 from scripts.viewer.command import parser, read

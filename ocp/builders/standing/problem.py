@@ -39,14 +39,7 @@ from models.machines.standing import External, Standing, center_of_pressure, wre
 from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
-from ocp.builders.standing.start import (
-    check_freedom,
-    check_loads,
-    check_slope,
-    inside_limits,
-    local_guess,
-    task_demand,
-)
+from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks

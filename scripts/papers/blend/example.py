@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.machines.scara import Elbow, Scara
-from models.paths import Arc, Line, Path, SmoothPath, smooth
+from models import Arc, Line, Path, Scara, SmoothPath, smooth
+from models.machines.scara import Elbow
 from models.paths.blends import BlendKind
 from ocp.schedule import JointLimits
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from models import SmoothPath
 from models.arrays import Array
-from models.paths import SmoothPath
 from models.paths.blends import BlendKind, polynomial
 from ocp.schedule import joint_motion
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from models import SmoothPath
 from models.arrays import Array
-from models.paths import Blend, SmoothPath, gauss_newton, march, predictor_corrector
+from models.paths import Blend, gauss_newton, march, predictor_corrector
 from models.paths.arc_length import arc_length
 from models.paths.blends import DEFAULT_SHAPE, BlendKind, polynomial
 from ocp.schedule import Schedule, SpeedProfile

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from models import SmoothPath, scara_along, smooth
 from models.arrays import Array
-from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import SmoothPath, gamma, smooth
+from models.machines.scara_path import ScaraPath
+from models.paths import gamma
 from models.paths.blends import polynomial
-from ocp.builders.timing import Fastest, plan_minimum_time
+from ocp import plan_minimum_time
+from ocp.builders.timing import Fastest
 from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts.papers.blend.example import (
     ARM,

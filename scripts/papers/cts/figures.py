@@ -10,9 +10,10 @@ import casadi as ca
 import numpy as np
 from matplotlib.figure import Figure
 
+from models import Rig
 from models.arrays import Array
 from models.cts.clearance import rig_capsules
-from models.cts.rig import INCH, Rig
+from models.cts.rig import INCH
 from scripts.drawing import COLORS, DASHES, gif, sheet
 from scripts.papers.cts.plan import draw_plan
 from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, surroundings

@@ -14,12 +14,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import ModelError, Rig, Tunnel
 from models.arrays import Array, ArrayInput, checked_array
-from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, forward, inverse, task_jacobian
+from models.cts.rig import HOME, INCH, Branch, forward, inverse, task_jacobian
 from models.cts.roll import index_harmonics
 from models.cts.roll_change import checked_gain
 from models.cts.table import checked_targets
-from models.errors import ModelError
 from models.spatial import Expression, solve_spd
 
 TOLERANCE, MOST_STEPS = 1e-6, 100  # Table 5

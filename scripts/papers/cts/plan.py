@@ -9,14 +9,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import Box, Rig, Tunnel, optimal_inverse
 from models.arrays import Array
-from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clearances
-from models.cts.rig import INCH, Rig, Tunnel, inverse
+from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
-from models.shapes.capsules import Box
-from ocp import Collocation, solve
-from ocp.builders.cts import roll_problem
+from ocp import Collocation, roll_problem, solve
 from scripts.drawing import COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep

@@ -14,9 +14,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import Link, ModelError
 from models.arrays import Array, ArrayInput, checked_array
-from models.errors import ModelError
-from models.robot.parts import Link
 from models.spatial import Expression, cross, expression, quaternion_product, rotation_from_quaternion
 
 GRAVITY = 9.80665

@@ -10,15 +10,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import Box, Link, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.arrays import Array
-from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clearances
-from models.cts.rig import HOME, INCH, Rig, Tunnel, forward, goose_neck_corner, inverse
+from models.cts.rig import HOME, INCH, forward, goose_neck_corner, inverse
 from models.cts.roll import index_harmonics
-from models.cts.table import Table, solve_table
-from models.papers import reference_rig, reference_tunnel
-from models.robot.parts import Link
-from models.shapes.capsules import Box
+from models.cts.table import Table
 from scripts.papers.cts.iterations import Run, combined, newton_step, null_space, null_space_step
 from scripts.papers.cts.plan import RollPlan, plan_sweep
 from scripts.papers.cts.release import Ejector, SlenderAir, Store, release, yaw_pitch

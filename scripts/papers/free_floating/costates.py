@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from models import ModelError
 from models.arrays import Array, ArrayInput, checked_array
-from models.errors import ModelError
 from models.robot.indices import checked_rows
 from scripts.papers.free_floating.recursion import D, J, dD, dJ
 from scripts.papers.free_floating.virtual_chain import VirtualChain

@@ -10,9 +10,7 @@ import numpy as np
 
 from models import FreeFloating, paper_example
 from models.arrays import Array
-from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.builders.redundancy import minimum_velocity_problem
-from ocp.local.rates import resolve
+from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, minimum_velocity_problem, resolve, solve
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating.extremals import Search
 from scripts.papers.free_floating.false_optima import Trial

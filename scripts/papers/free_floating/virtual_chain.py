@@ -11,11 +11,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from models import FreeFloating, Joint, Link, ModelError, Robot
 from models.arrays import Array, ArrayInput, checked_array
-from models.errors import ModelError
-from models.machines.free_floating import PLANAR_ROWS, FreeFloating
-from models.robot.parts import Joint, Link
-from models.robot.robot import Robot
+from models.machines.free_floating import PLANAR_ROWS
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machines.standing import External, Standing, tip_spring
+from models import STANDING_STARTS, Standing, standing_example
+from models.machines.standing import External, tip_spring
 from models.machines.standing_motion import StandingMotion
-from models.papers import STANDING_STARTS, standing_example
+from ocp import TipTask, resolve_accelerations
 from ocp.builders.standing import motion_cost
-from ocp.local.accelerations import Layer, Stabiliser, resolve_accelerations
-from ocp.tasks.tip_task import TipTask
+from ocp.local.accelerations import Layer, Stabiliser
 from scripts.papers.run import Row
 from scripts.papers.standing.printed import printed_law
 

@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
+from models import link_frames
 from models.machines.standing_motion import StandingMotion
-from models.robot.kinematics import link_frames
 from scripts.drawing import COLORS, DASHES, TIME_COLORS
 from scripts.papers.standing.cases import Array, Local, machine
 from scripts.papers.standing.plans import Plan

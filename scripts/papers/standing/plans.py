@@ -8,9 +8,9 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from models import STANDING_STARTS
 from models.machines.standing_motion import StandingMotion, standing_motion
-from models.papers import STANDING_STARTS
-from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, solve
+from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve
 from ocp.builders.standing import (
     Anywhere,
     FreeTime,
@@ -23,7 +23,6 @@ from ocp.builders.standing import (
     standing_problem,
 )
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import TipTask
 from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 

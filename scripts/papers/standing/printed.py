@@ -9,11 +9,11 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from models.machines.standing import Standing
+from models import Standing
 from models.machines.standing_motion import StandingMotion, standing_motion
+from ocp import TipTask
 from ocp.local.rates import least_rates
 from ocp.tasks.equations import bind
-from ocp.tasks.tip_task import TipTask
 
 __all__ = ["printed_law"]
 

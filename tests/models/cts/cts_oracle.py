@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.cts.rig import Branch, Rig, Tunnel
+from models import Rig, Tunnel
+from models.cts.rig import Branch
 
 Array = NDArray[np.float64]
 

@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models import ModelError, Rig, Tunnel, reference_rig, reference_tunnel
 from models.cts.rig import (
     BRANCHES,
     HOME,
     INCH,
     LENGTHS,
     Branch,
-    Rig,
-    Tunnel,
     dh_frames,
     forward,
     goose_neck_corner,
@@ -27,8 +26,6 @@ from models.cts.rig import (
     tool_frame,
 )
 from models.cts.roll import index_harmonics
-from models.errors import ModelError
-from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
 
 RIG = reference_rig()

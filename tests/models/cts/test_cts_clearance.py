@@ -8,14 +8,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.cts.best_roll import optimal_inverse
+from models import Box, ModelError, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.cts.clearance import Surroundings, clear_inverse, clearances
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
-from models.cts.table import solve_table
-from models.errors import ModelError
-from models.papers import reference_rig, reference_tunnel
-from models.shapes.capsules import Box, soft_minimum
+from models.shapes.capsules import soft_minimum
 from tests.models.cts.cts_oracle import Array, index_by_geometry, joints_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()

@@ -10,13 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.cts.best_roll import optimal_inverse
-from models.cts.rig import BRANCHES, HOME, INCH, Branch, Rig, Tunnel, forward
+from models import ModelError, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
+from models.cts.rig import BRANCHES, HOME, INCH, Branch, forward
 from models.cts.roll import ACTIVE, STATUS
-from models.cts.table import all_joint_sets, reachable_rolls, solve_table
+from models.cts.table import all_joint_sets, reachable_rolls
 from models.cts.trigonometric import Harmonics, least_point, roots, series_roots
-from models.errors import ModelError
-from models.papers import reference_rig, reference_tunnel
 from tests.models.cts.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {"lower": (0.2, -3.0, -2.0, -1.2, 0.3, -2.0), "upper": (1.6, -0.2, 2.2, 1.1, 2.6, 2.5)}

@@ -13,20 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from models import Box, Capsule, Link, ModelError, reference_rig
 from models.cts.clearance import Surroundings, clearances, rig_capsules
 from models.cts.rig import dh_frames
-from models.errors import ModelError
-from models.papers import reference_rig
-from models.robot.parts import Link
-from models.shapes.capsules import (
-    Box,
-    Capsule,
-    box_distance,
-    capsule_in_box,
-    capsule_to_box,
-    capsule_to_capsule,
-    soft_minimum,
-)
+from models.shapes.capsules import box_distance, capsule_in_box, capsule_to_box, capsule_to_capsule, soft_minimum
 from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
 
 seeds = st.integers(0, 2**32 - 1)

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models import Joint, Link, Robot, merged, planar_chain
-from models.machines.standing import Standing
-from models.machines.support import Support, rectangle
+from models import Joint, Link, Robot, Standing, Support, merged, planar_chain, rectangle
 from tests.models.robot.trees import Array, random_robot, random_rotation
 
 FOOT = Link("foot", 12.0, (0.0, 0.0, 0.05), np.diag([0.2, 0.1, 0.3]))

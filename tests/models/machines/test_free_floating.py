@@ -127,10 +127,7 @@ def test_momentum_and_jacobians_are_those_of_differentiated_frames(case: Case) -
     tip = machine.tip_pose(place, q)
     pairs = (
         (machine.momentum_matrices(place, q), momentum),
-        (
-            machine.jacobians(place, q),
-            twist_by_differentiation(tip.rotation, tip.position, x, dx),
-        ),
+        (machine.jacobians(place, q), twist_by_differentiation(tip.rotation, tip.position, x, dx)),
     )
     errors = [ca.mtimes(by_base, twist) + ca.mtimes(by_joints, q_rate) - known for (by_base, by_joints), known in pairs]
     errors.append(machine.momentum_residual(place, q, place_rate, q_rate) - momentum)

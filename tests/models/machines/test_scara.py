@@ -12,10 +12,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import ModelError, tip_jacobian, tip_pose
-from models.machines.scara import Scara
-from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import Arc, Line, Path, smooth
+from models import Arc, Line, ModelError, Path, Scara, scara_along, smooth, tip_jacobian, tip_pose
+from models.machines.scara_path import ScaraPath
 from ocp import ProblemError
 from ocp.schedule import JointLimits, LineLimits, schedule
 from tests.models.paths.task_paths import random_arm_path, seeds, turned

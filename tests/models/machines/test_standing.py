@@ -9,13 +9,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import Joint, Link, ModelError, Robot, center_of_mass, frame_jacobian, link_frames, planar_chain
-from models.machines.standing import Standing, center_of_pressure, tip_spring
+from models import (
+    STANDING_STARTS,
+    Joint,
+    Link,
+    ModelError,
+    Robot,
+    Standing,
+    Wrench,
+    center_of_mass,
+    frame_jacobian,
+    link_frames,
+    link_motions,
+    planar_chain,
+    rectangle,
+    standing_example,
+)
+from models.machines.standing import center_of_pressure, tip_spring
 from models.machines.standing_motion import standing_motion
-from models.machines.support import rectangle
-from models.papers import STANDING_STARTS, standing_example
-from models.robot.dynamics import Wrench
-from models.robot.motion import link_motions
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
 from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds
 from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from models import ModelError
-from models.machines.support import Support, rectangle
+from models import ModelError, Support, rectangle
 from tests.models.robot.trees import few, numeric, seeds
 
 

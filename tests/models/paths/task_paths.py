@@ -8,10 +8,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import ModelError
-from models.machines.scara import Scara
-from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import Arc, Line, Path, Segment, smooth
+from models import Arc, Line, ModelError, Path, Scara, scara_along, smooth
+from models.machines.scara_path import ScaraPath
+from models.paths import Segment
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)

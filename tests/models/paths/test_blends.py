@@ -14,19 +14,8 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
-from models import ModelError
-from models.paths import (
-    Arc,
-    Line,
-    Path,
-    SmoothPath,
-    end_curvature,
-    gamma,
-    middle_curvature,
-    peak_curvature,
-    rest_to_rest,
-    smooth,
-)
+from models import Arc, Line, ModelError, Path, SmoothPath, smooth
+from models.paths import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
 from tests.models.paths.task_paths import random_path, seeds

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import ModelError
-from models.paths import Line, Path, smooth
+from models import Line, ModelError, Path, smooth
 from models.paths.orientation import rotation_vector
 from tests.models.paths.task_paths import product, random_path, seeds, turned
 

@@ -12,18 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models import ModelError
-from models.paths import (
-    Blend,
-    Path,
-    SmoothPath,
-    gauss_newton,
-    march,
-    path_function,
-    predictor_corrector,
-    smooth,
-    turn_function,
-)
+from models import ModelError, Path, SmoothPath, smooth
+from models.paths import Blend, gauss_newton, march, path_function, predictor_corrector, turn_function
 from models.paths.arc_length import arc_length
 from models.paths.blends import polynomial
 from ocp.schedule import LineLimits, SpeedProfile, peak_acceleration, schedule

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models import ModelError
-from models.paths import Arc, Line, Path, SmoothPath, end_curvature, gamma, peak_curvature, smooth
+from models import Arc, Line, ModelError, Path, SmoothPath, smooth
+from models.paths import end_curvature, gamma, peak_curvature
 
 MM = 1e-3
 

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import ModelError
-from models.paths import Arc, Line, Path, smooth
+from models import Arc, Line, ModelError, Path, smooth
 from tests.models.paths.task_paths import seeds, turned
 
 

@@ -8,9 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import ModelError, center_of_mass, frame_jacobian, link_frames, momentum_matrix, planar_chain
-from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics, mass_matrix
-from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
+from models import (
+    ModelError,
+    Wrench,
+    base_reaction,
+    center_of_mass,
+    center_of_mass_motion,
+    frame_jacobian,
+    inverse_dynamics,
+    link_frames,
+    link_motions,
+    mass_matrix,
+    momentum,
+    momentum_matrix,
+    momentum_rate,
+    planar_chain,
+)
+from models.robot.dynamics import external_wrench
 from tests.models.robot.trees import (
     Array,
     directional,

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import (
+    Frame,
     Joint,
     Link,
     ModelError,
@@ -24,7 +25,6 @@ from models import (
     tip_jacobian,
     tip_pose,
 )
-from models.spatial import Frame
 from tests.models.robot.trees import (
     Base,
     directional,

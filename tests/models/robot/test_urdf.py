@@ -377,10 +377,7 @@ def test_a_chain_of_a_thousand_links_is_read_and_printed() -> None:
         (text(links='<link name="c"/>'), r"links \['a', 'c'\] have no parent joint"),
         (text(links='<link name="a"/>'), "link name 'a' is used more than once"),
         (chain("rr").replace('"j2"', '"j1"'), "joint name 'j1' is used more than once"),
-        (
-            chain("rr", {2: '<mimic joint="k1"/>'}),
-            "joint 'j2': mimicked joint 'k1' does not exist; did you mean 'j1'",
-        ),
+        (chain("rr", {2: '<mimic joint="k1"/>'}), "joint 'j2': mimicked joint 'k1' does not exist; did you mean 'j1'"),
         (chain("rr", {2: "<mimic/>"}), "joint 'j2': <mimic> has no attribute 'joint'"),
         (
             chain("rr", {1: '<mimic joint="j2"/>', 2: '<mimic joint="j1"/>'}),

@@ -20,9 +20,9 @@ from ocp import (
     ProblemError,
     Solution,
     certificate,
+    minimum_velocity_problem,
     solve,
 )
-from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, plant, van_der_pol

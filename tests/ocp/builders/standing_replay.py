@@ -7,7 +7,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from models.machines.standing import External, Standing
+from models import Standing
+from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion
 from tests.models.robot.trees import Array
 from tests.scripts.papers.oracles import mujoco_model

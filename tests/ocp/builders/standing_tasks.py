@@ -8,15 +8,14 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 
+from models import STANDING_STARTS, Standing, Wrench, standing_example
 from models.machines.machine import with_tip
-from models.machines.standing import External, Standing, tip_spring
+from models.machines.standing import External, tip_spring
 from models.machines.standing_motion import StandingMotion, standing_motion
-from models.papers import STANDING_STARTS, standing_example
-from models.robot.dynamics import Wrench
-from ocp import Problem, Solution
+from ocp import Problem, Solution, TipTask
 from ocp.builders.standing import FreeTime, Limits, Weights, standing_problem
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import TipTask, quintic
+from ocp.tasks.tip_task import quintic
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm, two_armed
 from tests.models.robot.trees import Array
 
@@ -149,11 +148,7 @@ def two_tasks(left: Any, right: Any) -> list[TipTask]:
 
 
 def sampled(
-    standing: Standing,
-    solution: Solution,
-    external: External | None = None,
-    rows: Any = ROWS,
-    finer: int = 10,
+    standing: Standing, solution: Solution, external: External | None = None, rows: Any = ROWS, finer: int = 10
 ) -> StandingMotion:
     """A plan on a grid `finer` times its own, at the middles of the parts, where held controls are plain."""
     count = solution.method["intervals"] * finer

@@ -8,13 +8,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.cts.best_roll import optimal_inverse
+from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
 from models.cts.clearance import Surroundings, clearances
-from models.cts.rig import HOME, INCH, Rig, inverse
-from models.papers import reference_rig, reference_tunnel
-from models.shapes.capsules import Box
-from ocp import Collocation, ProblemError, Solution, solve
-from ocp.builders.cts import least_course, roll_problem, spline_targets
+from models.cts.rig import HOME, INCH, inverse
+from ocp import Collocation, ProblemError, Solution, roll_problem, solve, spline_targets
+from ocp.builders.cts import least_course
 from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()

@@ -13,11 +13,20 @@ import pytest
 
 import models
 from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_example, planar_chain
-from ocp import Collocation, Finding, MultipleShooting, Problem, Solution, SolveError, solve
+from ocp import (
+    Collocation,
+    Finding,
+    MultipleShooting,
+    Problem,
+    ProblemError,
+    Solution,
+    SolveError,
+    minimum_velocity_problem,
+    plan_minimum_velocity,
+    resolve,
+    solve,
+)
 from ocp.builders import redundancy
-from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
-from ocp.errors import ProblemError
-from ocp.local.rates import resolve
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.local.test_rates import ASKED, PAPER_START, REFUSED
 

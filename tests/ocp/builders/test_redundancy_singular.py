@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Machine, planar_chain
-from ocp import Collocation, Solution, solve
-from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
-from ocp.local.rates import LocalSolution, resolve
-from ocp.tasks.tip_task import TipTask
+from ocp import Collocation, Solution, TipTask, minimum_velocity_problem, plan_minimum_velocity, resolve, solve
+from ocp.local.rates import LocalSolution
 from tests.models.robot.trees import Array, numeric, seven_joint_arm
 
 HORIZON = 4.0

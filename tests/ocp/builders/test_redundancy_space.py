@@ -9,15 +9,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, center_of_mass, paper_example, planar_chain
+from models import FixedBase, FreeFloating, Path, center_of_mass, paper_example, planar_chain, smooth
 from models.machines.machine import with_tip
-from models.paths import Path, smooth
-from ocp import Collocation, solve
-from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
-from ocp.errors import ProblemError
-from ocp.local.rates import resolve
+from ocp import Collocation, ProblemError, TipTask, minimum_velocity_problem, plan_minimum_velocity, resolve, solve
 from ocp.tasks.equations import bind
-from ocp.tasks.tip_task import TipTask, along
+from ocp.tasks.tip_task import along
 from tests.models.robot.trees import numeric
 from tests.ocp.builders.test_redundancy import audited, chain
 from tests.ocp.local.test_rates import PAPER_START

@@ -8,11 +8,20 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.machines.standing import Standing, center_of_pressure
+from models import STANDING_STARTS, Standing, Support, rectangle
+from models.machines.standing import center_of_pressure
 from models.machines.standing_motion import standing_motion
-from models.machines.support import Support, rectangle
-from models.papers import STANDING_STARTS
-from ocp import Collocation, MultipleShooting, Solution, solve, tighten
+from ocp import (
+    Collocation,
+    MultipleShooting,
+    ProblemError,
+    Solution,
+    SolveError,
+    TipTask,
+    resolve_accelerations,
+    solve,
+    tighten,
+)
 from ocp.builders.standing import (
     Anywhere,
     Following,
@@ -25,9 +34,7 @@ from ocp.builders.standing import (
     motion_cost,
     standing_problem,
 )
-from ocp.errors import ProblemError, SolveError
-from ocp.local.accelerations import Stabiliser, resolve_accelerations
-from ocp.tasks.tip_task import TipTask
+from ocp.local.accelerations import Stabiliser
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
 from tests.ocp.builders.standing_replay import assert_stands, assert_tips

@@ -9,23 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from models.machines.standing import Standing
-from models.machines.support import Support, rectangle
-from ocp import Collocation, Solution, solve
-from ocp.builders.standing import (
-    Anywhere,
-    Following,
-    IndexAtLeast,
-    InFoot,
-    Limits,
-    Pinned,
-    Weights,
-    standing_problem,
-)
-from ocp.errors import ProblemError
-from ocp.local.accelerations import resolve_accelerations
+from models import Standing, Support, rectangle
+from ocp import Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
+from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, Weights, standing_problem
 from ocp.local.laws import Law
-from ocp.tasks.tip_task import TipTask, quintic
+from ocp.tasks.tip_task import quintic
 from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric

@@ -9,22 +9,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from models import STANDING_STARTS
 from models.machines.machine import with_tip
-from models.papers import STANDING_STARTS
-from ocp import Collocation, Solution, solve
-from ocp.builders.standing import (
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Pinned,
-    ZmpRule,
-    plan_standing,
-    standing_problem,
-)
-from ocp.errors import ProblemError, SolveError
-from ocp.local.accelerations import resolve_accelerations
+from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
+from ocp.builders.standing import FreeTime, IndexAtLeast, InFoot, Pinned, ZmpRule, plan_standing, standing_problem
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import TipTask, pose_line, quintic, timed
+from ocp.tasks.tip_task import pose_line, quintic, timed
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.builders.standing_replay import assert_stands
 from tests.ocp.builders.standing_tasks import (

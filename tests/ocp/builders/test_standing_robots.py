@@ -16,13 +16,10 @@ import numpy as np
 import pinocchio
 import pytest
 
-from models import Robot, Standing, Wrench, rectangle, simplified, with_load
+from models import Robot, Standing, Wrench, rectangle, simplified, standing_example, with_load
 from models.machines.standing_motion import StandingMotion
-from models.papers import standing_example
-from ocp import Collocation, Solution, solve
+from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
 from ocp.builders.standing import Anywhere, Limits, Pinned, standing_problem
-from ocp.errors import ProblemError
-from ocp.local.accelerations import resolve_accelerations
 from ocp.tasks.equations import task_errors
 from scripts.robots import pushing
 from scripts.robots import standing as gallery

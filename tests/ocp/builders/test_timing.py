@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from models.machines.scara import Scara
-from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import Path, SmoothPath, smooth
-from ocp import Collocation, ProblemError, solve
+from models import Path, Scara, SmoothPath, scara_along, smooth
+from models.machines.scara_path import ScaraPath
+from ocp import Collocation, ProblemError, minimum_time_problem, plan_minimum_time, solve
 from ocp.builders import timing_tables
-from ocp.builders.timing import Fastest, minimum_time_problem, plan_minimum_time
+from ocp.builders.timing import Fastest
 from ocp.builders.timing_tables import largest_demand, table
 from ocp.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example

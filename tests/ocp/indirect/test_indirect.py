@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Machine, paper_example
-from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, prepare, solve
-from ocp.builders.redundancy import minimum_velocity_problem
+from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, minimum_velocity_problem, prepare, solve
 from ocp.problem.formulation import Formulation
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA

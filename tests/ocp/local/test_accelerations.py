@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from models import FixedBase, ModelError
-from models.machines.standing import Standing
-from models.papers import STANDING_STARTS
+from models import STANDING_STARTS, FixedBase, ModelError, Standing, momentum
 from models.robot.indices import jacobian_manipulability, joint_limit_index
-from models.robot.motion import momentum
-from ocp.errors import ProblemError
-from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser, resolve_accelerations
+from ocp import ProblemError, TipTask, resolve, resolve_accelerations
+from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser
 from ocp.local.laws import Law, accelerations
-from ocp.local.rates import resolve
 from ocp.tasks.equations import bind, task_errors, track_expression
-from ocp.tasks.tip_task import TipTask, pose_line
+from ocp.tasks.tip_task import pose_line
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
 from tests.ocp.builders.standing_tasks import (

@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
-from ocp.errors import ProblemError
-from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.tasks.tip_task import TipTask
+from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
 from tests.models.robot.trees import seeds
 from tests.ocp.tasks.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from models import FixedBase, FreeFloating, Machine, paper_example, planar_chain
-from ocp.errors import ProblemError
-from ocp.local.rates import LocalSolution, least_rates, resolve
+from ocp import ProblemError, resolve
+from ocp.local.rates import LocalSolution, least_rates
 from tests.models.robot.trees import Array, numeric, random_base, random_robot, seeds, seven_joint_arm
 
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])

@@ -10,11 +10,8 @@ import pytest
 
 from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain
 from models.spatial import rotation
-from ocp import Collocation, SolveError
-from ocp.builders.redundancy import plan_minimum_velocity
-from ocp.local.inverse_kinematics import Unreachable, check_reach
-from ocp.local.rates import resolve
-from ocp.tasks.tip_task import TipTask
+from ocp import Collocation, SolveError, TipTask, Unreachable, plan_minimum_velocity, resolve
+from ocp.local.inverse_kinematics import check_reach
 from tests.models.robot.trees import seven_joint_arm
 
 START = np.deg2rad([60.0, -100.0, -20.0])

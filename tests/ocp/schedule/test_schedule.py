@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import ModelError
-from models.paths import Path, SmoothPath, smooth
+from models import ModelError, Path, SmoothPath, smooth
 from ocp import ProblemError
 from ocp.schedule import (
     JointLimits,

@@ -17,9 +17,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.machines.scara import Scara
-from models.machines.scara_path import ScaraPath, scara_along
-from models.paths import Arc, Line, Path, SmoothPath, smooth
+from models import Arc, Line, Path, Scara, SmoothPath, scara_along, smooth
+from models.machines.scara_path import ScaraPath
 from ocp import ProblemError
 from ocp.schedule import (
     JointLimits,

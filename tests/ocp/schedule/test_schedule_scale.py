@@ -6,7 +6,8 @@ import tracemalloc
 
 import numpy as np
 
-from models.paths import Arc, Line, Path, Segment, SmoothPath, smooth
+from models import Arc, Line, Path, SmoothPath, smooth
+from models.paths import Segment
 from ocp.schedule import LineLimits, Schedule, schedule
 
 DEVIATION = 5e-4

@@ -8,8 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Link, Machine, Robot
-from models.robot.rebuild import merged
+from models import FixedBase, FreeFloating, Link, Machine, Robot, merged
 from ocp import Solution
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import PoseLine, pose_line

@@ -7,13 +7,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Machine, planar_chain
+from models import FixedBase, Machine, Path, planar_chain, smooth
 from models.machines.machine import with_tip
-from models.paths import Path, smooth
-from ocp.errors import ProblemError
-from ocp.local.rates import resolve
+from ocp import ProblemError, TipTask, resolve
 from ocp.tasks.equations import bind, task_errors
-from ocp.tasks.tip_task import TipTask, along, pose_line, timed
+from ocp.tasks.tip_task import along, pose_line, timed
 from tests.models.machines.standing_machines import standing_arm
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.tasks.space_tasks import (
@@ -132,10 +130,7 @@ def test_a_free_roll_leaves_the_tool_axis_where_it_is_wanted() -> None:
 
 def test_the_base_is_held_still_by_a_task_of_the_root_link() -> None:
     machine = floating_panda()
-    task = [
-        TipTask(rows=(3,), velocity=(0.02,)),
-        TipTask(rows=(0, 1, 2), velocity=(0.0, 0.0, 0.0), link="satellite"),
-    ]
+    task = [TipTask(rows=(3,), velocity=(0.02,)), TipTask(rows=(0, 1, 2), velocity=(0.0, 0.0, 0.0), link="satellite")]
     local = resolve(machine, task=task, start_joints=PANDA_START, horizon=3.0, start_base=BASE, samples=13)
     assert local.stopped is None
     np.testing.assert_allclose(local.base[:, 3:], np.tile(BASE[3:], (13, 1)), atol=1e-9)

@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import pinocchio
 
-from models import Robot
-from models.robot.dynamics import Wrench
+from models import Robot, Wrench
 from tests.models.robot.trees import Array, numeric_poses, random_inertia
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.machines.scara import Scara
-from models.paths import Path as TaskPath
-from models.paths import smooth
+from models import Path as TaskPath
+from models import Scara, smooth
 from ocp.schedule import JointTrajectory, LineLimits, joint_motion, schedule
 from scripts import blend
 from scripts.papers.blend.example import (

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models import ModelError, reference_rig, reference_tunnel
 from models.cts.export import export, rig_functions
-from models.errors import ModelError
-from models.papers import reference_rig, reference_tunnel
 from scripts import cts
 from scripts.papers.cts.results import Results
 from tests.models.cts.cts_oracle import random_targets

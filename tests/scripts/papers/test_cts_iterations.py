@@ -11,10 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.cts.best_roll import optimal_inverse
+from models import ModelError, optimal_inverse, reference_rig, reference_tunnel
 from models.cts.rig import HOME, INCH, forward, inverse
-from models.errors import ModelError
-from models.papers import reference_rig, reference_tunnel
 from scripts.papers.cts.iterations import Run, combined, newton_step, null_space, null_space_step
 from scripts.papers.cts.results import sweep_targets
 from tests.models.cts.cts_oracle import Array, random_targets

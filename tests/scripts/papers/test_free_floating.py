@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from models import FreeFloating, paper_example
-from ocp import Collocation, solve
-from ocp.local.rates import LocalSolution, resolve
+from ocp import Collocation, resolve, solve
+from ocp.local.rates import LocalSolution
 from scripts import free_floating
 from scripts.papers.free_floating import results as free_floating_results
 from scripts.papers.free_floating.false_optima import FALSE, GUESSES, Trial

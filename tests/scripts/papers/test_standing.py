@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models import STANDING_STARTS
 from models.machines.standing_motion import StandingMotion
-from models.papers import STANDING_STARTS
+from ocp import resolve_accelerations
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
-from ocp.local.accelerations import resolve_accelerations
 from scripts import standing
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task
 from scripts.papers.standing.checks import ALLOWED, STATIONARITY, check, failures, region_excess

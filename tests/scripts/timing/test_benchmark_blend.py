@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.paths import smooth
+from models import smooth
 from scripts.papers.blend.example import REMAINING, example
 from scripts.papers.run import write
 from scripts.timing import blend as benchmark_blend

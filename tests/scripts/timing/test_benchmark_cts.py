@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.cts.best_roll import optimal_inverse
-from models.papers import reference_rig, reference_tunnel
+from models import optimal_inverse, reference_rig, reference_tunnel
 from scripts import benchmark
 from scripts.papers.cts.results import sweep_targets
 from scripts.timing import cts as benchmark_cts
