@@ -18,6 +18,7 @@ import numpy as np
 from models.arrays import Array
 from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
+from ocp.curves import rk4_step
 from ocp.errors import ProblemError
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
@@ -213,11 +214,7 @@ class _Simulation:
             solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, options)
             after = solver(x0=state, p=time)["xf"]
         else:
-            k1 = rate(time, state)
-            k2 = rate(time + step / 2, state + step / 2 * k1)
-            k3 = rate(time + step / 2, state + step / 2 * k2)
-            k4 = rate(time + step, state + step * k3)
-            after = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            after = rk4_step(lambda place, x: rate(time + place * step, x), state, step)
         self._once = ca.Function("step", [state, time], [after])
         self._many: dict[int, Any] = {}
 

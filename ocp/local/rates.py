@@ -16,6 +16,7 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from models.spatial import solve_spd
+from ocp.curves import integrator
 from ocp.errors import ProblemError
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
 from ocp.tasks.equations import TaskEquations, bind
@@ -207,9 +208,9 @@ class _Model:
 
     @staticmethod
     def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Callable[..., Any]:
-        options = {"abstol": tolerance, "reltol": tolerance, "linear_multistep_method": "adams"}
-        options |= {"max_num_steps": INTEGRATOR_STEPS, "disable_internal_warnings": True, "show_eval_warnings": False}
-        built: Callable[..., Any] = ca.integrator("motion", "cvodes", problem, start, times.tolist(), options)
+        built: Callable[..., Any] = integrator(
+            "motion", problem, times.tolist(), tolerance=tolerance, max_steps=INTEGRATOR_STEPS, start=start
+        )
         return built
 
 

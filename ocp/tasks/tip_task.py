@@ -15,6 +15,7 @@ import numpy as np
 
 from models import ModelError
 from models.arrays import Array, ArrayInput, checked_array
+from models.paths.blends import rest_to_rest
 from models.paths.functions import path_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
@@ -22,7 +23,7 @@ from models.robot.indices import checked_rows
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError
 
-__all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "quintic", "timed"]
+__all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "timed"]
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
@@ -159,11 +160,6 @@ def one_of(
     return [task] if isinstance(task, TipTask) else list(task)
 
 
-def quintic(fraction: Any) -> Any:
-    """From 0 to 1, at rest and without acceleration at both ends."""
-    return fraction**3 * (10 + fraction * (-15 + 6 * fraction))
-
-
 class PoseLine(NamedTuple):
     """Tracks of a TipTask: `TipTask(position=line.position, orientation=line.orientation)`."""
 
@@ -184,7 +180,7 @@ def pose_line(
         first, second: (Orientation, position), the orientation as a matrix (3, 3) or a quaternion (4,); a Frame of
             numbers, such as `machine.tip_pose(base, q)`, will do.
         duration: From the first to the second, s. Before and after it the pose stands still with pace "rest".
-        pace: "constant" for constant speed, "rest" for the quintic that starts and ends at rest.
+        pace: "constant" for constant speed, "rest" for the polynomial that starts and ends at rest.
 
     Raises:
         ProblemError: Wrong sizes, no rotations, a turn of half a circle, whose sense is ambiguous, a duration that is
@@ -209,7 +205,7 @@ def pose_line(
         s = time / duration
         if pace == "constant":
             return s
-        return quintic(ca.fmin(ca.fmax(s, 0), 1))
+        return rest_to_rest(ca.fmin(ca.fmax(s, 0), 1))
 
     def position(time: Any) -> Any:
         return ca.DM(place) + share(time) * ca.DM(there - place)

@@ -20,9 +20,10 @@ from models import Footprint, Robot, Standing, Wrench, footprint, locked, with_l
 from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
+from models.paths import rest_to_rest
 from ocp import Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
-from ocp.tasks.tip_task import quintic, timed
+from ocp.tasks.tip_task import timed
 from scripts.drawing import COLORS, DASHES, sheet
 
 __all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]
@@ -119,7 +120,7 @@ def circle(machine: Standing) -> TipTask:
 
 def from_rest(task: TipTask, seconds: float = SECONDS) -> TipTask:
     """The same over the time, s, from rest to rest."""
-    return timed(task, lambda time: quintic(time / seconds))
+    return timed(task, lambda time: rest_to_rest(time / seconds))
 
 
 def problem(machine: Standing, *, along: Any = "time") -> Problem:

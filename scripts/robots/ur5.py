@@ -10,6 +10,7 @@ import numpy as np
 
 from models import FixedBase, Machine
 from models.arrays import Array
+from models.paths import rest_to_rest
 from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
 from ocp.local.inverse_kinematics import Posture
 from ocp.local.rates import LocalSolution
@@ -35,7 +36,7 @@ def raster() -> TipTask:
 
     def place(time: Any) -> tuple[Any, Any]:
         s = time / DURATION
-        phase = np.pi * LANES * s**3 * (10 + s * (-15 + 6 * s))
+        phase = np.pi * LANES * rest_to_rest(s)
         # sideways between the lanes: the integral of cos^6, so that the lanes are straight and the turns smooth
         advance = 10 * phase + 7.5 * ca.sin(2 * phase) + 1.5 * ca.sin(4 * phase) + ca.sin(6 * phase) / 6
         return -ca.cos(phase) * LENGTH / 2, (advance / (10 * np.pi * LANES) - 0.5) * WIDTH

@@ -13,13 +13,14 @@ import numpy as np
 
 from models.arrays import Array
 from models.machines.standing import External, Standing
+from models.paths import rest_to_rest
 from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from ocp.tasks.equations import TaskEquations, on_symbols
 from ocp.tasks.limits import JointBounds
-from ocp.tasks.tip_task import quintic, timed
+from ocp.tasks.tip_task import timed
 from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "local_guess", "task_demand"]
@@ -209,7 +210,7 @@ def local_guess(
     """Guesses by name; where the local motion breaks down or races, the last posture before that is kept."""
     tasks = [part.task for part in equations.bound]
     if by_parameter:
-        tasks = [timed(task, lambda time: quintic(time / horizon)) for task in tasks]
+        tasks = [timed(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]
     times, still = np.zeros(1), np.zeros((1, joints.size))
     parts = [joints[None, :], still, still]
     try:
@@ -230,7 +231,7 @@ def local_guess(
     names = ("joints", "velocities", "accelerations")
     guess: dict[str, Any] = {name: Samples(times, part) for name, part in zip(names, parts, strict=True)}
     at = np.linspace(0.0, 1.0, GUESS_STEPS + 1)
-    along = (quintic(at), 30 * (at * (1 - at)) ** 2 / horizon, (60 * at - 180 * at**2 + 120 * at**3) / horizon**2)
+    along = (rest_to_rest(at), 30 * (at * (1 - at)) ** 2 / horizon, (60 * at - 180 * at**2 + 120 * at**3) / horizon**2)
     for name, values in zip(("path", "path_rate", "path_acceleration"), along, strict=True):
         guess[name] = Samples(at * horizon, values[:, None])
     return guess

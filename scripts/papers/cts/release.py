@@ -17,6 +17,7 @@ import numpy as np
 from models import Link, ModelError
 from models.arrays import Array, ArrayInput, checked_array
 from models.spatial import Expression, cross, expression, quaternion_product, rotation_from_quaternion
+from ocp.curves import rk4_step
 
 GRAVITY = 9.80665
 STATES = 13
@@ -165,11 +166,7 @@ def release(store: Store, start: ArrayInput, times: ArrayInput, steps: int = 4) 
         raise ModelError("release: the quaternion of the start is zero")
     x, time, h = ca.SX.sym("x", STATES), ca.SX.sym("time"), ca.SX.sym("h")
     rate = ca.Function("rate", [x, time], [ca.cse(store.rate(x, time))])
-    k1 = rate(x, time)
-    k2 = rate(x + h / 2 * k1, time + h / 2)
-    k3 = rate(x + h / 2 * k2, time + h / 2)
-    k4 = rate(x + h * k3, time + h)
-    step = ca.Function("step", [x, time, h], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    step = ca.Function("step", [x, time, h], [rk4_step(lambda place, at: rate(at, time + place * h), x, h)])
     states = [np.array(state)]
     for begin, end in pairwise(t):
         now, size = states[-1], (end - begin) / steps

@@ -12,6 +12,7 @@ import numpy as np
 from models import Standing
 from models.machines.standing_motion import StandingMotion, standing_motion
 from ocp import TipTask
+from ocp.curves import rk4_step
 from ocp.local.rates import least_rates
 from ocp.tasks.equations import bind
 
@@ -53,11 +54,8 @@ def printed_law(
     def rate(t: ca.MX, x: ca.MX) -> ca.MX:
         return ca.vertcat(x[n:], law(t, x[:n], x[n:])[0])
 
-    k1 = rate(at, state)
-    k2 = rate(at + h / 2, state + h / 2 * k1)
-    k3 = rate(at + h / 2, state + h / 2 * k2)
-    k4 = rate(at + h, state + h * k3)
-    step = ca.Function("step", [state, at], [state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    after = rk4_step(lambda place, x: rate(at + place * h, x), state, h)
+    step = ca.Function("step", [state, at], [after])
     start = np.concatenate([start_joints, np.zeros(n)])
     times = np.linspace(0.0, horizon, steps + 1)
     states = np.vstack([start, np.array(step.mapaccum("steps", steps)(start, times[None, :-1])).T])

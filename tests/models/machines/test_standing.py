@@ -28,8 +28,8 @@ from models import (
 from models.machines.standing import center_of_pressure, tip_spring
 from models.machines.standing_motion import standing_motion
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
+from tests.models.robot.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds
-from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
 EXAMPLE = standing_example()

@@ -25,6 +25,7 @@ from models import (
     planar_chain,
 )
 from models.robot.dynamics import external_wrench
+from tests.models.robot.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.robot.trees import (
     Array,
     directional,
@@ -36,7 +37,6 @@ from tests.models.robot.trees import (
     seeds,
     twist_by_differentiation,
 )
-from tests.scripts.papers.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 
 bases = st.sampled_from(["planar", "spatial"])
 LIBRARY = 1e-9

@@ -10,8 +10,8 @@ import numpy as np
 from models import Standing
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion
+from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
-from tests.scripts.papers.oracles import mujoco_model
 
 FOOT_MASS = 1.0  # kg; the simulator takes no body without mass
 SERVO = 1e4  # N m/rad at the ankle

@@ -12,10 +12,10 @@ from models import STANDING_STARTS, Standing, Wrench, standing_example
 from models.machines.machine import with_tip
 from models.machines.standing import External, tip_spring
 from models.machines.standing_motion import StandingMotion, standing_motion
+from models.paths import rest_to_rest
 from ocp import Problem, Solution, TipTask
 from ocp.builders.standing import FreeTime, Limits, Weights, standing_problem
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import quintic
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm, two_armed
 from tests.models.robot.trees import Array
 
@@ -90,7 +90,7 @@ def moved_task(standing: Standing, start: Array, by: Any, seconds: float, **fiel
     axes = [0, 1, 2] if len(by) == 3 else [1, 2]
     place, step = ca.DM(tip_at(standing, start)[axes]), ca.DM(by)
     rows = None if len(by) == 3 else ROWS
-    return TipTask(position=lambda t: place + step * quintic(t / seconds), rows=rows, gain=0.0, **fields)
+    return TipTask(position=lambda t: place + step * rest_to_rest(t / seconds), rows=rows, gain=0.0, **fields)
 
 
 def arm_task() -> TipTask:

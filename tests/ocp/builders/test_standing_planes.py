@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models import Standing, Support, rectangle
+from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, Weights, standing_problem
 from ocp.local.laws import Law
-from ocp.tasks.tip_task import quintic
 from ocp.tasks.zmp_rules import ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
@@ -52,7 +52,7 @@ def turned(degrees: float) -> tuple[Standing, TipTask]:
     tip, ahead = tip_at(machine, START), 0.2 * turn[axis, 1]
 
     def path(t: Any) -> list[Any]:
-        share = quintic(t / PLANAR_HORIZON)
+        share = rest_to_rest(t / PLANAR_HORIZON)
         return [tip[axis] + ahead * share, tip[2] - 0.3 * share]
 
     return machine, led(path, (3 + axis, 5))

@@ -11,10 +11,11 @@ import pytest
 
 from models import STANDING_STARTS
 from models.machines.machine import with_tip
+from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import FreeTime, IndexAtLeast, InFoot, Pinned, ZmpRule, plan_standing, standing_problem
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import pose_line, quintic, timed
+from ocp.tasks.tip_task import pose_line, timed
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.builders.standing_replay import assert_stands
 from tests.ocp.builders.standing_tasks import (
@@ -161,7 +162,7 @@ def test_a_hand_that_turns_on_its_way_costs_less_with_its_time_law_free() -> Non
     goal = turned((1, 0, 0), 0.4) @ first, place + np.array([0, 0.25, -0.3])
     line = pose_line((first, place), goal, 1.0, pace="constant")
     task = TipTask(position=line.position, orientation=line.orientation, rows=(0, 4, 5))
-    given = timed(task, lambda t: quintic(t / PLANAR_HORIZON))
+    given = timed(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
     cost = {}
     for along, what in (("time", given), ("parameter", task)):
         found = plan_standing(standing, what, start, PLANAR_HORIZON, zmp=InFoot(0.01), along=along)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, FreeFloating, Link, Machine, Robot, merged
+from models.paths import rest_to_rest
 from ocp import Solution
 from ocp.tasks.equations import task_errors
 from ocp.tasks.tip_task import PoseLine, pose_line
@@ -83,7 +84,7 @@ def circle(center: Array, radius: float, horizon: float) -> Any:
 
     def position(time: Any) -> Any:
         s = time / horizon
-        angle = 2 * np.pi * s**3 * (10 + s * (-15 + 6 * s))
+        angle = 2 * np.pi * rest_to_rest(s)
         return ca.vertcat(center[0] + radius * (ca.cos(angle) - 1), center[1] + radius * ca.sin(angle), center[2])
 
     return position
