@@ -1,4 +1,4 @@
-"""The exceptions of the package."""
+"""The exception and the warning of the package, in a room of their own below all others, which all may raise them."""
 
 from __future__ import annotations
 

@@ -53,3 +53,20 @@ def test_every_local_link_of_the_readme_leads_to_a_file() -> None:
     assert links, "README.md shows no local file: not even a picture"
     missing = [link for link in links if not (ROOT / link).exists()]
     assert not missing, f"README.md points at files that do not exist: {missing}"
+
+
+def test_the_list_of_modules_is_the_tree_as_it_is() -> None:
+    house = README.read_text(encoding="utf-8").partition("## The house")[2].partition("```\n")[2].partition("```")[0]
+    listed: dict[str, list[str]] = {}
+    package = room = ""
+    for line in house.splitlines():
+        if folder := re.match(r"(  )?([\w/]+)/ ", f"{line} "):
+            package, room = (package, folder[2]) if folder[1] else (folder[2], "")
+            line = line[folder.end() :] if folder[1] else ""
+        if package in ("models", "ocp"):
+            listed.setdefault(f"{package}/{room}".rstrip("/"), []).extend(line.split())
+    found: dict[str, list[str]] = {}
+    for file in (file for name in ("models", "ocp") for file in sorted((ROOT / name).rglob("*.py"))):
+        if file.name != "__init__.py":
+            found.setdefault(str(file.parent.relative_to(ROOT)), []).append(file.stem)
+    assert {folder: sorted(names) for folder, names in listed.items()} == found
