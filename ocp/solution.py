@@ -15,7 +15,18 @@ import numpy as np
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
 
-__all__ = ["ByName", "Guess", "Refinement", "Sample", "Solution", "check_belongs", "stack", "unstack"]
+__all__ = [
+    "ByName",
+    "Guess",
+    "Refinement",
+    "Sample",
+    "Solution",
+    "check_belongs",
+    "check_structure",
+    "in_order_of",
+    "stack",
+    "unstack",
+]
 
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
@@ -209,7 +220,9 @@ class Solution:
             if past is not None:
                 rounds = tuple(past["intervals"]), tuple(past["errors"])
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
-            return cls(**head, **fields, **{name: arrays[name] for name in PLAIN})
+            solution = cls(**head, **fields, **{name: arrays[name] for name in PLAIN})
+            check_structure(solution)
+            return solution
         except (FileNotFoundError, ProblemError):
             raise
         except Exception as error:  # what zip, zlib, numpy and JSON say of broken bytes is of many kinds
@@ -246,10 +259,75 @@ class Places(Protocol):
 
 
 def check_belongs(form: Places, solution: Solution) -> None:
-    """Raise ProblemError unless the states and controls of a plan are those of a problem."""
+    """Raise ProblemError unless the states and controls of a plan are those of a problem, in whatever order."""
     for what in ("states", "controls"):
         have = {name: values.shape[1] for name, values in getattr(solution, what).items()}
         want = {name: place.stop - place.start for name, place in getattr(form, what).items()}
         if have != want:
             words = f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}"
             raise ProblemError(words, name=what, value=have, limit=want)
+    if set(solution.costates) != set(solution.states):
+        words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
+        raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
+
+
+def in_order_of(form: Places, solution: Solution) -> Solution:
+    """The same plan with its states and controls, which interpolants hold by position, in the order of a problem."""
+    orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
+    changes: dict[str, Any] = {}
+    for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
+        own, names = getattr(solution, pool), orders[pool]
+        if list(own) == names:
+            continue
+        ends = dict(zip(own, np.cumsum([values.shape[1] for values in own.values()]), strict=True))
+        columns = np.concatenate([np.arange(ends[name] - own[name].shape[1], ends[name]) for name in names])
+        curve = getattr(solution, interpolant)
+        changes[pool] = {name: own[name] for name in names}
+        changes[interpolant] = replace(curve, values=curve.values[:, :, columns])
+    return replace(solution, **changes) if changes else solution
+
+
+def check_structure(solution: Solution) -> None:
+    """Raise ProblemError, which names the part, unless the arrays of a plan are whole: sizes, order of times, breaks.
+
+    Times run from 0 to the horizon and breaks from 0 to 1; every array has a row for each time, every interpolant a
+    piece for each pair of breaks, nodes within 0..1, and as many columns as what it interpolates.
+    """
+
+    def refuse(name: str, words: str) -> ProblemError:
+        return ProblemError(f"plan {solution.name!r}: {name} {words}", name=name)
+
+    def real(name: str, value: Any, dimensions: int) -> np.ndarray:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu" or array.ndim != dimensions:
+            raise refuse(name, f"is no real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}")
+        return array
+
+    for name in ("horizon", "cost"):
+        if isinstance(getattr(solution, name), bool) or not isinstance(
+            getattr(solution, name), int | float | np.number
+        ):
+            raise refuse(name, f"is no number: {getattr(solution, name)!r}")
+    if not isinstance(solution.success, bool | np.bool_):
+        raise refuse("success", f"is neither True nor False: {solution.success!r}")
+    if not 0 < solution.horizon < np.inf:
+        raise refuse("horizon", f"{solution.horizon!r} s is not positive and finite")
+    t, slack = real("t", solution.t, 1), 1e-9 * solution.horizon
+    if t.size < 2 or not (np.diff(t) >= -slack).all() or abs(t[0]) > slack or abs(t[-1] - solution.horizon) > slack:
+        raise refuse("t", f"does not run from 0 to the horizon, {solution.horizon!r} s")
+    for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
+        columns = 0
+        for name, values in getattr(solution, pool).items():
+            if len(real(f"{pool[:-1]} {name!r}", values, 2)) != t.size:
+                raise refuse(f"{pool[:-1]} {name!r}", f"has {len(values)} rows for {t.size} times")
+            columns += values.shape[1]
+        curve = getattr(solution, interpolant)
+        breaks, nodes = real(f"{interpolant}.breaks", curve.breaks, 1), real(f"{interpolant}.nodes", curve.nodes, 1)
+        values = real(f"{interpolant}.values", curve.values, 3)
+        if breaks.size < 2 or not (np.diff(breaks) > 0).all() or abs(breaks[0]) > 1e-12 or abs(breaks[-1] - 1) > 1e-12:
+            raise refuse(f"{interpolant}.breaks", "do not increase from 0 to 1")
+        if not nodes.size or not (np.diff(nodes) > 0).all() or nodes[0] < -1e-12 or nodes[-1] > 1 + 1e-12:
+            raise refuse(f"{interpolant}.nodes", "do not increase within 0 to 1")
+        if values.shape != (breaks.size - 1, nodes.size, columns):
+            shape = (breaks.size - 1, nodes.size, columns)
+            raise refuse(f"{interpolant}.values", f"have shape {values.shape}, not {shape}")

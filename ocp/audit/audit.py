@@ -17,13 +17,14 @@ from ocp.audit.principle import Optimality, minimum_principle
 from ocp.audit.reintegration import Reintegration, reintegrate, violations
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_belongs, stack, unstack
+from ocp.solution import Solution, check_belongs, check_structure, in_order_of, stack, unstack
 
 __all__ = ["Audit", "Finding", "audit"]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which constraints are looked at
+HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,8 @@ def audit(
             raise ProblemError(words, name=name, value=limit)
     form = Formulation(problem)
     check_belongs(form, solution)
+    check_structure(solution)
+    solution = in_order_of(form, solution)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     points = max(solution.state_interpolant.values.shape[1] - 1, 1)
@@ -161,6 +164,7 @@ def audit(
     findings.append(worst("integration error of one interval", local.max(axis=1), again.t, integration))
     findings.append(cost_finding(form, solution, again, p, integration))
     findings.append(reported_finding(solution, integration))
+    findings.append(horizon_finding(form, solution, bounds))
 
     names = [*form.states, *form.controls, *[c for kind in (form.path, form.start, form.end) for c in kind.names]]
     for name in limits:
@@ -194,6 +198,14 @@ def audit(
         costate,
         second,
     )
+
+
+def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Finding:
+    """The plan's horizon against the one that is asked, or its bounds: it is given, not found, so to rounding."""
+    low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
+    miss = max(low - solution.horizon, solution.horizon - high, 0.0)
+    asked = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
+    return Finding("horizon", miss, HORIZON_SLACK * solution.horizon, None, f"{solution.horizon:.6g} s, asked {asked}")
 
 
 def optimality_findings(form: Formulation, found: Optimality, stationarity: float, drift: float) -> list[Finding]:

@@ -44,13 +44,18 @@ def is_finite(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class InFoot:
-    """The zero moment point stays inside the support by a margin, m; a negative one lets it go as far beyond."""
+    """The zero moment point stays inside the support by a margin, m, zero or positive."""
 
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not is_finite(self.margin):
-            raise ProblemError(f"InFoot: margin must be a finite number of m, not {self.margin!r}")
+        if not (is_finite(self.margin) and self.margin >= 0):  # beyond the foot it would tip over
+            raise ProblemError(
+                f"InFoot: margin must be a finite number of m, not negative, not {self.margin!r}",
+                name="margin",
+                value=self.margin,
+                limit=0.0,
+            )
 
     def check(self, machine: Standing) -> None:
         """Raise ProblemError where the margin leaves no room in the support."""

@@ -469,3 +469,68 @@ def test_a_held_control_is_stationary_with_the_constraints_at_both_ends_of_its_i
     audit = solve(problem, method).audit()
     assert audit.passed, str(audit)
     assert audit[STATIONARITY].value < 1e-6
+
+
+# ---- what belongs to a plan ------------------------------------------------------------------------------------------
+
+
+def lifted(horizon: float, order: str = "ab", **free: Any) -> Problem:
+    """Two integrators from 0 to 1 and to 2, declared in an order, at the least integral of squared rates."""
+    problem = Problem("lifted")
+    ends = {"a": 1.0, "b": 2.0}
+    states = {name: problem.state(name, initial=0.0, terminal=ends[name]) for name in order}
+    rates = {name: problem.control(f"rate of {name}") for name in order}
+    for name in order:
+        problem.dynamics(states[name], rates[name])
+    problem.horizon(**free) if free else problem.horizon(horizon)
+    problem.minimize(sum(rate**2 for rate in rates.values()))
+    return problem
+
+
+@pytest.mark.parametrize(
+    ("asked", "free", "passes"),
+    [(1.0, {}, False), (2.0, {}, True), (0.0, {"lower": 1.0, "upper": 2.0}, True), (0.0, {"upper": 1.9}, False)],
+    ids=["shorter", "its own", "at its bound", "beyond its bound"],
+)
+def test_a_plan_of_another_horizon_fails(asked: float, free: dict[str, Any], passes: bool) -> None:
+    plan = solve(lifted(2.0), Collocation(10))
+    audit = plan.audit(lifted(asked, **free))
+    assert audit["horizon"].passed is passes
+    assert audit.passed is passes
+
+
+def test_a_plan_is_read_by_the_names_of_its_states() -> None:
+    plan = solve(lifted(1.0, "ab"), Collocation(10))
+    assert plan.audit(lifted(1.0, "ba")).passed
+    swapped = lifted(1.0, "ba")
+    swapped.end(
+        "the other way round", ca.vertcat(*(v.symbol for v in swapped.declared.states.values())), [1, 2], [1, 2]
+    )
+    assert not plan.audit(swapped).passed
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "part"),
+    [
+        ("t", lambda t: 1.5 * t, "t"),
+        ("t", lambda t: t[::-1], "t"),
+        ("horizon", lambda _: np.nan, "horizon"),
+        ("horizon", lambda _: 3.0, "t"),
+        ("success", lambda _: "no", "success"),
+        ("cost", lambda _: "cheap", "cost"),
+        ("states", lambda pool: {name: values[1:] for name, values in pool.items()}, "state 'a'"),
+        ("states", lambda pool: {name: values + 0j for name, values in pool.items()}, "state 'a'"),
+        ("state_interpolant", lambda curve: replace(curve, breaks=curve.breaks / 2), "state_interpolant.breaks"),
+        ("control_interpolant", lambda curve: replace(curve, nodes=curve.nodes[::-1]), "control_interpolant.nodes"),
+        ("costate_interpolant", lambda curve: replace(curve, values=curve.values[1:]), "costate_interpolant.values"),
+        ("costates", lambda pool: {"a": pool["a"]}, "costates"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_plan_that_is_not_whole_is_refused_by_the_name_of_the_part(field: str, change: Any, part: str) -> None:
+    problem = lifted(1.0)
+    plan = solve(problem, Collocation(10))
+    broken: dict[str, Any] = {field: change(getattr(plan, field))}
+    with pytest.raises(ProblemError) as caught:
+        replace(plan, **broken).audit(problem)
+    assert caught.value.name == part

@@ -509,6 +509,7 @@ def test_a_path_longer_than_the_arm_is_refused() -> None:
         (lambda: Weights(velocity=-1.0), "weights: velocity"),
         (lambda: Weights(time="long"), "weights: time"),  # type: ignore[arg-type]
         (lambda: InFoot(np.nan), "InFoot: margin must be a finite number"),
+        (lambda: InFoot(-0.3), "InFoot: margin must be a finite number"),
         (lambda: IndexAtLeast(None), "value must be below 1"),  # type: ignore[arg-type]
         (lambda: FreeTime(np.nan, 1.0, 1.0), "lower <= guess <= upper"),
         (lambda: Limits(velocity="fast"), "velocity must be positive, one number or one for each joint, not 'fast'"),
