@@ -86,7 +86,8 @@ def footprint(
     if not points:
         owning = sorted({name for _, name in meshes})
         what = f"only meshes, in {owning}, which are not read" if meshes else "no collision shapes"
-        raise ModelError(f"footprint: there are {what}; give the support yourself, for example models.rectangle(...)")
+        message = f"footprint: there are {what}; give the support yourself, for example models.rectangle(...)"
+        raise ModelError(message, name=owning[0] if owning else "shapes", value=tuple(owning))
     cloud = np.array(points)
     height = float(cloud[:, 2].min())
     if meshes and min(meshes)[0] < height:

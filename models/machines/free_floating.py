@@ -375,4 +375,4 @@ def _require_inertia(robot: Robot, rows: list[int]) -> None:
         f"the links {names} have no rotational inertia about some axis, "
         f"so that the momentum does not fix the motion of the base; give the base link an inertia{hint}"
     )
-    raise ModelError(message, name="robot", value=names)
+    raise ModelError(message, name="links", value=names)

@@ -64,7 +64,8 @@ def _remaining_distances(
     """Remaining distance of each vertex, checked. Shape (n - 1,), m. Arguments as of `smooth`."""
     checked_choice(overlap, get_args(Overlap), "path", "overlap")
     if (remaining is None) == (deviation is None):
-        raise ModelError("give either the remaining distance or the deviation, not both and not neither")
+        message = "give either the remaining distance or the deviation, not both and not neither"
+        raise ModelError(message, name="deviation", value=deviation)
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
         wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")

@@ -3,6 +3,7 @@
 Recursive Newton-Euler (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) written in world axes. The base stands
 still unless its motion is given; joint positions, velocities and accelerations are of shape (dof, 1) in the order of
 `robot.joint_names`, as SX, MX, DM or numbers. Any algebra of one kind: a wrench of SX entries goes with SX positions.
+All raise ModelError for wrong sizes, and for a wrench on a link that does not exist.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from models.arrays import checked_array
 from models.errors import ModelError
 from models.robot.kinematics import Placement, by_joint_vector, checked_vector, frames_and_axes, subtree_moments
 from models.robot.motion import LinkMotion, momentum_rates, motions_of
@@ -49,8 +51,8 @@ class Wrench:
             given = getattr(self, part)
             owner = f"wrench on link {self.link!r}"
             value = checked_vector(given, 3, f"{owner}: {part}", "x, y and z")
-            if isinstance(value, ca.DM) and not np.isfinite(np.array(value)).all():
-                raise ModelError(f"{owner}: {part} {np.array(value).ravel().tolist()} is not finite")
+            if isinstance(value, ca.DM):
+                checked_array(np.array(value).ravel(), (3,), owner, part)
             object.__setattr__(self, part, value)
 
 
@@ -72,9 +74,6 @@ def inverse_dynamics(
 
     The base may move: `base_twist` and `base_acceleration` are (angular velocity, velocity of the origin of the root
     link's frame) and their time derivatives, world axes, shape (6, 1).
-
-    Raises:
-        ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
     return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[0]
@@ -96,9 +95,6 @@ def base_reaction(
 
     The rate of momentum less the weight of all links, the root link included, and less the wrenches. Of a base that
     moves, see inverse_dynamics, it is what drives it: zero where it floats freely.
-
-    Raises:
-        ModelError: Wrong sizes, a wrench on a link that does not exist.
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
     return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[1]
@@ -129,11 +125,7 @@ def mass_matrix(robot: Robot, q: Expression) -> Expression:
 def external_wrench(
     robot: Robot, q: Expression, wrenches: Sequence[Wrench], world_from_base: Placement | None = None
 ) -> Expression:
-    """Sum of wrenches: (moment about the world's origin, force). Shape (6, 1).
-
-    Raises:
-        ModelError: Wrong sizes, a wrench on a link that does not exist.
-    """
+    """Sum of wrenches: (moment about the world's origin, force). Shape (6, 1)."""
     frames, _ = frames_and_axes(robot, q, world_from_base)
     links = tuple(w.link for w in wrenches)
     given = _given_wrenches(frames, stacked_wrenches(robot, wrenches), links)
@@ -143,16 +135,13 @@ def external_wrench(
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
     """`wrenches` as a tuple; ModelError unless it is a list of them."""
     if not isinstance(wrenches, list | tuple) or not all(isinstance(one, Wrench) for one in wrenches):
-        raise ModelError(f"wrenches must be a list of Wrench(...), not {wrenches!r}")
+        message = f"wrenches must be a list of Wrench(...), not {wrenches!r}"
+        raise ModelError(message, name="wrenches", value=wrenches)
     return tuple(wrenches)
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
-    """Moment, force and point of every wrench in a column of its own. Shape (9, k).
-
-    Raises:
-        ModelError: An unknown link.
-    """
+    """Moment, force and point of every wrench in a column of its own. Shape (9, k)."""
     columns = []
     for wrench in checked_wrenches(wrenches):
         robot.link(wrench.link)

@@ -3,7 +3,8 @@
 Every function takes the joint positions q, shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
 numbers, with which joints that follow others move too, and the placement of the root link in the world,
 `world_from_base` = (rotation, position), the world's own frame if None. Velocities and momenta are those of the
-joints alone: the base stands still unless said otherwise.
+joints alone: the base stands still unless said otherwise. All raise ModelError for a q of a wrong size, for a link that
+does not exist, and, where they divide by it, for no mass.
 """
 
 from __future__ import annotations
@@ -65,13 +66,16 @@ def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
 
 
 def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Expression:
-    """`value` as a column of `size`; ModelError naming `what` and `meaning` otherwise."""
+    """`value` as a column of `size`; ModelError naming `what`, an argument, and `meaning` otherwise."""
+    name, limit = what.rpartition(" ")[2], (size, 1)
     try:
         value = expression(value)
     except (TypeError, ValueError, NotImplementedError) as error:
-        raise ModelError(f"{what} {value!r} is not numeric; ({size}, 1) expected: {meaning}") from error
-    if value.shape != (size, 1) and not (size == 0 and value.numel() == 0):
-        raise ModelError(f"{what} has shape {tuple(value.shape)}, expected ({size}, 1): {meaning}")
+        message = f"{what} {value!r} is not numeric; {limit} expected: {meaning}"
+        raise ModelError(message, name=name, value=value, limit=limit) from error
+    if value.shape != limit and not (size == 0 and value.numel() == 0):
+        message = f"{what} has shape {tuple(value.shape)}, expected {limit}: {meaning}"
+        raise ModelError(message, name=name, value=tuple(value.shape), limit=limit)
     return value
 
 
@@ -119,11 +123,7 @@ def centers_of_mass(robot: Robot, q: Expression, world_from_base: Placement | No
 
 
 def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Centre of mass of the whole robot in the world. Shape (3, 1), m.
-
-    Raises:
-        ModelError: The robot has no mass.
-    """
+    """Centre of mass of the whole robot in the world. Shape (3, 1), m."""
     if robot.total_mass == 0:
         raise massless("hence no centre of mass")
     frames = link_frames(robot, q, world_from_base)
@@ -148,9 +148,6 @@ def frame_jacobian(
 
     Returns:
         Shape (6, dof). Columns of joints that do not carry the link are zero.
-
-    Raises:
-        ModelError: Unknown link, q of a wrong size.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     robot.link(link)

@@ -44,7 +44,8 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
             if tie.joint not in names:
                 raise absent(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
             if tie.joint in chain:
-                raise ModelError(f"joints {chain} mimic each other in a ring; let one of them mimic none")
+                message = f"joints {chain} mimic each other in a ring; let one of them mimic none"
+                raise ModelError(message, name="joints", value=tuple(chain))
             if tie.joint not in ties:
                 break
             chain.append(tie.joint)
@@ -126,9 +127,10 @@ def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[s
         limits["upper"][column] = min(limits["upper"][column], upper)
         limits["velocity"][column] = min(limits["velocity"][column], joint.velocity / abs(multiplier))
         if limits["lower"][column] > limits["upper"][column]:
-            raise ModelError(
+            message = (
                 f"joint {name!r} follows {leader.name!r} and stays within its limits {joint.lower:g} .. "
                 f"{joint.upper:g} only where that is in {lower:g} .. {upper:g}, which its own limits {leader.lower:g} "
                 f".. {leader.upper:g}, or those of other followers, exclude"
             )
+            raise ModelError(message, name=name, value=(lower, upper), limit=(leader.lower, leader.upper))
     return limits

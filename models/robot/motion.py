@@ -2,7 +2,7 @@
 
 Written in world axes, so that what a planar machine does not do stays a structural zero. The base stands still; joint
 positions, velocities and accelerations are of shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
-numbers. Moments are about points at rest in the world.
+numbers; ModelError for one of a wrong size. Moments are about points at rest in the world.
 """
 
 from __future__ import annotations
@@ -44,11 +44,7 @@ class CenterOfMassMotion(NamedTuple):
 def link_motions(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> dict[str, LinkMotion]:
-    """Motion of every link, by name, root first.
-
-    Raises:
-        ModelError: q, qd or qdd is of a wrong size.
-    """
+    """Motion of every link, by name, root first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     return motions_of(robot, frames, axes, qd, qdd)
 
@@ -56,11 +52,7 @@ def link_motions(
 def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
-    """Position, velocity and acceleration of the centre of mass of the whole robot.
-
-    Raises:
-        ModelError: The robot has no mass; wrong sizes.
-    """
+    """Position, velocity and acceleration of the centre of mass of the whole robot; ModelError if it has no mass."""
     if robot.total_mass == 0:
         raise massless("hence no centre of mass")
     return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))

@@ -6,19 +6,18 @@ Attributes that are arrays are given as anything numpy reads and stored as read-
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_rotation, frozen
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number, checked_rotation, frozen
 from models.errors import ModelError
 from models.spatial import rotation
 
 Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
-KINDS = ("fixed", "revolute", "continuous", "prismatic")
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
 """Kinds of collision shapes, and how many numbers their size is."""
 INERTIA_TOLERANCE = 1e-6
@@ -48,14 +47,13 @@ class CollisionShape:
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        owner = "collision shape"
-        if self.kind not in SHAPES:
-            raise ModelError(f"{owner}: unknown kind {self.kind!r}; use one of {', '.join(SHAPES)}")
-        size = checked_array(self.size, (SHAPES[self.kind],), owner, f"size of the {self.kind}")
-        if self.kind == "mesh" and not self.file:
-            raise ModelError(f"{owner}: a mesh needs the name of its file")
-        if not (size.all() if self.kind == "mesh" else (size > 0).all()):
-            raise ModelError(f"{owner}: size {size.tolist()} of the {self.kind} is not positive")
+        numbers = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
+        owner, mesh = f"collision {self.kind}", self.kind == "mesh"
+        size = checked_array(self.size, (numbers,), owner, "size", positive=not mesh)
+        if mesh and not self.file:
+            raise ModelError(f"{owner}: a mesh needs the name of its file", name="file", value=self.file)
+        if not size.all():
+            raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
@@ -92,9 +90,9 @@ class Link:
 
     def __post_init__(self) -> None:
         owner = f"link {self.name!r}"
-        mass = checked_array(self.mass, (), owner, "mass").item()
+        mass = checked_number(self.mass, owner, "mass")
         if mass < 0:
-            raise ModelError(f"{owner}: mass {mass} kg is negative")
+            raise ModelError(f"{owner}: mass {mass} kg is negative", name="mass", value=mass, limit=0.0)
         inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
         _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
@@ -122,7 +120,7 @@ class Mimic:
 
     def __post_init__(self) -> None:
         for what in ("multiplier", "offset"):
-            number = checked_array(getattr(self, what), (), f"mimic of joint {self.joint!r}", what).item()
+            number = checked_number(getattr(self, what), f"mimic of joint {self.joint!r}", what)
             object.__setattr__(self, what, number)
 
 
@@ -167,33 +165,35 @@ class Joint:
 
     def __post_init__(self) -> None:
         owner = f"joint {self.name!r}"
-        if self.kind not in KINDS:
-            raise ModelError(f"{owner}: unknown kind {self.kind!r}; use one of {', '.join(KINDS)}")
+        checked_choice(self.kind, get_args(Kind), owner, "kind")
         axis = checked_array(self.axis, (3,), owner, "axis")
         length = float(np.linalg.norm(axis))
         if not length > 0:
-            raise ModelError(f"{owner}: axis {axis.tolist()} has no direction")
+            raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axis", value=axis)
         object.__setattr__(self, "axis", frozen(axis / length))
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
         for what in ("lower", "upper", "velocity", "effort"):
-            limit = checked_array(getattr(self, what), (), owner, what, finite=False).item()
+            limit = checked_number(getattr(self, what), owner, what, finite=False)
             object.__setattr__(self, what, limit)
+            if what in ("velocity", "effort") and limit < 0:
+                raise ModelError(f"{owner}: {what} limit {limit} is negative", name=what, value=limit, limit=0.0)
+        room = (self.lower, self.upper)
         if self.lower > self.upper:
-            raise ModelError(f"{owner}: lower limit {self.lower} is above upper limit {self.upper}")
+            message = f"{owner}: lower limit {self.lower} is above upper limit {self.upper}"
+            raise ModelError(message, name="lower", value=self.lower, limit=self.upper)
         if self.lower == np.inf or self.upper == -np.inf:
-            raise ModelError(f"{owner}: limits {self.lower} .. {self.upper} leave no position")
-        for what in ("velocity", "effort"):
-            if getattr(self, what) < 0:
-                raise ModelError(f"{owner}: {what} limit {getattr(self, what)} is negative")
-        if self.kind == "continuous" and np.isfinite([self.lower, self.upper]).any():
-            raise ModelError(
+            message = f"{owner}: limits {self.lower} .. {self.upper} leave no position"
+            raise ModelError(message, name="limits", value=room)
+        if self.kind == "continuous" and np.isfinite(room).any():
+            message = (
                 f"{owner}: a continuous joint has no position limits, but {self.lower} .. {self.upper} is "
                 "given; make it revolute or leave them out"
             )
-
+            raise ModelError(message, name="limits", value=room, limit=(-np.inf, np.inf))
         if self.mimic is not None and not self.moves:
-            raise ModelError(f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}")
+            message = f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}"
+            raise ModelError(message, name=self.name, value=self.mimic.joint)
 
     @property
     def moves(self) -> bool:
@@ -214,28 +214,31 @@ class Joint:
             ModelError: The joint is fixed already, or the position is not finite.
         """
         if not self.moves:
-            raise ModelError(f"joint {self.name!r} is fixed; only a joint that moves can be locked")
-        held = checked_array(position, (), f"joint {self.name!r}", "locked position").item()
-        turn, shift = self.placed(held)
+            message = f"joint {self.name!r} is fixed; only a joint that moves can be locked"
+            raise ModelError(message, name=self.name, value=self.kind)
+        turn, shift = self.placed(checked_number(position, f"joint {self.name!r}", "locked position"))
         return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
 
 
 def massless(consequence: str) -> ModelError:
     """The error that says a robot has no mass, what that makes impossible, and what URDF has for it."""
-    return ModelError(f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>")
+    message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
+    return ModelError(message, name="mass", value=0.0, limit=0.0)
 
 
 def _check_inertia(inertia: Array, owner: str, lenient: bool) -> None:
     slack = INERTIA_TOLERANCE * float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > slack:
-        raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric")
+        raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric", name="inertia", value=inertia)
     if lenient:
         return
     least, middle, greatest = np.linalg.eigvalsh((inertia + inertia.T) / 2)
     if least < -slack:
-        raise ModelError(f"{owner}: inertia has the negative principal moment {least:g} kg m^2")
+        message = f"{owner}: inertia has the negative principal moment {least:g} kg m^2"
+        raise ModelError(message, name="inertia", value=float(least), limit=0.0)
     if greatest > least + middle + slack:
-        raise ModelError(
-            f"{owner}: principal moments {least:g}, {middle:g}, {greatest:g} kg m^2 violate the triangle "
-            "inequality: none may exceed the sum of the two others"
+        message = (
+            f"{owner}: inertia has principal moments {least:g}, {middle:g}, {greatest:g} kg m^2, which violate the "
+            "triangle inequality: none may exceed the sum of the two others"
         )
+        raise ModelError(message, name="inertia", value=float(greatest), limit=float(least + middle))

@@ -1,8 +1,8 @@
 """Robots made from robots: joints locked, tools and loads attached, arms joined, branches cut, another root or tip.
 
-Every function returns a new robot and leaves the given one as it is. Placements are (3,) translations in m and (3, 3)
-rotations whose columns are axes, no turn if None. All raise ModelError, naming the near ones, for a name that does not
-exist, and for a name that would occur twice.
+Every function takes a robot, which it leaves as it is, and returns a new one. Placements are (3,) translations in m
+and (3, 3) rotations whose columns are axes, no turn if None. All raise ModelError, naming the near ones, for a name
+that does not exist, and for a name that would occur twice.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
     """The robot with some joints held fixed, and with each the joints that follow it, where that puts them.
 
     Args:
-        robot: The robot.
         positions: Position of each joint to lock (rad or m), by name. Limits are not checked.
 
     Raises:
@@ -50,7 +49,6 @@ def with_load(
     """The robot with a body welded to a link, whose inertia it joins.
 
     Args:
-        robot: The robot.
         link: Name of the link that carries the load.
         mass: kg.
         center_of_mass: In the link's frame. Shape (3,), m.
@@ -80,7 +78,6 @@ def attached(
     come last.
 
     Args:
-        robot: The robot.
         tool: What is attached: a robot, or a single link.
         link: Name of the link that carries it. The tool stands at its tip frame if None.
         translation: Tool's root link in the carrying frame. Shape (3,), m.
@@ -122,10 +119,11 @@ def merged(
         ModelError: No arm; a placement of an arm that is not there.
     """
     if not arms:
-        raise ModelError("merged robots: no arm is given")
+        raise ModelError("merged robots: no arms are given", name="arms", value=arms)
     given = [links or {}, translations or {}, rotations or {}]
     if unknown := [prefix for places in given for prefix in places if prefix not in arms]:
-        raise ModelError(f"merged robots: {unknown} are no prefixes of the arms, which are {list(arms)}")
+        message = f"merged robots: {unknown} are no prefixes of the arms, which are {list(arms)}"
+        raise ModelError(message, name=unknown[0], value=unknown, limit=tuple(arms))
     whole = base if isinstance(base, Robot) else Robot((base,), name=base.name)
     root, first = whole.root, True
     for prefix, arm in arms.items():
@@ -163,7 +161,6 @@ def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
     """A link with all that it carries, as a robot of its own; `pruned` says what becomes of joints that follow others.
 
     Args:
-        robot: The robot.
         root: Name of the link.
         tip: Link whose frame is the tip. If None the robot's tip where it is among them, else the only leaf if any.
     """
@@ -199,7 +196,6 @@ def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     The tip frame, the names and order of the moving joints and the frames of their links stay.
 
     Args:
-        robot: The robot.
         keep: Links on fixed joints whose frames are still wanted. They stay, without mass: that goes to the carrier.
     """
     stay = {robot.link(name).name for name in _names(keep)}

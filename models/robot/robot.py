@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 from warnings import warn
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_rotation
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_rotation
 from models.errors import ModelError, ModelWarning
 from models.robot.mimicry import Drive, drives, held, joint_limits, ties_to_leaders
 from models.robot.parts import Joint, Link
@@ -82,10 +82,11 @@ class Robot:
     def tip_link(self) -> str:
         """Name of the link that carries the tip; ModelError, which says how to give it, where there is none."""
         if self.tip is None:
-            raise ModelError(
+            message = (
                 f"{self.name!r} has no tip, which is needed here: its tree has the leaves {self._leaves}; say which "
                 "link carries it, tip=NAME where the robot is made or retipped(robot, NAME), or let tasks name links"
             )
+            raise ModelError(message, name="tip", limit=tuple(self._leaves))
         return self.tip
 
     @classmethod
@@ -123,8 +124,7 @@ class Robot:
             ModelWarning: Inertias that no body can have, attributes that mean nothing in URDF, joints whose followers'
                 limits leave them one position.
         """
-        if mimic not in ("couple", "lock", "free"):
-            raise ModelError(f"unknown mimic rule {mimic!r}; use 'couple', 'lock' or 'free'")
+        checked_choice(mimic, get_args(MimicRule), "URDF", "mimic")
         found = read_urdf(source, inertia=inertia)
         joints = found.joints if mimic != "free" else tuple(replace(joint, mimic=None) for joint in found.joints)
         known = {joint.name: None for joint in joints}
@@ -306,16 +306,12 @@ def planar_chain(
     Raises:
         ModelError: Sizes that differ, no link, a mass or an inertia that is impossible.
     """
-    lengths = np.atleast_1d(np.asarray(lengths, dtype=float))
-    count = lengths.shape[0]
-    if lengths.ndim != 1 or count == 0:
-        raise ModelError(f"planar chain: lengths must be a vector of at least one length, not of shape {lengths.shape}")
-    lengths = checked_array(lengths, (count,), "planar chain", "lengths")
-    masses = checked_array(masses, (count,), "planar chain", "masses")
-    moments = checked_array(
-        masses * lengths**2 / 12 if inertias is None else inertias, (count,), "planar chain", "inertias"
-    )
-    mount = checked_array(mount, (2,), "planar chain", "mount")
+    owner = "planar chain"
+    lengths = checked_array(lengths, ("links",), owner, "lengths")
+    count = len(lengths)
+    masses = checked_array(masses, (count,), owner, "masses")
+    moments = checked_array(masses * lengths**2 / 12 if inertias is None else inertias, (count,), owner, "inertias")
+    mount = checked_array(mount, (2,), owner, "mount")
     root = base if base is not None else Link("base")
     links, joints = [root], []
     for i in range(count):

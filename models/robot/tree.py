@@ -23,14 +23,16 @@ def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
     near = [folded[each] for each in get_close_matches(str(name).casefold(), folded, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(repr(each) for each in near)}? " if near else ""
     listed = f"{names[:MANY]} and {len(names) - MANY} more" if len(names) > MANY else f"{names}"
-    return ModelError(f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}")
+    message = f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
+    return ModelError(message, name=str(name), value=name, limit=tuple(names))
 
 
 def require_unique(names: Iterable[str], what: str) -> None:
     """Raise ModelError when a name occurs twice."""
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        raise ModelError(f"{what} name {repeated[0]!r} is used more than once; give every {what} its own name")
+    for name, count in Counter(names).items():
+        if count > 1:
+            message = f"{what} name {name!r} is used more than once; give every {what} its own name"
+            raise ModelError(message, name=name, value=count, limit=1)
 
 
 def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> str:
@@ -44,7 +46,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
         ModelError: Unknown link name, a link with two parents, no root (a loop), more than one root.
     """
     if not links:
-        raise ModelError("a robot needs at least one link")
+        raise ModelError("a robot needs at least one link", name="link", value=0, limit=1)
     known = set(links)
     parent_joint: dict[str, str] = {}
     for joint, parent, child in edges:
@@ -52,20 +54,21 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
             if link not in known:
                 raise absent(f"joint {joint!r}: {role} link", link, links)
         if parent == child:
-            raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop")
+            raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop", name=joint, value=child)
         if child in parent_joint:
-            raise ModelError(
+            message = (
                 f"link {child!r} is the child of joints {parent_joint[child]!r} and {joint!r}: "
                 "a loop; a kinematic tree gives each link one parent"
             )
+            raise ModelError(message, name=child, value=(parent_joint[child], joint), limit=1)
         parent_joint[child] = joint
     roots = [link for link in links if link not in parent_joint]
     if not roots:
-        raise ModelError(f"links {sorted(known)} form a loop: every link has a parent, so there is no root")
+        message = f"links {sorted(known)} form a loop: every link has a parent, so there is no root"
+        raise ModelError(message, name="links", value=tuple(sorted(known)))
     if len(roots) > 1:
-        raise ModelError(
-            f"links {roots} have no parent joint; a kinematic tree has one root: join or remove the others"
-        )
+        message = f"links {roots} have no parent joint; a kinematic tree has one root: join or remove the others"
+        raise ModelError(message, name="links", value=tuple(roots), limit=1)
     return roots[0]
 
 
@@ -89,7 +92,8 @@ def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
         order.append(first)
     if len(order) < len(edges):
         names = [edges[i][0] for i in sorted(set(range(len(edges))) - set(order))]
-        raise ModelError(f"joints {names} form a loop that is not connected to the root link {root!r}")
+        message = f"joints {names} form a loop that is not connected to the root link {root!r}"
+        raise ModelError(message, name="joints", value=tuple(names))
     return order
 
 

@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 from warnings import warn
 from xml.etree import ElementTree
 
 import numpy as np
 
-from models.arrays import Array
+from models.arrays import Array, checked_choice
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic
 
@@ -75,8 +75,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     Warns:
         ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF.
     """
-    if inertia not in ("warn", "as_given"):
-        raise ModelError(f"unknown inertia rule {inertia!r}; use 'warn' or 'as_given'")
+    checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
     tree = parsed(source)
     if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
         warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unread)}", ModelWarning, 3)
@@ -88,10 +87,11 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
         base = next((link for link in links if link.name == virtual.parent), None)
         neighbours = [j for _, j in pairs if virtual.parent in (j.parent, j.child)]
         if base is None or base.mass or len(neighbours) > 1 or base.inertia.any():
-            raise ModelError(
+            message = (
                 f"joint {name!r} is floating, which is supported only as the joint between a massless root link and "
                 "the whole robot; make it fixed, or read its two sides as two robots"
             )
+            raise ModelError(message, name=name, value="floating")
         links = tuple(link for link in links if link is not base)
         pairs = [pair for pair in pairs if pair[0] != name]
     tip = _only(tree, "tip", "the robot")
@@ -185,35 +185,41 @@ def parsed(source: Source) -> ElementTree.Element:
         above = source[: len(source) - len(text)].count("\n")
     try:
         if isinstance(source, str) and not text:
-            raise ModelError("an empty text cannot be read as URDF; give the XML or the path of a file")
+            message = "source: an empty text cannot be read as URDF; give the XML or the path of a file"
+            raise ModelError(message, name="source", value=source)
         if text.startswith("<"):
             where = "the given text"
             tree = ElementTree.fromstring(text)
         else:
             where = f"file {os.fspath(source)!r}" if isinstance(source, str | os.PathLike) else repr(source)
             if not isinstance(source, str | os.PathLike):
-                raise ModelError(f"a URDF source is a text or a path, not {type(source).__name__}")
+                message = f"a URDF source is a text or a path, not {type(source).__name__}"
+                raise ModelError(message, name="source", value=source)
             tree = ElementTree.fromstring(Path(source).read_bytes())
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).split(": line")[0]
         hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in (text or _contents(source)) else ""
-        raise ModelError(
-            f"{where} is not well-formed XML: {reason}, line {line + above}, column {column}{hint}"
-        ) from error
+        message = f"{where} is not well-formed XML: {reason}, line {line + above}, column {column}{hint}"
+        raise ModelError(message, name=where, value=(line + above, column)) from error
     except OSError as error:
-        raise ModelError(f"{where} cannot be read: {error.strerror or error}; a URDF text begins with '<'") from error
+        message = f"{where} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
+        raise ModelError(message, name=where, value=source) from error
+    except ModelError:
+        raise
     except (ValueError, LookupError) as error:
-        raise error if isinstance(error, ModelError) else ModelError(f"{where} cannot be read: {error}") from error
+        raise ModelError(f"{where} cannot be read: {error}", name=where, value=source) from error
     space = tree.tag[: tree.tag.rfind("}") + 1]
     for element in tree.iter():
         if isinstance(element.tag, str):
             if "xacro" in element.tag:
-                raise ModelError(f"{where} has the element <{element.tag.rpartition('}')[2]}>: {XACRO}")
+                tag = element.tag.rpartition("}")[2]
+                raise ModelError(f"{where} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
             if space and element.tag.startswith(space):
                 element.tag = element.tag[len(space) :]
     if tree.tag != "robot":
-        raise ModelError(f"{where} is not URDF: its root element is <{tree.tag}>, not <robot>")
+        message = f"{where} is not URDF: its root element is <{tree.tag}>, not <robot>"
+        raise ModelError(message, name=where, value=tree.tag, limit="robot")
     return tree
 
 
@@ -238,7 +244,7 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
             4,
         )
     if not links:
-        raise ModelError(f"the robot {tree.get('name') or ''!r} has no <link>")
+        raise ModelError(f"the robot {tree.get('name') or ''!r} has no <link>", name="link", value=0, limit=1)
     return tuple(links)
 
 
@@ -260,11 +266,10 @@ def _link(element: ElementTree.Element) -> Link:
 def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
     found: list[Any] = list(child_of(element, "geometry", owner))
     if len(found) != 1:
-        raise ModelError(f"{owner}: <geometry> has {len(found)} shapes, not one")
+        message = f"{owner}: <geometry> has {len(found)} shapes, not one"
+        raise ModelError(message, name="geometry", value=len(found), limit=1)
     (shape,) = found
-    kind = shape.tag
-    if kind not in SHAPES:
-        raise ModelError(f"{owner}: unknown shape <{kind}>; a shape is one of {', '.join(SHAPES)}")
+    kind = checked_choice(shape.tag, SHAPES, owner, "shape")
     file = text_of(shape, "filename", owner) if kind == "mesh" else ""
     if kind in ("box", "mesh"):
         key = "size" if kind == "box" else "scale"
@@ -274,7 +279,7 @@ def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
     try:
         return CollisionShape(kind, size, file, *origin_of(element, owner))
     except ModelError as error:
-        raise ModelError(f"{owner}: {error}") from None
+        raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
 
 
 def _joint(element: ElementTree.Element) -> Joint:
@@ -282,10 +287,11 @@ def _joint(element: ElementTree.Element) -> Joint:
     owner = f"joint {name!r}"
     kind = text_of(element, "type", owner)
     if kind not in (*MOVING, "fixed", "floating"):
-        raise ModelError(
+        message = (
             f"{owner} is of the type {kind!r}, which is not supported; use one of fixed, {', '.join(MOVING)} (a robot "
             "whose base moves in the plane is made by FreeFloating(robot, base='planar'))"
         )
+        raise ModelError(message, name="type", value=kind, limit=("fixed", *MOVING))
     parent, child = (text_of(child_of(element, role, owner), "link", owner) for role in ("parent", "child"))
     shift, turn = origin_of(element, owner)
     if kind not in MOVING:
@@ -321,7 +327,8 @@ def _unread(owner: ElementTree.Element) -> list[str]:
         for key in [key for key in element.attrib if lacking and key not in known and "}" not in key]:
             where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
             if near := get_close_matches(key.casefold(), lacking, n=1):
-                raise ModelError(f"{where} is no attribute of URDF; did you mean {near[0]!r}?")
+                message = f"{where} is no attribute of URDF; did you mean {near[0]!r}?"
+                raise ModelError(message, name=key, value=element.get(key), limit=known)
             found.append(where)
     return found
 
@@ -346,7 +353,8 @@ def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Ele
     """The child of that tag, None without; ModelError naming `owner` where there are several."""
     found = element.findall(tag)
     if len(found) > 1:
-        raise ModelError(f"{owner} has {len(found)} <{tag}> elements in <{element.tag}>; it takes one at most")
+        message = f"{owner} has {len(found)} <{tag}> elements in <{element.tag}>; it takes one at most"
+        raise ModelError(message, name=tag, value=len(found), limit=1)
     return found[0] if found else None
 
 
@@ -359,7 +367,7 @@ def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.
     """The one child of that tag; ModelError naming `owner` without, or with several."""
     found = _only(element, tag, owner)
     if found is None:
-        raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>")
+        raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)
     return found
 
 
@@ -367,7 +375,7 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
     """An attribute; ModelError naming `owner` without, or when it is empty."""
     value = element.get(key)
     if not value:
-        raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}")
+        raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}", name=key, value=value)
     return value
 
 
@@ -379,16 +387,16 @@ def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
     """An attribute of `count` numbers, shape (count,); ModelError naming `owner` otherwise."""
     text = text_of(element, key, owner)
-    words: list[Any] = text.split()
+    words, where = text.split(), f"{owner}: {key}={text!r} of <{element.tag}>"
     try:
         if "_" in text:  # Python would read 1_0 as ten
             raise ValueError
         values = np.array([float(word) for word in words])
     except ValueError:
         hint = f": {XACRO}" if "${" in text or "$(" in text else ""
-        raise ModelError(f"{owner}: {key}={text!r} of <{element.tag}> is not numeric{hint}") from None
+        raise ModelError(f"{where} is not numeric{hint}", name=key, value=text) from None
     if count > 1 and not np.isfinite(values).all():
-        raise ModelError(f"{owner}: {key}={text!r} of <{element.tag}> is not finite")
+        raise ModelError(f"{where} is not finite", name=key, value=text)
     if values.size != count:
-        raise ModelError(f"{owner}: {key}={text!r} of <{element.tag}> has {values.size} numbers, not {count}")
+        raise ModelError(f"{where} has {values.size} numbers, not {count}", name=key, value=text, limit=count)
     return values

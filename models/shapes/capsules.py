@@ -144,7 +144,7 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
         ModelError: No value, or a width that is not positive.
     """
     if not values:
-        raise ModelError("soft_minimum of no values")
+        raise ModelError("soft_minimum of no values", name="values", value=values)
     checked_number(width, "soft_minimum", "width", positive=True)
     stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))

@@ -112,9 +112,8 @@ def certificate(
     """
     named = dict(solutions) if isinstance(solutions, Mapping) else name_by_method(solutions)
     if len(named) < 2:
-        raise ProblemError(
-            f"a certificate compares at least two solutions, not {len(named)}", value=len(named), limit=2
-        )
+        words = f"a certificate compares at least two solutions, not {len(named)}"
+        raise ProblemError(words, name="solutions", value=len(named), limit=2)
     form = Formulation(problem)
     for solution in named.values():
         check_belongs(form, solution)

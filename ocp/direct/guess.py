@@ -131,7 +131,8 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
             )
         shared[name] = lambda s, name=name: guess.at_fraction(s)[name]  # type: ignore[misc]
     if not shared:
-        raise ProblemError(f"the guess, plan {guess.name!r}, shares no state or control with problem {form.name!r}")
+        words = f"the guess, plan {guess.name!r}, shares no state or control with problem {form.name!r}"
+        raise ProblemError(words, name="guess", value=guess.name, limit=(*form.states, *form.controls))
     return shared
 
 

@@ -230,7 +230,8 @@ class FragmentBuilder:
             self._end_block(form.start, 0, lay.node[:nx, 0], (basis[0], first), None, 0)
         needs = ca.vertcat(form.end.expression, form.terminal)
         if self.staged and not at_nodes and (ca.depends_on(needs, form.u) or ca.depends_on(needs, form.u0)):
-            raise ProblemError("a stage-ordered program cannot constrain the control at the end; use ipopt")
+            words = "a stage-ordered program cannot constrain the control at the end; use ipopt"
+            raise ProblemError(words, name="control")
         self._end_block(form.end, form.terminal, lay.node[:nx, -1], (basis[1], last), (basis[0], first), 1)
 
     def _end_block(

@@ -179,6 +179,7 @@ class Hamiltonian:
                     f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
                     "both sides: no control makes it least; bound it or add a quadratic term to the cost",
                     name=self.form.control_labels[i],
+                    value=(float(low[at]), float(high[at])),
                 )
 
     def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
@@ -191,7 +192,10 @@ class Hamiltonian:
         if singular[-1] < REGULAR * singular[0]:
             raise ProblemError(
                 "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
-                "that the path equalities leave; add a quadratic term in the control to the cost"
+                "that the path equalities leave; add a quadratic term in the control to the cost",
+                name="control",
+                value=float(singular[-1]),
+                limit=float(REGULAR * singular[0]),
             )
 
 
@@ -225,7 +229,8 @@ def check_constraints(form: Formulation) -> None:
                     "differentiate it until one appears or use a direct method"
                 )
     if form.nu and ca.depends_on(form.terminal, form.u0):
-        raise ProblemError("the indirect method cannot take a terminal cost on the control at the start")
+        words = "the indirect method cannot take a terminal cost on the control at the start"
+        raise ProblemError(words, name="terminal cost")
     controls = ca.vertcat(form.u, form.u0)
     for kind, rows in (("start", form.start), ("end", form.end)):
         for i, (owner, label, equality) in enumerate(zip(rows.owners, rows.labels, rows.equality, strict=True)):

@@ -136,6 +136,7 @@ class PreparedIndirect:
                 f"Newton steps, residual {found.residual:.2e}\n  try a finer direct solution as guess, more segments, "
                 "or a direct method",
                 solution,
+                name="residual",
                 value=found.residual,
                 limit=self.method.residual,
             )

@@ -41,7 +41,8 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
 
     z, value = start, evaluate(start)
     if value.size != start.size:
-        raise ProblemError(f"the boundary value problem has {value.size} conditions for {start.size} unknowns")
+        words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
+        raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     interrupt = Interrupt()
     polished = False
     with interruptible(interrupt):

@@ -272,7 +272,7 @@ def _distinct(found: list[Posture], turns: Array, apart: float) -> list[Posture]
 def _unreachable(
     machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
 ) -> Unreachable:
-    names = [part.task.link or str(part.tip.robot.tip) for part in equations.bound]
+    names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
     stopped = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [machine.robot.joint_names[k] for k in stopped]
     where = f", with {at_limit} at their limits" if at_limit else ""

@@ -144,7 +144,7 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
 
 def _frame(part: Bound) -> str:
     """The name of the link that a task moves."""
-    return part.task.link or str(part.tip.robot.tip)
+    return part.task.link or part.tip.robot.tip_link
 
 
 def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
@@ -235,7 +235,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 def _reach(machine: Machine, base: Array) -> tuple[Array, float]:
     """Where the first moving joint stands in the world, (3,), and how far from there the tip can be at most."""
     robot = machine.robot
-    chain = robot.path_to(str(robot.tip))
+    chain = robot.path_to(robot.tip_link)
     first = next((i for i, joint in enumerate(chain) if joint.moves), len(chain) - 1)
     frame = machine.world_from_base(base)
     turn, shoulder = np.array(ca.DM(frame.rotation)), np.array(ca.DM(frame.position)).ravel()

@@ -67,7 +67,7 @@ def frames_function(
     """
     q, b = ca.SX.sym("q", robot.dof), ca.SX.sym("b", base_size)
     found = link_frames(robot, q, placement(b, translation, turn))
-    tip = found[str(robot.tip)]
+    tip = found[robot.tip_link]
     entries = [ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in found.values()]
     entries.append(
         ca.vertcat(ca.vec(ca.mtimes(tip.rotation, ca.DM(robot.tip_rotation))), tip.point(robot.tip_translation))
@@ -109,7 +109,7 @@ def frames_along(robot: Robot, joints: Any, base: Any = None, translation: Any =
 
 def chain(robot: Robot) -> list[str]:
     """Links from the root to the tip, and TIP: the arm as a line of points."""
-    return [robot.root, *(joint.child for joint in robot.path_to(str(robot.tip))), TIP]
+    return [robot.root, *(joint.child for joint in robot.path_to(robot.tip_link)), TIP]
 
 
 def inertia_box(robot: Robot, name: str) -> tuple[Array, Array, Array] | None:

@@ -55,7 +55,7 @@ def anymal() -> tuple[Standing, Footprint]:
     """ANYmal on its feet, the arm free, with its load."""
     whole = ANYMAL.read()
     ground = footprint(whole, links=FEET)
-    robot = with_load(whole, str(whole.tip), LOAD)
+    robot = with_load(whole, whole.tip_link, LOAD)
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 
 

@@ -171,7 +171,7 @@ def pinocchio_jacobian(path: Path, robot: Robot) -> Callable[[Array, Array], Arr
     text = path.read_text(encoding="utf-8").replace('"revolute"', '"continuous"')  # it wants limits of revolute joints
     model = pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
     data = model.createData()
-    frame = model.getFrameId(str(robot.tip))
+    frame = model.getFrameId(robot.tip_link)
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     rows = [3, 4, 5, 0, 1, 2]
     configuration = np.empty(model.nq)

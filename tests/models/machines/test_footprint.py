@@ -108,10 +108,10 @@ def test_the_hull_is_that_of_an_independent_library(points: list[tuple[int, int]
     ("shape", "message"),
     [
         ('<mesh filename="package://a/b.stl"/>', r"only meshes, in \['foot'\].*give the support yourself"),
-        ('<sphere radius="-0.1"/>', r"link 'foot': .*size \[-0.1\] of the sphere is not positive"),
-        ('<box size="0.1 0 0.1"/>', r"link 'foot': .*size .* of the box is not positive"),
+        ('<sphere radius="-0.1"/>', r"link 'foot': .*sphere: size \[-0.1\] is not positive"),
+        ('<box size="0.1 0 0.1"/>', r"link 'foot': .*box: size .* is not positive"),
         ('<cylinder radius="0.1"/>', r"link 'foot': <cylinder> has no attribute 'length'"),
-        ('<cone radius="0.1"/>', "link 'foot': unknown shape <cone>"),
+        ('<cone radius="0.1"/>', "link 'foot': shape 'cone' is unknown"),
         ("", "link 'foot': <geometry> has 0 shapes"),
     ],
 )

@@ -357,7 +357,7 @@ def test_the_momentum_that_is_given_is_that_of_pinocchio(name: str) -> None:
     machine = FreeFloating(robot, conserved_momentum=given)
     b, q, rates = (ca.SX.sym(n, k) for n, k in (("b", 7), ("q", robot.dof), ("r", robot.dof)))
     moved = ca.Function("f", [b, q, rates], [machine.base_twist(b, q, rates), machine.tip_twist(b, q, rates)])
-    frame = peer.model.getFrameId(str(robot.tip))
+    frame = peer.model.getFrameId(robot.tip_link)
     for _ in range(10):
         state = random_state(robot, rng)
         twist, tip = (numeric(part).ravel() for part in moved(state.base, state.q, state.qd))

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import (
-    ModelError,
     Wrench,
     base_reaction,
     center_of_mass,
@@ -34,6 +33,7 @@ from tests.models.robot.trees import (
     numeric,
     random_frame,
     random_robot,
+    refused,
     seeds,
     twist_by_differentiation,
 )
@@ -65,7 +65,7 @@ def test_torques_and_reaction_equal_those_of_an_independent_library(
     robot = with_masses(random_robot(rng, size, base), rng)
     q, qd, qdd = random_motion(rng, robot.dof)
     gravity = rng.normal(scale=9.0, size=3)
-    wrenches = [hand_wrench(rng, str(robot.tip)), hand_wrench(rng, robot.links[rng.integers(size + 1)].name)]
+    wrenches = [hand_wrench(rng, robot.tip_link), hand_wrench(rng, robot.links[rng.integers(size + 1)].name)]
     torques, reaction = library(robot, q, qd, qdd, wrenches, gravity)
     np.testing.assert_allclose(
         numeric(inverse_dynamics(robot, q, qd, qdd, wrenches, gravity)).ravel(), torques, rtol=0, atol=LIBRARY
@@ -92,7 +92,7 @@ def test_power_of_the_torques_and_wrenches_is_the_rate_of_energy(seed: int, size
         inertia = ca.mtimes([turn, ca.DM(link.inertia), turn.T])
         energy += link.mass * ca.sumsqr(twist[3:6]) / 2 + ca.dot(twist[0:3], ca.mtimes(inertia, twist[0:3])) / 2
         energy -= link.mass * ca.dot(ca.DM(gravity), center)
-    wrench = hand_wrench(rng, str(robot.tip))
+    wrench = hand_wrench(rng, robot.tip_link)
     torques = inverse_dynamics(robot, q, qd, qdd, [wrench], gravity, placement)
     jacobian = frame_jacobian(robot, q, wrench.link, wrench.point, placement)
     given = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
@@ -153,7 +153,7 @@ def test_the_reaction_is_the_rate_of_momentum_less_weight_and_wrenches(seed: int
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size)
     motion, placement = random_motion(rng, robot.dof), random_frame(rng)
-    wrench, gravity = hand_wrench(rng, str(robot.tip)), rng.normal(size=3)
+    wrench, gravity = hand_wrench(rng, robot.tip_link), rng.normal(size=3)
     center = numeric(center_of_mass(robot, motion[0], placement)).ravel()
     weight = robot.total_mass * np.concatenate([np.cross(center, gravity), gravity])
     outside = numeric(external_wrench(robot, motion[0], [wrench], placement)).ravel()
@@ -216,12 +216,12 @@ def test_a_planar_machine_keeps_its_structural_zeros() -> None:
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {"q": np.zeros(2), "qd": np.zeros(2), "qdd": np.zeros(2), **changes}
     for function in (inverse_dynamics, base_reaction):
-        with pytest.raises(ModelError, match=message):
+        with refused(message):
             function(planar_chain([1.0, 1.0], [1.0, 1.0]), **arguments)
 
 
 def test_a_robot_without_mass_has_no_centre_of_mass_motion() -> None:
-    with pytest.raises(ModelError, match="no mass"):
+    with refused("no mass"):
         center_of_mass_motion(planar_chain([1.0], [0.0]), [0.0], [0.0], [0.0])
 
 
@@ -233,7 +233,7 @@ def test_a_robot_without_mass_has_no_centre_of_mass_motion() -> None:
     ],
 )
 def test_a_wrench_that_is_none_is_refused(parts: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Wrench("hand", **parts)
 
 

@@ -14,7 +14,6 @@ import pytest
 
 from models import (
     FreeFloating,
-    ModelError,
     ModelWarning,
     Robot,
     base_reaction,
@@ -30,7 +29,7 @@ from models import (
     tip_pose,
 )
 from tests.models.robot.pinocchio_robots import ROBOTS, Peer, State, collection, random_state, swapped, urdf_file
-from tests.models.robot.trees import Array, assert_same_robot, everything, numeric, ties, untied
+from tests.models.robot.trees import Array, assert_same_robot, everything, numeric, refused, ties, untied
 
 pytestmark = pytest.mark.xdist_group("real robots")
 
@@ -86,7 +85,7 @@ def read(path: Path) -> Robot:
 @pytest.mark.parametrize("name", REFUSED)
 def test_files_that_describe_no_robot_are_refused_by_name(name: str) -> None:
     (path,) = (path for path in collection() if path.name == name)
-    with pytest.raises(ModelError, match=REFUSED[name]):
+    with refused(REFUSED[name]):
         read(path)
 
 
@@ -180,8 +179,8 @@ def test_frames_and_jacobians_of_all_links_and_of_the_tip(case: Case) -> None:
             expected_motions[name] = swapped(local)[:, peer.columns]
         assert_close(places, np.vstack(expected_places))
         assert_close(motions, np.vstack(list(expected_motions.values())))
-        assert_close(tip, expected_motions[str(robot.tip)])
-        assert_close(tip_place, expected_places[list(frames).index(str(robot.tip))])
+        assert_close(tip, expected_motions[robot.tip_link])
+        assert_close(tip_place, expected_places[list(frames).index(robot.tip_link)])
 
 
 def test_centre_of_mass_and_centroidal_momentum(case: Case) -> None:
@@ -218,7 +217,7 @@ def test_generalized_jacobian_from_the_joint_space_inertia(case: Case, fewer: bo
     base, q, rates = ca.SX.sym("base", 7), ca.SX.sym("q", robot.dof), ca.SX.sym("rates", robot.dof)
     outputs = [machine.tip_jacobian(base, q), machine.base_twist(base, q, rates), machine.tip_twist(base, q, rates)]
     values = [[s.base, s.q, s.qd] for s in case.states]
-    tip = bodies(peer)[str(robot.tip)]
+    tip = bodies(peer)[robot.tip_link]
     for state, found in zip(case.states, mapped(outputs, [base, q, rates], values), strict=True):
         configuration = peer.configuration(state)
         inertia = pinocchio.crba(peer.model, peer.data, configuration)
@@ -265,5 +264,5 @@ def test_inverse_dynamics_on_a_fixed_and_on_a_moving_base(case: Case) -> None:
 def test_single_frames_and_numbers_do_as_well_as_all_of_them(case: Case) -> None:
     robot, state = case.robot, case.states[0]
     all_of_them = link_jacobians(robot, state.q)
-    for link in (robot.root, str(robot.tip), robot.links[-1].name):
+    for link in (robot.root, robot.tip_link, robot.links[-1].name):
         assert_close(numeric(frame_jacobian(robot, state.q, link)), numeric(all_of_them[link]))

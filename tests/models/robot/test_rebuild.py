@@ -13,7 +13,6 @@ from models import (
     FreeFloating,
     Joint,
     Link,
-    ModelError,
     Robot,
     attached,
     base_reaction,
@@ -44,6 +43,7 @@ from tests.models.robot.trees import (
     random_inertia,
     random_robot,
     random_rotation,
+    refused,
     seeds,
 )
 
@@ -279,12 +279,12 @@ def test_branches_are_cut_and_taken_out(seed: int, size: int) -> None:
     poses = numeric_poses(robot, q)
     other = robot.links[int(rng.integers(len(robot.links)))].name
     cut = pruned(robot, other)
-    ways = {robot.root, *(j.child for name in (str(robot.tip), other) for j in robot.path_to(name))}
+    ways = {robot.root, *(j.child for name in (robot.tip_link, other) for j in robot.path_to(name))}
     assert {link.name for link in cut.links} == ways
     chosen = q[[robot.joint_names.index(name) for name in cut.joint_names]]
     for name, pose in numeric_poses(cut, chosen).items():
         np.testing.assert_allclose(matrix(pose), matrix(poses[name]), **NEAR)
-    part = subtree(robot, other, None if other in {j.parent for j in robot.path_to(str(robot.tip))} else other)
+    part = subtree(robot, other, None if other in {j.parent for j in robot.path_to(robot.tip_link)} else other)
     assert part.root == other
     chosen = q[[robot.joint_names.index(name) for name in part.joint_names]]
     for name, pose in numeric_poses(part, chosen, poses[other]).items():
@@ -302,7 +302,7 @@ def test_an_impossible_inertia_stays_marked_where_it_is_merged() -> None:
     odd = Link("odd", 1.0, inertia=np.diag([1.0, 1.0, 9.0]), any_inertia=True)
     robot = attached(planar_chain([1.0], [1.0]), odd)
     assert [link.any_inertia for link in simplified(robot).links] == [False, True]
-    with pytest.raises(ModelError, match=r"inertia .* not symmetric"):
+    with refused(r"inertia .* not symmetric"):
         Link("odd", 1.0, inertia=np.triu(np.ones((3, 3))), any_inertia=True)
 
 
@@ -327,7 +327,7 @@ PAIR: Any = {"joint1": [0.0, 1.0]}
         (lambda: attached(ARM, ARM), "link name 'base' is used more than once"),
         (lambda: attached(ARM, Link("tool"), translation=(0, 0)), "attached tool: translation has shape"),
         (lambda: attached(ARM, Link("tool"), rotation=np.ones((3, 3))), "attached tool: rotation .* not a rotation"),
-        (lambda: merged(Link("base"), {}), "no arm is given"),
+        (lambda: merged(Link("base"), {}), "no arms are given"),
         (lambda: merged(Link("base"), {"": ARM}), "link name 'base' is used more than once"),
         (lambda: merged(Link("b"), {"a_": ARM}, links={"a_": "c"}), "link 'c' does not exist"),
         (lambda: merged(Link("b"), {"a_": ARM}, translations={"A_": (0, 0, 0)}), r"\['A_'\] are no prefixes"),
@@ -338,5 +338,5 @@ PAIR: Any = {"joint1": [0.0, 1.0]}
     ],
 )
 def test_what_cannot_be_rebuilt_is_refused(build: Any, message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         build()

@@ -16,7 +16,6 @@ from models import (
     FreeFloating,
     Joint,
     Link,
-    ModelError,
     Robot,
     attached,
     locked,
@@ -27,7 +26,7 @@ from models import (
     tip_jacobian,
     tip_pose,
 )
-from tests.models.robot.trees import numeric, random_inertia, random_robot, random_rotation, seeds
+from tests.models.robot.trees import numeric, random_inertia, random_robot, random_rotation, refused, seeds
 
 
 def joint(name: str, parent: str, child: str, **fields: Any) -> Joint:
@@ -98,7 +97,7 @@ def test_a_tree_of_several_leaves_has_no_tip_and_says_so_where_one_is_needed() -
         lambda: attached(robot, Link("tool")),
     ]
     for use in needing:
-        with pytest.raises(ModelError, match=r"'robot' has no tip.*leaves \['b', 'c'\].*tip=NAME.*retipped"):
+        with refused(r"'robot' has no tip.*leaves \['b', 'c'\].*tip=NAME.*retipped"):
             use()
 
 
@@ -187,30 +186,30 @@ def test_inertias_of_real_bodies_are_accepted(seed: int) -> None:
     ],
 )
 def test_an_impossible_link_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Link("a", **fields)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"kind": "cone", "size": 1.0}, r"collision shape: unknown kind 'cone'; use one of box, sphere"),
-        ({"kind": "box", "size": 1.0}, r"collision shape: size of the box has shape \(\), expected \(3,\)"),
-        ({"kind": "sphere", "size": [0.0]}, r"collision shape: size \[0.0\] of the sphere is not positive"),
-        ({"kind": "mesh", "size": [1, 1, 1]}, r"collision shape: a mesh needs the name of its file"),
-        ({"kind": "mesh", "size": [1, 0, 1], "file": "a"}, r"collision shape: size .* of the mesh is not positive"),
+        ({"kind": "cone", "size": 1.0}, r"collision shape: kind 'cone' is unknown; use one of \['box', 'sphere'"),
+        ({"kind": "box", "size": 1.0}, r"collision box: size has shape \(\), expected \(3,\)"),
+        ({"kind": "sphere", "size": [0.0]}, r"collision sphere: size \[0.0\] is not positive"),
+        ({"kind": "mesh", "size": [1, 1, 1]}, r"collision mesh: a mesh needs the name of its file"),
+        ({"kind": "mesh", "size": [1, 0, 1], "file": "a"}, r"collision mesh: size .* scales it to nothing"),
         ({"kind": "sphere", "size": [1], "rotation": np.ones((3, 3))}, r"rotation .* is not a rotation matrix"),
     ],
 )
 def test_an_impossible_shape_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         CollisionShape(**fields)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"kind": "ball"}, r"joint 'j': unknown kind 'ball'"),
+        ({"kind": "ball"}, r"joint 'j': kind 'ball' is unknown; use one of \['fixed', 'rev"),
         ({"axis": (0, 0, 0)}, r"joint 'j': axis .* has no direction"),
         ({"axis": (0, 1)}, r"joint 'j': axis has shape"),
         ({"axis": (0, 0, np.nan)}, r"joint 'j': axis .* not finite"),
@@ -227,7 +226,7 @@ def test_an_impossible_shape_is_refused(fields: dict[str, Any], message: str) ->
     ],
 )
 def test_an_impossible_joint_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         joint("j", "a", "b", **fields)
 
 
@@ -247,7 +246,7 @@ def test_an_impossible_joint_is_refused(fields: dict[str, Any], message: str) ->
     ],
 )
 def test_links_that_form_no_tree_are_refused(links: str, edges: list[tuple[str, str, str]], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Robot(tuple(Link(name) for name in links), tuple(joint(*edge) for edge in edges))
 
 
@@ -260,15 +259,15 @@ def test_links_that_form_no_tree_are_refused(links: str, edges: list[tuple[str, 
     ],
 )
 def test_an_impossible_tip_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Robot((Link("a"),), **fields)
 
 
 def test_unknown_links_are_named() -> None:
     robot = planar_chain([1.0], [1.0])
-    with pytest.raises(ModelError, match="link 'elbow' does not exist"):
+    with refused("link 'elbow' does not exist"):
         robot.link("elbow")
-    with pytest.raises(ModelError, match="link 'elbow' does not exist"):
+    with refused("link 'elbow' does not exist"):
         robot.path_to("elbow")
 
 
@@ -285,8 +284,8 @@ def test_planar_chain_is_made_of_slender_rods_by_default() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([], []), "at least one length"),
-        (([[1.0]], [1.0]), "lengths must be a vector"),
+        (([], []), r"lengths has shape \(0,\), expected \(links,\), 1 at least"),
+        (([[1.0]], [1.0]), r"lengths has shape \(1, 1\), expected \(links,\)"),
         (([1.0, 1.0], [1.0]), r"masses has shape \(1,\), expected \(2,\)"),
         (([1.0], [1.0], [1.0, 2.0]), r"inertias has shape"),
         (([1.0], [-1.0], [1.0]), "link 'link1': mass -1.0 kg is negative"),
@@ -294,5 +293,5 @@ def test_planar_chain_is_made_of_slender_rods_by_default() -> None:
     ],
 )
 def test_an_impossible_planar_chain_is_refused(arguments: tuple[Any, ...], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         planar_chain(*arguments)

@@ -17,7 +17,6 @@ from models import (
     Joint,
     Link,
     Mimic,
-    ModelError,
     ModelWarning,
     Robot,
     Standing,
@@ -38,6 +37,7 @@ from tests.models.robot.trees import (
     numeric_poses,
     random_robot,
     random_rotation,
+    refused,
     seeds,
 )
 
@@ -258,7 +258,7 @@ def test_a_floating_joint_below_a_massless_root_says_that_the_robot_floats() -> 
     robot = Robot.from_urdf(source)
     assert (robot.root, robot.joint_names) == ("l1", ("j2", "j3"))
     for elsewhere in (chain("Frr"), chain("rFr")):
-        with pytest.raises(ModelError, match=r"joint 'j[12]' is floating, which is supported only"):
+        with refused(r"joint 'j[12]' is floating, which is supported only"):
             Robot.from_urdf(elsewhere)
 
 
@@ -390,7 +390,7 @@ def test_a_chain_of_a_thousand_links_is_read_and_printed() -> None:
     ],
 )
 def test_what_is_no_robot_is_refused(source: Any, message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Robot.from_urdf(source)
 
 
@@ -403,14 +403,14 @@ def test_what_is_no_robot_is_refused(source: Any, message: str) -> None:
         ({"lock": {"J1": 0.0}}, "joint 'J1' does not exist; did you mean 'j1'"),
         ({"lock": {"j3": 0.0}}, "joint 'j3' is fixed; only a joint that moves can be locked"),
         ({"lock": {"j1": np.nan}}, "joint 'j1': locked position nan is not finite"),
-        ({"mimic": "both"}, "unknown mimic rule 'both'; use 'couple', 'lock' or 'free'"),
-        ({"inertia": "fix"}, "unknown inertia rule 'fix'; use 'warn' or 'as_given'"),
+        ({"mimic": "both"}, r"mimic 'both' is unknown; use one of \['couple', 'lock', 'free'\]"),
+        ({"inertia": "fix"}, r"inertia 'fix' is unknown; use one of \['warn', 'as_given'\]"),
         ({"tip_translation": (1, 2)}, "tip_translation has shape"),
         ({"tip_rotation": np.ones((3, 3))}, "tip_rotation .* not a rotation"),
     ],
 )
 def test_what_does_not_fit_the_robot_is_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Robot.from_urdf(chain("rrf"), **options)
 
 
@@ -444,7 +444,7 @@ def test_a_joint_whose_followers_leave_it_one_position_is_named() -> None:
 
 
 def test_a_configuration_of_a_wrong_length_names_the_joints() -> None:
-    with pytest.raises(ModelError, match=r"q has shape \(2, 1\), expected \(3, 1\).*'j1', 'j2', 'j3'"):
+    with refused(r"q has shape \(2, 1\), expected \(3, 1\).*'j1', 'j2', 'j3'"):
         link_frames(Robot.from_urdf(chain()), [0.0, 0.0])
 
 
@@ -452,18 +452,18 @@ def test_a_robot_without_inertials_does_not_float() -> None:
     robot = Robot.from_urdf(chain().replace(BODY, ""))
     assert robot.total_mass == 0
     message = "no mass.*in URDF none has an <inertial>"
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         FreeFloating(robot)
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         center_of_mass(robot, np.zeros(3))
-    with pytest.raises(ModelError, match=message):
+    with refused(message):
         Standing(robot, support=rectangle((-1.0, 1.0), (-1.0, 1.0)))
 
 
 def test_a_robot_of_point_masses_does_not_float_and_the_bare_links_are_named() -> None:
     point = '<inertial><mass value="2"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
     joint = f'<joint name="j" type="continuous">{ENDS}</joint>'
-    with pytest.raises(ModelError, match=r"links \['b'\] have no mass: in URDF, no <inertial>"):
+    with refused(r"links \['b'\] have no mass: in URDF, no <inertial>"):
         FreeFloating(Robot.from_urdf(text(joint).replace(BODY, point)))
 
 
@@ -484,5 +484,5 @@ def test_whether_a_robot_floats_does_not_depend_on_its_size(size: float) -> None
 
 
 def test_a_configuration_of_words_is_refused() -> None:
-    with pytest.raises(ModelError, match=r"q 'home' is not numeric; \(3, 1\) expected"):
+    with refused(r"q 'home' is not numeric; \(3, 1\) expected"):
         link_frames(Robot.from_urdf(chain()), "home")

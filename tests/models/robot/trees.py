@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal, cast
 
 import casadi as ca
 import numpy as np
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -17,6 +20,7 @@ from models import (
     Joint,
     Link,
     Mimic,
+    ModelError,
     Robot,
     inverse_dynamics,
     link_frames,
@@ -34,6 +38,15 @@ few = settings(max_examples=25)
 """For tests that build expressions anew for every example."""
 
 seeds = st.integers(0, 2**32 - 1)
+
+
+@contextmanager
+def refused(message: str) -> Iterator[None]:
+    """A ModelError that says so, and carries as a field the name of what it is about, which stands in what it says."""
+    with pytest.raises(ModelError, match=message) as caught:
+        yield
+    assert caught.value.name
+    assert caught.value.name in str(caught.value)
 
 
 def random_rotation(rng: np.random.Generator) -> Array:

@@ -53,7 +53,7 @@ class Peered:
         robot = self.machine.robot
         whole = Robot.from_urdf(self.file, tip=robot.tip, inertia="as_given")
         peer = Peer.of(self.file, whole)
-        tip = peer.model.frames[peer.model.getFrameId(str(robot.tip))]
+        tip = peer.model.frames[peer.model.getFrameId(robot.tip_link)]
         point = pinocchio.Inertia(self.load, np.zeros(3), np.zeros((3, 3)))
         peer.model.appendBodyToJoint(tip.parentJoint, point, tip.placement)
         full = []
@@ -223,7 +223,7 @@ def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: 
 
 def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> None:
     machine = anymal.machine
-    heavy = replace(machine, robot=with_load(machine.robot, str(machine.robot.tip), 60.0))
+    heavy = replace(machine, robot=with_load(machine.robot, machine.robot.tip_link, 60.0))
     with pytest.raises(
         ProblemError, match=r"whatever the joints do there, .*the torque of 'j2s6s200_joint_\d', at most"
     ):
