@@ -144,8 +144,8 @@ def audit(
             raise ProblemError(words, name=name, value=limit)
     form = Formulation(problem)
     check_belongs(form, solution)
-    check_structure(solution)
     solution = in_order_of(form, solution)
+    check_structure(solution)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     points = max(solution.state_interpolant.values.shape[1] - 1, 1)
@@ -201,9 +201,9 @@ def audit(
 
 
 def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Finding:
-    """The plan's horizon against the one that is asked, or its bounds: it is given, not found, so to rounding."""
+    """The plan's horizon and its last time against the horizon that is asked, to a solver's tolerance."""
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
-    miss = max(low - solution.horizon, solution.horizon - high, 0.0)
+    miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     asked = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
     return Finding("horizon", miss, HORIZON_SLACK * solution.horizon, None, f"{solution.horizon:.6g} s, asked {asked}")
 
