@@ -22,6 +22,7 @@ __all__ = [
     "checked_choice",
     "checked_count",
     "checked_mapping",
+    "checked_nonnegative",
     "checked_positive",
     "unknown_name",
 ]
@@ -108,6 +109,14 @@ def checked_count(what: str, value: Any, least: int = 1, most: int | None = None
         kind = kind if most is None else f"{least} to {most}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=(least, most))
     return int(value)
+
+
+def checked_nonnegative(what: str, value: Any) -> float:
+    """``value``, or ProblemError unless it is a finite number, zero or above."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 <= value < np.inf:
+        words = f"{what} must be a finite number, zero or above, not {value!r}"
+        raise ProblemError(words, name=_last(what), value=value, limit=0.0)
+    return value  # type: ignore[return-value]
 
 
 def checked_positive(what: str, value: Any, below: float = np.inf) -> float:

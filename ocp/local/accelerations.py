@@ -19,12 +19,12 @@ from models.arrays import Array
 from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
 from ocp.curves import rk4_step
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_choice, checked_positive
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
 from ocp.tasks.equations import bind, on_symbols
 from ocp.tasks.tip_task import TipTask
-from ocp.tasks.zmp_rules import checked_place, is_finite
+from ocp.tasks.zmp_rules import checked_place
 
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]
 
@@ -142,17 +142,16 @@ def resolve_accelerations(
     joints, base = checked_configuration(machine, start_joints, None)
     checked_law(machine, equations.size, law, layers, null_damping)
     for what, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
-        if not (is_finite(number) and number > 0):
-            raise ProblemError(f"{what} must be a positive number, not {number!r}")
-    if integrator not in ("rk4", "cvodes"):
-        raise ProblemError(f"unknown integrator {integrator!r}; use 'rk4' or 'cvodes'")
+        checked_positive(what, number)
+    checked_choice("integrator", integrator, ("rk4", "cvodes"))
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
     n = machine.joint_size
     given = np.zeros(n) if start_velocities is None else start_velocities
     velocities = checked_numbers(given, n, "start_velocities", "one entry for each joint")
     if not isinstance(stabiliser, Stabiliser | None):
-        raise ProblemError(f"stabiliser must be a Stabiliser(...), not {stabiliser!r}")
+        words = f"stabiliser must be a Stabiliser(...), not {stabiliser!r}"
+        raise ProblemError(words, name="stabiliser", value=stabiliser)
     place = _target(machine.most_stable_point if zmp is None else zmp)
 
     def law_function(symbols: Any) -> Any:
@@ -166,10 +165,11 @@ def resolve_accelerations(
 
     function = on_symbols(law_function)
     if not np.isfinite(np.array(function(0.0, joints, velocities)[0])).all():
-        raise ProblemError(
+        words = (
             f"law {law!r} has no accelerations at the start joints {joints.tolist()}: a task, the zero moment "
             "point or a layer cannot be moved there; start elsewhere or ask for less"
         )
+        raise ProblemError(words, name="law", value=law, time=0.0)
     steps = max(int(np.ceil(duration / step - 1e-9)), 1)
     simulate = _Simulation(function, n, duration / steps, integrator, tolerance)
     reported = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))

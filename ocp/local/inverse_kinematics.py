@@ -15,7 +15,7 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_count, checked_positive
 from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
@@ -60,10 +60,14 @@ class Unreachable(ProblemError):
         misfit: How far it is off, m or rad (2 sin(angle / 2)).
     """
 
-    def __init__(self, message: str, joints: Array, misfit: float) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, joints: Array, misfit: float, **details: Any) -> None:
+        super().__init__(message, **details)
         self.joints = joints
         self.misfit = misfit
+
+    def __reduce__(self) -> Any:
+        """Pickled with what it is made from, and with its fields."""
+        return type(self), (*self.args, self.joints, self.misfit), self.__dict__
 
 
 def inverse_kinematics(
@@ -107,14 +111,13 @@ def inverse_kinematics(
     equations = bind(machine, task)
     posed = tuple(part for part in equations.bound if part.task.is_pose)
     if not posed:
-        raise ProblemError("inverse kinematics need a pose: TipTask(position=..., orientation=... or direction=...)")
+        words = "inverse kinematics need a pose: task=TipTask(position=..., orientation=... or direction=...)"
+        raise ProblemError(words, name="task")
     equations = TaskEquations(machine, posed)
     for what, number in (("starts", starts), ("iterations", iterations)):
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < (what == "iterations"):
-            raise ProblemError(f"{what} must be a whole number, not {number!r}")
+        checked_count(what, number, least=int(what == "iterations"))
     for what, value in (("tolerance", tolerance), ("apart", apart)):
-        if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
-            raise ProblemError(f"{what} must be a positive number, not {value!r}")
+        checked_positive(what, value)
     size = machine.joint_size
     place = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
@@ -122,7 +125,8 @@ def inverse_kinematics(
     first = _starts(machine, lower, upper, int(starts), near, seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
-        raise ProblemError(f"the task's targets are not finite at {time:g} s")
+        words = f"the task's targets are not finite at {time:g} s"
+        raise ProblemError(words, name="task", value=targets, time=float(time))
 
     q, misfit = _gauss_newton(_residual(equations, place, targets), first, lower, upper, tolerance, int(iterations))
     turns = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
@@ -170,7 +174,7 @@ def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: f
         try:
             inverse_kinematics(machine, poses, time=float(time), near=near, limits=limits, tolerance=REACH_TOLERANCE)
         except Unreachable as error:
-            raise Unreachable(f"at {time:.4g} s {error}", error.joints, error.misfit) from error
+            raise Unreachable(f"at {time:.4g} s {error}", **{**vars(error), "time": float(time)}) from error
 
 
 def _as_pose(machine: Machine, task: TipTask, start: Array, time: float) -> TipTask | None:
@@ -200,10 +204,11 @@ def _starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any,
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
     given = np.zeros((0, size)) if near is None else np.atleast_2d(np.asarray(near, dtype=float))
     if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
-        raise ProblemError(f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected")
+        words = f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected"
+        raise ProblemError(words, name="near", value=given, limit=(size,))
     both = np.vstack([given, rng.uniform(low, high, size=(count, size))])
     if not len(both):
-        raise ProblemError("starts = 0 and near = None leave no start")
+        raise ProblemError("starts = 0 and near = None leave no start", name="starts", value=0, limit=1)
     return np.asarray(np.clip(both, lower, upper))
 
 
@@ -281,4 +286,6 @@ def _unreachable(
         f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, leave a row free, or raise starts",
         joints,
         misfit,
+        name=names[0],
+        value=misfit,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from models.machines.standing import External, Standing, wrenches_at
 from models.robot.indices import joint_limit_index, manipulability_of
 from models.robot.motion import center_of_mass_motion, momentum
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_choice, checked_nonnegative
 from ocp.local.rates import least_rates
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.zmp_rules import is_finite
@@ -44,12 +44,11 @@ class Layer:
     form: Literal["assigned", "gradient"] = "assigned"
 
     def __post_init__(self) -> None:
-        if self.index not in ("joint_limits", "manipulability"):
-            raise ProblemError(f"layer: unknown index {self.index!r}; use 'joint_limits' or 'manipulability'")
-        if self.form not in ("assigned", "gradient"):
-            raise ProblemError(f"layer: unknown form {self.form!r}; use 'assigned' or 'gradient'")
+        checked_choice("layer: index", self.index, ("joint_limits", "manipulability"))
+        checked_choice("layer: form", self.form, ("assigned", "gradient"))
         if not is_finite(self.demand):
-            raise ProblemError(f"layer {self.index!r}: demand must be a number, not {self.demand!r}")
+            words = f"layer {self.index!r}: demand must be a number, not {self.demand!r}"
+            raise ProblemError(words, name="demand", value=self.demand)
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,10 @@ class Stabiliser:
     def __post_init__(self) -> None:
         poles = self.poles if isinstance(self.poles, Sequence | np.ndarray) else ()
         if len(poles) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
-            raise ProblemError(f"stabiliser: poles must be three positive numbers, not {self.poles!r}")
+            words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
+            raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
         for what in ("damping", "gradient"):
-            if not (is_finite(getattr(self, what)) and getattr(self, what) >= 0):
-                raise ProblemError(f"stabiliser: {what} must not be negative, it is {getattr(self, what)!r}")
+            checked_nonnegative(f"stabiliser: {what}", getattr(self, what))
 
 
 class _Stack:
@@ -103,19 +102,19 @@ def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer],
     Args:
         size: Rows of all tasks.
     """
-    if law not in get_args(Law):
-        raise ProblemError(f"unknown law {law!r}; use one of {', '.join(get_args(Law))}")
-    if not (is_finite(damping) and damping >= 0):
-        raise ProblemError(f"null_damping must be a finite number, zero or above, not {damping!r}")
+    checked_choice("law", law, get_args(Law))
+    checked_nonnegative("null_damping", damping)
     if not isinstance(layers, list | tuple) or not all(isinstance(layer, Layer) for layer in layers):
-        raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}")
+        raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}", name="layers", value=layers)
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
     tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
     tasks |= {"the assigned layers": sum(layer.form == "assigned" for layer in layers)}
-    if sum(tasks.values()) > machine.joint_size:
+    needed, size = sum(tasks.values()), machine.joint_size
+    if needed > size:
         asked = ", ".join(f"{count} for {what}" for what, count in tasks.items() if count)
-        raise ProblemError(f"law {law!r} needs {sum(tasks.values())} joints ({asked}), there are {machine.joint_size}")
+        words = f"law {law!r} needs {needed} joints ({asked}), there are {size}"
+        raise ProblemError(words, name="law", value=needed, limit=size)
 
 
 def accelerations(

@@ -17,7 +17,7 @@ from models import Machine
 from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.curves import integrator
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_nonnegative, checked_positive
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.tip_task import TipTask, Velocity, one_of
@@ -125,17 +125,15 @@ def resolve(
     joints, base = checked_configuration(machine, start_joints, start_base)
     duration, heavy = checked_horizon(horizon), checked_weights(weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration, start=check_start)
-    for what, number in (("damping", damping), ("tolerance", tolerance)):
-        if not (np.isfinite(number) and number >= 0):
-            raise ProblemError(f"{what} must be a finite number, zero or above, not {number!r}")
-    if tolerance == 0:
-        raise ProblemError("tolerance must be positive, not 0")
+    checked_nonnegative("damping", damping)
+    checked_positive("tolerance", tolerance)
     times = _times(samples, duration)
     if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
-        raise ProblemError(
+        words = (
             f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
             "start elsewhere, fix fewer rows, or give a damping"
         )
+        raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
     try:
         model = _Model(equations, heavy, damping, ca.SX)
     except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
@@ -164,13 +162,15 @@ def _times(samples: Any, horizon: float) -> Array:
     if np.ndim(samples) == 0:
         count = int(samples)
         if count != samples or count < 2:
-            raise ProblemError(f"samples must be at least 2 points or an array of times, not {samples!r}")
+            words = f"samples must be at least 2 points or an array of times, not {samples!r}"
+            raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, count)
     times = np.asarray(samples, dtype=float)
     if times.ndim != 1 or len(times) < 2 or times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
-        raise ProblemError(f"samples must be times from 0 to the horizon {horizon:g} s")
+        words = f"samples must be times from 0 to the horizon {horizon:g} s"
+        raise ProblemError(words, name="samples", value=times, limit=(0.0, horizon))
     if not (np.diff(times) > 0).all():
-        raise ProblemError("samples must be increasing times")
+        raise ProblemError("samples must be increasing times", name="samples", value=times)
     return times
 
 

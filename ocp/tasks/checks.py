@@ -41,7 +41,8 @@ def checked_horizon(horizon: Any) -> float:
     except (TypeError, ValueError):
         duration = np.nan
     if not 0 < duration < np.inf:
-        raise ProblemError(f"horizon must be a positive number of seconds, not {horizon!r}")
+        words = f"horizon must be a positive number of seconds, not {horizon!r}"
+        raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
     return duration
 
 
@@ -52,12 +53,14 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
         ProblemError: Wrong sizes, not finite; a quaternion that is not of unit length.
     """
     if joints is None:
-        raise ProblemError("start_joints are missing; inverse_kinematics(machine, task) finds some for a pose")
+        words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
+        raise ProblemError(words, name="start_joints")
     angles = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
     home = machine.base_home() if base is None else base
     place = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
     if machine.base_size == 7 and abs(np.linalg.norm(place[3:]) - 1) > 1e-9:
-        raise ProblemError(f"start_base has the quaternion {place[3:].tolist()}, which is not of unit length")
+        words = f"start_base has the quaternion {place[3:].tolist()}, which is not of unit length"
+        raise ProblemError(words, name="start_base", value=place[3:])
     return angles, place
 
 
@@ -67,7 +70,7 @@ def checked_weights(weights: Any, size: int) -> Array:
         return np.ones(size)
     given = checked_numbers(weights, size, "weights", "one for each joint")
     if not (given > 0).all():
-        raise ProblemError(f"weights {given.tolist()} must be positive")
+        raise ProblemError(f"weights {given.tolist()} must be positive", name="weights", value=given, limit=0.0)
     return given
 
 
@@ -76,11 +79,12 @@ def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
     try:
         array = np.asarray(value, dtype=float).ravel()
     except (TypeError, ValueError) as error:
-        raise ProblemError(f"{what} {value!r} is not numeric") from error
+        raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.shape != (size,):
-        raise ProblemError(f"{what} has {array.size} entries, expected {size}: {meaning}")
+        words = f"{what} has {array.size} entries, expected {size}: {meaning}"
+        raise ProblemError(words, name=what, value=array, limit=size)
     if not np.isfinite(array).all():
-        raise ProblemError(f"{what} {array.tolist()} is not finite")
+        raise ProblemError(f"{what} {array.tolist()} is not finite", name=what, value=array)
     return array
 
 
@@ -95,23 +99,28 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
     rows = _rows_by_name(equations)
     jacobian = equations.jacobian(place, q)
     if equations.size > len(joints):
-        raise ProblemError(f"the task fixes {equations.size} rows {rows} but the machine has only {len(joints)} joints")
+        words = f"the task fixes {equations.size} rows {rows} but the machine has only {len(joints)} joints"
+        raise ProblemError(words, name="rows", value=equations.size, limit=len(joints))
     unmoved = [row for i, row in enumerate(rows) if all(entry.is_zero() for entry in ca.horzsplit(jacobian[i, :]))]
     if unmoved:
-        raise ProblemError(f"rows {rows}: no joint moves the tip in rows {unmoved}; leave them out of the task")
+        words = f"rows {rows}: no joint moves the tip in rows {unmoved}; leave them out of the task"
+        raise ProblemError(words, name="rows", value=unmoved)
     numeric = ca.Function("jacobian", [place, q], [jacobian])
     rng = np.random.default_rng(0)
     places = [joints, *rng.normal(size=(5, len(joints)))]
     if not any(_has_full_rank(np.array(numeric(base, at))) for at in places):
-        raise ProblemError(
+        words = (
             f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they ask for "
             "the same motion twice or for more than the machine can do; leave out rows"
         )
+        raise ProblemError(words, name="rows", value=rows)
     if not any(part.task.is_pose for part in equations.bound):
         return
     times, values = _sampled(equations, horizon, TRACK_SAMPLES)
     if not (finite := np.isfinite(values).all(axis=0)).all():
-        raise ProblemError(f"the task's targets are not finite at {times[~finite][0]:g} s")
+        first = float(times[~finite][0])
+        words = f"the task's targets are not finite at {first:g} s"
+        raise ProblemError(words, name="task", value=values[:, ~finite][:, 0], time=first)
     _check_rotations(equations, values, times)
     if start:
         for part in equations.bound:
@@ -121,11 +130,12 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
             misfit = np.array(alone.misfit(base, joints, alone.target_function()(0.0)))
             gap = float(np.abs(misfit).max())
             if gap > part.task.start_gap:
-                raise ProblemError(
+                words = (
                     f"at the start joints {joints.tolist()} the frame of {_frame(part)!r} is {gap:.3g} (m or rad) away "
                     f"from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
                     "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
                 )
+                raise ProblemError(words, name=_frame(part), value=gap, limit=part.task.start_gap, time=0.0)
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
@@ -166,7 +176,9 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
             wrong = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
             wrong |= np.linalg.det(turn) < 0
             if wrong.any():
-                raise ProblemError(f"orientation is no rotation at {times[wrong][0]:g} s: {turn[wrong][0].T.tolist()}")
+                time, found = float(times[wrong][0]), turn[wrong][0].T
+                words = f"orientation is no rotation at {time:g} s: {found.tolist()}"
+                raise ProblemError(words, name="orientation", value=found, time=time)
 
 
 def _has_full_rank(jacobian: Array) -> bool:
@@ -193,10 +205,11 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
             turned = _turn(np.array(whole), times[1]) if closes[[row in ANGULAR for row in task.chosen]].any() else 0.0
             gap = max(float(np.abs(moved).max(initial=0.0)), turned)
         if gap > CLOSED:
-            raise ProblemError(
+            words = (
                 f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
                 "from where it began, and the joints cannot return; close the path"
             )
+            raise ProblemError(words, name=_frame(part), value=gap, limit=CLOSED)
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
@@ -208,10 +221,11 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
         for part, mine in _parts(equations, np.array(targets(time)).ravel()):
             asked = mine[_rate_rows(part.task)] if part.task.is_pose else mine
             if np.linalg.norm(asked) > STILL:
-                raise ProblemError(
+                words = (
                     f"the task of {_frame(part)!r} moves at {asked.tolist()} (m/s or rad/s) at {time:g} s, where the "
                     "joints are to be at rest; let it come to rest there, or say 'free' for that end"
                 )
+                raise ProblemError(words, name=_frame(part), value=asked, limit=STILL, time=float(time))
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
@@ -226,10 +240,11 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         far = np.linalg.norm(wanted - shoulder[task.linear], axis=1)
         worst = int(far.argmax())
         if far[worst] > reach:
-            raise ProblemError(
+            words = (
                 f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
                 f"{times[worst]:.4g}, to {wanted[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             )
+            raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
 def _reach(machine: Machine, base: Array) -> tuple[Array, float]:

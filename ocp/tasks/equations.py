@@ -270,10 +270,11 @@ class TaskEquations:
         if np.any(np.asarray(self.machine.conserved_momentum)[linear:]):
             alone = _combinations(task, len(task))
             if alone.shape[1] < closes.shape[1]:
-                raise ProblemError(
+                words = (
                     "cyclic: the linear momentum moves the centre of mass on, and the joints cannot return together "
                     "with a tip that returns in the world; let the task be relative to the base"
                 )
+                raise ProblemError(words, name="cyclic", value=self.machine.conserved_momentum)
             closes = alone
         free = np.zeros((self.size, closes.shape[1]))
         free[chosen] = closes
@@ -313,15 +314,19 @@ def track_expression(
         try:
             value = ca.DM(np.asarray(value, dtype=float))
         except (TypeError, ValueError, NotImplementedError) as error:
-            raise ProblemError(f"{what} gives {value!r}, not numbers or expressions of shape {wanted}") from error
+            words = f"{what} gives {value!r}, not numbers or expressions of shape {wanted}"
+            raise ProblemError(words, name=what, value=value, limit=allowed) from error
     if value.shape not in allowed:
         hint = ": one entry for each row of the task" if what == "tip_velocity" else ""
-        raise ProblemError(f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}")
+        words = f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}"
+        raise ProblemError(words, name=what, value=value.shape, limit=allowed)
     if isinstance(value, ca.DM):
         if not np.isfinite(np.array(value)).all():
-            raise ProblemError(f"{what} {np.array(value).ravel().tolist()} is not finite")
+            found = np.array(value).ravel()
+            raise ProblemError(f"{what} {found.tolist()} is not finite", name=what, value=found)
     elif strange := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
-        raise ProblemError(f"{what} depends on {strange}, but only the time it is called with may occur")
+        words = f"{what} depends on {strange}, but only the time it is called with may occur"
+        raise ProblemError(words, name=what, value=strange)
     return ca.densify(value)
 
 
@@ -355,17 +360,18 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
     """
     listed = [tasks] if isinstance(tasks, TipTask) else list(tasks)
     if not listed:
-        raise ProblemError("task is an empty list; give a TipTask, or several")
+        raise ProblemError("task is an empty list; give a TipTask, or several", name="task", value=listed)
     bound = []
     for task in listed:
         if not isinstance(task, TipTask):
-            raise ProblemError(f"task must be a TipTask or a list of them, not {task!r}")
+            words = f"task must be a TipTask or a list of them, not {task!r}"
+            raise ProblemError(words, name="task", value=task)
         try:
             tip = with_tip(machine, task.link, task.point) if task.link is not None else machine
             _ = tip.robot.tip_link
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
         except ModelError as error:
-            raise ProblemError(str(error)) from error
+            raise ProblemError(str(error), **vars(error)) from error
         bound.append(Bound(task, tip, reference))
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 

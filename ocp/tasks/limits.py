@@ -10,8 +10,7 @@ import numpy as np
 
 from models import Machine, Standing
 from models.arrays import Array
-from ocp.errors import ProblemError
-from ocp.tasks.zmp_rules import is_finite
+from ocp.errors import ProblemError, checked_positive
 
 __all__ = ["JointBounds", "Limits"]
 
@@ -58,11 +57,13 @@ class Limits:
         for what in ("velocity", "acceleration", "jerk", "torque"):
             value = getattr(self, what)
             if value is not None and not (_numbers(value) > 0).all():
-                raise ProblemError(f"limits: {what} must be positive, one number or one for each joint, not {value!r}")
-        if self.vertical_force is not None and not (is_finite(self.vertical_force) and self.vertical_force > 0):
-            raise ProblemError(f"limits: vertical_force must be positive, not {self.vertical_force!r}")
-        if not (isinstance(self.friction, Real) and self.friction > 0):
-            raise ProblemError(f"limits: friction must be positive, not {self.friction!r}")
+                words = f"limits: {what} must be positive, one number or one for each joint, not {value!r}"
+                raise ProblemError(words, name=what, value=value, limit=0.0)
+        if self.vertical_force is not None:
+            checked_positive("limits: vertical_force", self.vertical_force)
+        if not (isinstance(self.friction, Real) and self.friction > 0):  # which may be infinite
+            words = f"limits: friction must be positive, not {self.friction!r}"
+            raise ProblemError(words, name="friction", value=self.friction, limit=0.0)
 
     def least_force(self, machine: Standing) -> float:
         """Least vertical ground force, N."""
@@ -82,14 +83,16 @@ class Limits:
             if value is not None:
                 array = _numbers(value)
                 if array.size not in (1, n):
-                    raise ProblemError(f"limits: {what} must be positive, one number or {n}, not {value!r}")
+                    words = f"limits: {what} must be positive, one number or {n}, not {value!r}"
+                    raise ProblemError(words, name=what, value=value, limit=n)
                 given[what] = np.array(np.broadcast_to(array, n))
             elif not (own > 0).all():
                 names = [name for name, most in zip(robot.joint_names, own, strict=True) if not most > 0]
-                raise ProblemError(
+                words = (
                     f"limits: the robot gives the joints {names} a {what} limit of 0; lock them, or say what they "
                     f"bear: Limits({what}=...), inf for no limit"
                 )
+                raise ProblemError(words, name=names[0], value=0.0)
         lower, upper = (robot.lower, robot.upper) if self.joints else (-free, free)
         return JointBounds(lower, upper, **given)
 

@@ -21,7 +21,7 @@ from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.robot.indices import checked_rows
 from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_choice, checked_nonnegative
 
 __all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "timed"]
 
@@ -84,31 +84,32 @@ class TipTask:
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):
-            raise ProblemError("a tip task needs a velocity or a pose (position, orientation, direction), and not both")
+            words = "a tip task needs a velocity or a pose (position, orientation, direction), and not both"
+            raise ProblemError(words, name="velocity")
         if self.orientation is not None and self.direction is not None:
-            raise ProblemError("a tip task takes an orientation or a direction of its tool axis, not both")
-        if self.axes not in get_args(Axes):
-            raise ProblemError(f"axes {self.axes!r} are unknown; use one of {list(get_args(Axes))}")
+            words = "a tip task takes an orientation or a direction of its tool axis, not both"
+            raise ProblemError(words, name="direction")
+        checked_choice("axes", self.axes, get_args(Axes))
         for what in ("gain", "start_gap"):
-            value = getattr(self, what)
-            if not (isinstance(value, int | float | np.number) and 0 <= value < np.inf):
-                raise ProblemError(f"{what} must be a finite number, zero or above, not {value!r}")
+            checked_nonnegative(what, getattr(self, what))
         try:
             axis = checked_array(self.tool_axis, (3,), "tip task", "tool_axis")
             object.__setattr__(self, "point", checked_array(self.point, (3,), "tip task", "point"))
             object.__setattr__(self, "rows", self._checked_rows())
         except ModelError as error:
-            raise ProblemError(str(error)) from error
+            raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
-            raise ProblemError(f"tool_axis {axis.tolist()} has no direction")
+            raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
         object.__setattr__(self, "tool_axis", axis / np.linalg.norm(axis))
         if self.link is None and np.any(self.point):
-            raise ProblemError("a point is given in the frame of a link: name the link too")
+            words = "a point is given in the frame of a link: name the link too"
+            raise ProblemError(words, name="point", value=self.point)
 
     def _checked_rows(self) -> tuple[int, ...]:
         if not self.is_pose:
             if self.rows is None:
-                raise ProblemError("rows are missing: which rows of the twist does the velocity prescribe?")
+                words = "rows are missing: which rows of the twist does the velocity prescribe?"
+                raise ProblemError(words, name="rows")
             return tuple(checked_rows(self.rows))
         defined = (ANGULAR if self.orientation is not None else ()) + (LINEAR if self.position is not None else ())
         if self.rows is None:
@@ -116,9 +117,8 @@ class TipTask:
         none = self.direction is not None and np.size(self.rows) == 0
         rows = () if none else tuple(checked_rows(self.rows))
         if strange := [row for row in rows if row not in defined]:
-            raise ProblemError(
-                f"rows {strange}: rows 0..2 need an orientation, rows 3..5 a position; a direction fixes its own rows"
-            )
+            needs = "rows 0..2 need an orientation, rows 3..5 a position; a direction fixes its own rows"
+            raise ProblemError(f"rows {strange}: {needs}", name="rows", value=strange, limit=defined)
         return rows
 
     @property
@@ -153,10 +153,10 @@ def one_of(
     """The tasks, given either as (tip_velocity, rows) or as such; ProblemError when both or neither."""
     if task is None:
         if tip_velocity is None:
-            raise ProblemError("a task is missing: give tip_velocity and rows, or task=TipTask(...)")
+            raise ProblemError("a task is missing: give tip_velocity and rows, or task=TipTask(...)", name="task")
         return [TipTask(rows=rows, velocity=tip_velocity)]
     if tip_velocity is not None or rows is not None:
-        raise ProblemError("give either tip_velocity and rows, or task, not both")
+        raise ProblemError("give either tip_velocity and rows, or task, not both", name="task")
     return [task] if isinstance(task, TipTask) else list(task)
 
 
@@ -186,10 +186,10 @@ def pose_line(
         ProblemError: Wrong sizes, no rotations, a turn of half a circle, whose sense is ambiguous, a duration that is
             not positive.
     """
-    if pace not in ("constant", "rest"):
-        raise ProblemError(f"unknown pace {pace!r}; use 'constant' or 'rest'")
+    checked_choice("pace", pace, ("constant", "rest"))
     if not (isinstance(duration, int | float | np.number) and 0 < duration < np.inf):
-        raise ProblemError(f"duration must be a positive number of seconds, not {duration!r}")
+        words = f"duration must be a positive number of seconds, not {duration!r}"
+        raise ProblemError(words, name="duration", value=duration, limit=0.0)
     (turn, place), (other, there) = (_pose(pose, what) for pose, what in ((first, "first"), (second, "second")))
     relative = turn.T @ other
     axial = np.array(
@@ -198,7 +198,8 @@ def pose_line(
     sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(relative)) - 1) / 2
     angle = float(np.arctan2(sine, cosine))
     if angle > LARGEST_TURN:
-        raise ProblemError(f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous")
+        words = f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous"
+        raise ProblemError(words, name="poses", value=angle, limit=LARGEST_TURN)
     vector = axial / 2 * (angle / sine if sine > 0 else 1.0)
 
     def share(time: Any) -> Any:
@@ -237,7 +238,8 @@ def along(path: SmoothPath, speed: float) -> Callable[[Any], Any]:
     A mesh whose nodes are where the pieces of the path begin, `path.bounds / path.length`, keeps the full order.
     """
     if not (isinstance(speed, int | float | np.number) and 0 < speed < np.inf):
-        raise ProblemError(f"speed must be a positive number of m/s, not {speed!r}")
+        words = f"speed must be a positive number of m/s, not {speed!r}"
+        raise ProblemError(words, name="speed", value=speed, limit=0.0)
     return _Along(path, float(speed))
 
 
@@ -277,13 +279,14 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], what: str) -> tuple[Array, Array]
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except (TypeError, ValueError, NotImplementedError) as error:
-        raise ProblemError(f"the {what} pose must be (orientation, position) in numbers, not {pose!r}") from error
+        words = f"the {what} pose must be (orientation, position) in numbers, not {pose!r}"
+        raise ProblemError(words, name=what, value=str(pose)) from error
     if orientation.size == 4 and np.linalg.norm(orientation) > 0:
         orientation = np.array(rotation_from_quaternion(ca.DM(orientation.ravel())))
     if orientation.shape != (3, 3) or position.size != 3:
-        raise ProblemError(
-            f"the {what} pose has the shapes {orientation.shape}, {position.shape}; (3, 3), (3,) expected"
-        )
+        words = f"the {what} pose has the shapes {orientation.shape}, {position.shape}; (3, 3), (3,) expected"
+        raise ProblemError(words, name=what, value=(orientation.shape, position.shape), limit=((3, 3), (3,)))
     if not (np.abs(orientation @ orientation.T - np.eye(3)).max() < 1e-6 and np.linalg.det(orientation) > 0):
-        raise ProblemError(f"the {what} pose has the orientation {orientation.tolist()}, which is no rotation")
+        words = f"the {what} pose has the orientation {orientation.tolist()}, which is no rotation"
+        raise ProblemError(words, name=what, value=orientation)
     return orientation, position.ravel()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
@@ -50,12 +50,8 @@ class InFoot:
 
     def __post_init__(self) -> None:
         if not (is_finite(self.margin) and self.margin >= 0):  # beyond the foot it would tip over
-            raise ProblemError(
-                f"InFoot: margin must be a finite number of m, not negative, not {self.margin!r}",
-                name="margin",
-                value=self.margin,
-                limit=0.0,
-            )
+            words = f"InFoot: margin must be a finite number of m, not negative, not {self.margin!r}"
+            raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
 
     def check(self, machine: Standing) -> None:
         """Raise ProblemError where the margin leaves no room in the support."""
@@ -63,9 +59,8 @@ class InFoot:
         along = np.ptp(support.vertices @ directions.T, axis=0) / 2
         room = support.inner_radius if len(directions) == 2 else float(along.min(initial=np.inf))
         if self.margin >= room * (1 - 1e-9):
-            raise ProblemError(
-                f"InFoot: margin {self.margin!r} m leaves no room in a support that holds no more than {room:g} m"
-            )
+            words = f"InFoot: margin {self.margin!r} m leaves no room in a support that holds no more than {room:g} m"
+            raise ProblemError(words, name="margin", value=self.margin, limit=room)
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,8 @@ class IndexAtLeast:
 
     def __post_init__(self) -> None:
         if not (is_finite(self.value) and self.value < 1):
-            raise ProblemError(f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()")
+            words = f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()"
+            raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
         """Least and greatest (x, y) where the index is as asked. Shape (2,) each, m."""
@@ -111,7 +107,8 @@ class Following:
     def place(self, machine: Standing, time: Any) -> Any:
         """Shape (2, 1), m."""
         if not callable(self.reference):
-            raise ProblemError(f"Following: a function of time is expected, not {self.reference!r}")
+            words = f"Following: a function of time is expected, not {self.reference!r}"
+            raise ProblemError(words, name="Following", value=self.reference)
         return checked_place(self.reference(time), "Following: the reference")
 
 
@@ -121,10 +118,11 @@ def checked_place(given: Any, what: str) -> Any:
         point = expression(given)
     except (TypeError, ValueError, NotImplementedError):
         point = ca.DM()
-    if point.numel() != 2 or 1 not in point.shape:
-        raise ProblemError(f"{what} must be two numbers (x, y), not {given!r}")
-    if isinstance(point, ca.DM) and not np.isfinite(np.array(point)).all():
-        raise ProblemError(f"{what} must be two numbers (x, y), not {given!r}")
+    numeric = isinstance(point, ca.DM)
+    if point.numel() != 2 or 1 not in point.shape or (numeric and not np.isfinite(np.array(point)).all()):
+        shown = given if numeric else str(given)  # expressions cannot be pickled
+        words = f"{what} must be two numbers (x, y), not {given!r}"
+        raise ProblemError(words, name=what.rpartition(" ")[2], value=shown)
     return ca.vec(point)
 
 
@@ -174,10 +172,11 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, pushed: bool) -> Any:
     for i in set(range(len(offsets))) - set(free):
         inside = float(ca.evalf(rows[i])) if pushed else float(normals[i] @ here - offsets[i])
         if inside < -ROUNDING:
-            raise ProblemError(
+            words = (
                 f"the zero moment point is {-inside:.4g} m beyond an edge of the support, less its margin, whatever "
                 "the joints do: put the foot below the machine"
             )
+            raise ProblemError(words, name="zero moment point", value=-inside, limit=0.0)
     return rows[free]
 
 
@@ -195,17 +194,19 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, pushed: bool) -
     here = machine.nearest_reachable(machine.most_stable_point)
     for i in {0, 1} - set(rows):
         if not low[i] - ROUNDING <= here[i] <= high[i] + ROUNDING:
-            raise ProblemError(
+            words = (
                 f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {here[i]:.4g} m whatever the "
                 f"joints do, outside {low[i]:.4g} .. {high[i]:.4g} m: put the foot below the machine"
             )
+            raise ProblemError(words, name="zero moment point", value=here[i], limit=(low[i], high[i]))
     return rows
 
 
 def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:
     """Raise ProblemError for what is no rule, leaves no room in the support, or asks the machine to tip over."""
     if not isinstance(zmp, ZmpRule):
-        raise ProblemError(f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}")
+        words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
+        raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
     if isinstance(zmp, InFoot):
         zmp.check(machine)
     if not isinstance(zmp, Pinned | Following):
@@ -214,10 +215,12 @@ def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:
     for time in np.linspace(0.0, horizon, REFERENCE_SAMPLES if isinstance(zmp, Following) else 1):
         place = np.array(ca.DM(zmp.place(machine, ca.DM(time)))).ravel()
         if not np.isfinite(place).all():
-            raise ProblemError(f"{name}: the zero moment point is to be at {place.tolist()} at {time:.4g} s")
+            words = f"{name}: the zero moment point is to be at {place.tolist()} at {time:.4g} s"
+            raise ProblemError(words, name=name, value=place, time=float(time))
         inside = float(machine.support.margin(machine.nearest_reachable(place)))
         if inside < -ROUNDING:
-            raise ProblemError(
+            words = (
                 f"{name}: {place.tolist()} m at {time:.4g} s is {-inside:.4g} m outside the support, where the machine "
                 "tips over; stay inside, or give another support"
             )
+            raise ProblemError(words, name=name, value=place, limit=machine.support.vertices, time=float(time))

@@ -394,12 +394,12 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"law": "magic"}, "unknown law 'magic'"),
-        ({"integrator": "euler"}, "unknown integrator 'euler'"),
-        ({"step": 0.0}, "step must be a positive number"),
-        ({"speed_limit": -1.0}, "speed_limit must be a positive number"),
+        ({"law": "magic"}, "law must be .* not 'magic'"),
+        ({"integrator": "euler"}, "integrator must be .* not 'euler'"),
+        ({"step": 0.0}, "step must be positive"),
+        ({"speed_limit": -1.0}, "speed_limit must be positive"),
         ({"null_damping": -1.0}, "null_damping must be"),
-        ({"step": "short"}, "step must be a positive number"),
+        ({"step": "short"}, "step must be positive"),
         ({"layers": ("limits",)}, "layers must be a list of Layer"),
         ({"law": "stabilised", "stabiliser": 3}, "stabiliser must be"),
         ({"zmp": lambda t: t, "law": "augmented"}, "zmp must be two numbers"),
@@ -416,24 +416,26 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
     arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": 1.0, **changes}
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         resolve_accelerations(machine(), **arguments)
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Layer("reach", 1.0), "unknown index 'reach'"),  # type: ignore[arg-type]
-        (lambda: Layer("joint_limits", 1.0, "soft"), "unknown form 'soft'"),  # type: ignore[arg-type]
+        (lambda: Layer("reach", 1.0), "index must be .* not 'reach'"),  # type: ignore[arg-type]
+        (lambda: Layer("joint_limits", 1.0, "soft"), "form must be .* not 'soft'"),  # type: ignore[arg-type]
         (lambda: Layer("joint_limits", np.nan), "demand must be a number"),
         (lambda: Stabiliser((4.0, 4.0, -1.0)), "three positive numbers"),
         (lambda: Stabiliser("fast"), "three positive numbers"),  # type: ignore[arg-type]
-        (lambda: Stabiliser(damping=-1.0), "damping must not be negative"),
+        (lambda: Stabiliser(damping=-1.0), "damping must be a finite number, zero or above"),
     ],
 )
 def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         make()
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -84,12 +85,16 @@ def test_a_start_that_is_near_is_kept_and_seeds_repeat() -> None:
     np.testing.assert_array_equal([p.joints for p in one], [p.joints for p in other])
 
 
-def test_the_nearest_miss_is_told() -> None:
+def test_the_nearest_miss_is_told_and_pickled() -> None:
     machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
     with pytest.raises(Unreachable, match=r"nearest miss is 0\.3 ") as caught:
         inverse_kinematics(machine, TipTask(position=(2.0, 0.0, 0.0), rows=(3, 4)))
     assert caught.value.misfit == pytest.approx(0.3, abs=1e-6)
     np.testing.assert_allclose(np.sin(caught.value.joints), 0.0, atol=1e-3)
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (type(again), str(again)) == (Unreachable, str(caught.value))
+    assert (again.name, again.value, again.misfit) == ("link2", caught.value.misfit, caught.value.misfit)
+    np.testing.assert_array_equal(again.joints, caught.value.joints)
 
 
 def test_limits_refuse_what_they_forbid_and_name_the_joint() -> None:
@@ -116,7 +121,7 @@ def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
         (TipTask(rows=(3,), velocity=(0.0,)), {}, "need a pose"),
         (POINT, {"starts": -1}, "starts must be a whole number"),
         (POINT, {"starts": 0}, "no start"),
-        (POINT, {"tolerance": 0.0}, "tolerance must be a positive"),
+        (POINT, {"tolerance": 0.0}, "tolerance must be positive"),
         (POINT, {"near": (0.0, 0.0)}, r"near has shape \(1, 2\)"),
         (TipTask(position=(0.0, 0.0, np.nan)), {}, "position .* not finite"),
         (TipTask(position=(0.0, 0.0)), {}, r"position has shape \(2, 1\)"),
@@ -126,5 +131,6 @@ def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(task: Any, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         inverse_kinematics(ur5(), task, **changes)
+    assert (caught.value.name or "unnamed") in str(caught.value)

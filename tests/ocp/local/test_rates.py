@@ -215,8 +215,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         resolve(paper_example(), **{**ASKED, **changes})
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_quaternion_that_is_none_is_refused() -> None:

@@ -39,7 +39,7 @@ def test_a_plan_out_of_reach_says_when_and_by_how_much(kind: str) -> None:
         plan_minimum_velocity(arm(), method=SHORT, start_joints=START, horizon=3.0, **tasks[kind])
     leaving = np.sqrt(4 - place[1] ** 2) - place[0]
     grid = 3.0 / 8
-    time = float(str(caught.value).split()[1])
+    time = caught.value.time
     assert leaving < time <= leaving + grid
     miss = np.hypot(place[0] + time, place[1]) - 2.0
     angle = np.arctan2(place[1], place[0] + time)
