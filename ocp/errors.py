@@ -33,7 +33,8 @@ class Detailed(Exception):
 
     Attributes:
         name: Of the offending state, control, constraint, parameter, option or argument, where it is one.
-        value: What was found. limit: What it may be. time: When, s. Each None where the message says none.
+        value: What was found. limit: What it may be. time: When, s, or where along a path, m. Each None where the
+            message says none.
     """
 
     def __init__(

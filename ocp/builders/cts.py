@@ -28,7 +28,7 @@ from models.cts.table import checked_targets
 from models.shapes.capsules import soft_minimum
 from models.spatial import FULL_TURN
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_positive
 from ocp.problem.problem import Problem
 
 __all__ = ["ROLLS", "least_course", "roll_problem", "spline_targets"]
@@ -59,11 +59,10 @@ def spline_targets(times: Any, targets: Any) -> Targets:
     try:
         rows = checked_targets(targets)
     except ModelError as error:
-        raise ProblemError(str(error)) from error
+        raise ProblemError(str(error), name=error.name, value=error.value) from error
     if t.shape != (len(rows),) or len(t) < 4 or not (np.diff(t) > 0).all():
-        raise ProblemError(
-            f"times of shape {t.shape} must increase, one for each of the {len(rows)} targets, 4 at least"
-        )
+        message = f"times of shape {t.shape} must increase, one for each of the {len(rows)} targets, 4 at least"
+        raise ProblemError(message, name="times", value=t, limit=(len(rows),))
     curve = ca.interpolant("targets", "bspline", [t], rows.ravel())
     return lambda time: curve(time)
 
@@ -119,17 +118,17 @@ def roll_problem(
     weights |= {"acceleration_limit": acceleration_limit, "clearance_weight": clearance_weight}
     for name, value in weights.items():
         if not value >= 0:
-            raise ProblemError(f"roll_problem: {name} {value} must not be negative")
-    if not clearance_width > 0:
-        raise ProblemError(f"roll_problem: clearance_width {clearance_width} m must be positive")
+            message = f"roll_problem: {name} {value} must not be negative"
+            raise ProblemError(message, name=name, value=value, limit=(0.0, np.inf))
+    checked_positive("roll_problem: clearance_width", clearance_width)
     try:
         checked_clearance(clearance)
     except ModelError as error:
-        raise ProblemError(f"roll_problem: {error}") from error
-    if not (np.isfinite(horizon) and horizon > 0):
-        raise ProblemError(f"roll_problem: horizon {horizon} s must be positive and finite")
+        raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
+    checked_positive("roll_problem: horizon", horizon)
     if start_roll is not None and not np.isfinite(start_roll):
-        raise ProblemError(f"roll_problem: start_roll {start_roll} rad must be finite")
+        message = f"roll_problem: start_roll {start_roll} rad must be finite"
+        raise ProblemError(message, name="start_roll", value=start_roll)
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
     posture = posture_at(rig, x, c, s, branch)
@@ -149,8 +148,9 @@ def roll_problem(
     rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
     status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
-        at = t[int(np.flatnonzero(status)[0])]
-        raise ProblemError(f"roll_problem: no roll reaches the target at {at:.4g} s; see solve_table")
+        missed = int(np.flatnonzero(status)[0])
+        message = f"roll_problem: no roll reaches the target at {t[missed]:.4g} s; see solve_table"
+        raise ProblemError(message, name="target", value=rows[:, missed], time=float(t[missed]))
     price = ca.Function("price", [x, phi], [ca.cse(index + ca.fmin(near, VIOLATION_PRICE) + VIOLATION_PRICE * short)])
     first = least_course(
         lambda times, rolls: np.asarray(np.array(price.map(len(rolls))(rows[:, times], rolls[None]))[0]),

@@ -21,7 +21,7 @@ from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError, checked_choice, checked_positive
 from ocp.local.inverse_kinematics import check_reach, inverse_kinematics
 from ocp.local.rates import LocalSolution, least_rates, resolve
 from ocp.methods import solve
@@ -119,10 +119,8 @@ def minimum_velocity_problem(
             task that is not closed; a horizon or a damping that is not positive; an unknown formulation.
         Unreachable: No start found where it is free and not given (a ProblemError).
     """
-    if formulation not in get_args(Form):
-        raise ProblemError(f"unknown formulation {formulation!r}; use 'rates' or 'null_space'")
-    if not (np.isfinite(guess_damping) and guess_damping > 0):
-        raise ProblemError(f"guess_damping must be positive, not {guess_damping!r}")
+    checked_choice("formulation", formulation, get_args(Form))
+    checked_positive("guess_damping", guess_damping)
     equations, duration = bind(machine, one_of(tip_velocity, rows, task)), checked_horizon(horizon)
     if start_joints is None and free_start:
         tasks = [part.task for part in equations.bound]
@@ -131,20 +129,20 @@ def minimum_velocity_problem(
     heavy = checked_weights(weights, machine.joint_size)
     checked_tasks(equations, place, start, duration, start=not free_start)
     if formulation == "null_space" and (task_name := dependent_rows(equations, place, start)):
-        raise ProblemError(
+        message = (
             f"{task_name} is singular at the start joints {start.tolist()}, where the "
             "null-space form does not exist; use formulation='rates' or start elsewhere"
         )
+        raise ProblemError(message, name=task_name, value=start)
     if cyclic:
         check_closed(equations, duration)
     robot, unbounded = machine.robot, np.full(machine.joint_size, np.inf)
     lower, upper, speed = (robot.lower, robot.upper, robot.velocity) if limits else (-unbounded, unbounded, unbounded)
     for name, value, low, high in zip(robot.joint_names, start, lower, upper, strict=True):
         if not low <= value <= high:
-            raise ProblemError(
-                f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}; "
-                "start inside or pass limits=False"
-            )
+            message = f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}"
+            hint = "start inside or pass limits=False"
+            raise ProblemError(f"{message}; {hint}", name=name, value=float(value), limit=(low, high))
     local = _local_motion(equations, start, place, duration, heavy, guess_damping)
     problem = Problem(f"minimum velocity, {formulation.replace('_', ' ')}", symbols=symbols)
     base: Any = np.zeros(0)
@@ -158,7 +156,8 @@ def minimum_velocity_problem(
     try:
         targets = equations.targets(problem.time)
     except (RuntimeError, NotImplementedError) as error:
-        raise ProblemError("the task calls an interpolant or an external function: pass symbols=casadi.MX") from error
+        message = "the task calls an interpolant or an external function: pass symbols=casadi.MX"
+        raise ProblemError(message, name="symbols", value=symbols, limit=ca.MX) from error
     closure: Any = ca.DM(equations.size, 1)
     if cyclic and (directions := equations.closing(place, start)).shape[1]:
         slack = problem.state("closure", directions.shape[1], guess=0.0)
@@ -261,14 +260,14 @@ class _Outcome:
 
     Attributes:
         solution: The plan, or the last iterate where there is none.
-        failure: What is wrong with it; None where the plan passes.
+        failure: What is wrong with it, which is not raised; None where the plan passes.
         flaw: What a finer mesh may mend; None where nothing.
         excess: The audit's worst value over its limit; infinite where there is none.
     """
 
     attempt: _Attempt
     solution: Solution | None
-    failure: str | None = None
+    failure: SolveError | None = None
     flaw: str | None = None
     excess: float = np.inf
 
@@ -310,12 +309,12 @@ def plan_minimum_velocity(
         options: Of IPOPT, besides at most 150 iterations.
 
     Raises:
-        SolveError: No guess leads to a plan that passes; says what became of each.
+        SolveError: No guess leads to a plan that passes; says what became of each, and carries what the last one lacks.
         ProblemError: As minimum_velocity_problem; Unreachable, which is one, where a fixed machine cannot reach what
             its tasks ask (see ocp.local.inverse_kinematics.check_reach).
     """
     if not len(dampings):
-        raise ProblemError("dampings are empty: there is no guess to start from")
+        raise ProblemError("dampings are empty: there is no guess to start from", name="dampings", value=dampings)
     tasks = one_of(tip_velocity, rows, task)
     asked: dict[str, Any] = {"start_joints": start_joints, "horizon": horizon, "task": tasks}
     asked |= {"start_base": start_base, "weights": weights}
@@ -343,7 +342,11 @@ def plan_minimum_velocity(
     if not standing:
         reasons = "\n".join(f"{one.attempt}: {one.failure}" for one in tried)
         last = next((one.solution for one in reversed(tried) if one.solution), None)
-        raise SolveError(f"no plan of minimum velocity passes its audit:\n{reasons}", last)
+        why = next((one.failure for one in reversed(tried) if one.failure and one.failure.name), SolveError())
+        raise SolveError(
+            f"no plan of minimum velocity passes its audit:\n{reasons}", last, why.conflicts,
+            name=why.name, value=why.value, limit=why.limit, time=why.time,
+        )  # fmt: skip
     return min(standing.values(), key=lambda plan: plan.cost)
 
 
@@ -376,22 +379,23 @@ def _outcome(
     try:
         solution = solve(attempt.problem, attempt.mesh, options=options, guess=attempt.guess, check=explain)
     except SolveError as error:
-        return _Outcome(attempt, error.solution, str(error))
+        return _Outcome(attempt, error.solution, error)
     if not solution.success:
         if "User_Requested_Stop" in solution.status:
-            raise SolveError(f"interrupted in the solve with {attempt}", solution)
-        return _Outcome(attempt, solution, f"ipopt ended with {solution.status.split(':')[0]}")
+            raise SolveError(f"interrupted in the solve with {attempt}", solution, name=str(attempt))
+        ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
+        return _Outcome(attempt, solution, ended)
     audit = solution.audit()
     if not audit.passed:
         worst = audit.failures[0]
-        failure, excess = (
-            f"the audit fails, {worst.name} {worst.value:.2g}",
-            worst.value / worst.limit if worst.limit else np.inf,
-        )
+        details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
+        failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
+        excess = worst.value / worst.limit if worst.limit else np.inf
         return _Outcome(attempt, solution, failure, "whose audit fails", excess)
     gap = float(np.abs(solution["closure"]).max()) * solution.horizon if "closure" in solution.states else 0.0
     if gap > LARGEST_CLOSURE:
-        return _Outcome(attempt, solution, f"the task gives way by {gap:.2g}", "that gives way")
+        failure = SolveError(f"the task gives way by {gap:.2g}", name="task", value=gap, limit=LARGEST_CLOSURE)
+        return _Outcome(attempt, solution, failure, "that gives way")
     strays = _stray(machine, tasks, audit) > LARGEST_STRAY
     return _Outcome(attempt, solution, flaw="whose tip strays" if strays else None)
 

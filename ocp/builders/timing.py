@@ -31,7 +31,7 @@ from ocp.builders.timing_tables import (
     table,
 )
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_count
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
@@ -83,7 +83,8 @@ class TimingProblem:
         """
         curve = solution.control_interpolant
         if curve.values.shape[1] != 1:
-            raise ProblemError("the jerk of this solution is not constant in its intervals; solve with control='held'")
+            message = "the jerk of this solution is not constant in its intervals; solve with control='held'"
+            raise ProblemError(message, name="jerk", value=curve.values.shape[1], limit=1)
         breaks, begin, horizon = np.asarray(curve.breaks), self.span[0], self.span[1] - self.span[0]
         v, a = (solution.state_interpolant(breaks) * np.array(self.units[:2])).T
         jerk = curve.values[:, 0, 0] * self.units[2]
@@ -188,13 +189,14 @@ def minimum_time_problem(
         ProblemError: Joint limits without joints; a joint jerk limit on a path whose curvature jumps; curvature or
             joints that are not finite; a guess for another path; fewer than 10 intervals.
     """
-    if isinstance(intervals, bool) or not isinstance(intervals, int | np.integer) or intervals < 10:
-        raise ProblemError(f"intervals = {intervals!r} must be a whole number, 10 or more")
+    checked_count("intervals", intervals, 10)
     if limits.joints is not None and joints is None:
-        raise ProblemError("joint limits need the joints along the path: plan_minimum_time(path, limits, arm)")
+        message = "joint limits need the joints along the path: plan_minimum_time(path, limits, arm)"
+        raise ProblemError(message, name="joints")
     limited = joints if limits.joints is not None else None
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
-        raise ProblemError(f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m")
+        message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
+        raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
     path_columns(path, limits, limited, path.dense())  # refuses what is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:

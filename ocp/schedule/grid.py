@@ -122,7 +122,9 @@ def _check_smooth(path: PathLike, limits: LineLimits, count: int) -> None:
         return
     at = int(jumps.argmax())
     if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
-        raise ProblemError(
-            f"a joint jerk limit cannot be kept at {path.bounds[at + 1]:g} m, where the path's curvature jumps by "
-            f"{jumps[at]:.3g} /m and the joint accelerations with it; round the corners with kind='quintic'"
+        place, jump = float(path.bounds[at + 1]), float(jumps[at])
+        message = (
+            f"a joint jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
+            f"{jump:.3g} /m and the joint accelerations with it; round the corners with kind='quintic'"
         )
+        raise ProblemError(message, name="curvature", value=jump, time=place)

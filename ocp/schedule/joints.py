@@ -136,10 +136,12 @@ def search(grid: Grid, limits: LineLimits, joints: JointPath | None) -> Attempt:
         if best is not None:
             return relax_ramps(best, limits, joints)
     if best is None:
-        raise ProblemError(
+        slowest = float(grid.permitted.min())
+        message = (
             f"no schedule found that keeps the joint limits, after {LOWERINGS} rounds; raise the limits, or keep the "
-            f"path away from singular arms (the slowest place permits {float(grid.permitted.min()):.3g} m/s)"
+            f"path away from singular arms (the slowest place permits {slowest:.3g} m/s)"
         )
+        raise ProblemError(message, name="joint limits", value=slowest)
     return best
 
 

@@ -95,7 +95,8 @@ class LineLimits:
             _check(name, getattr(self, name), finite, 1 if name == "speed" else 0)
         if self.joints is not None:
             if not isinstance(self.joints, JointLimits):
-                raise ProblemError(f"joint limits {self.joints!r} must be a JointLimits")
+                message = f"joint limits {self.joints!r} must be a JointLimits"
+                raise ProblemError(message, name="joint limits", value=self.joints)
             for name in ("velocity", "acceleration", "jerk"):
                 _check(f"joint {name}", getattr(self.joints, name), False)
 
@@ -106,7 +107,8 @@ class LineLimits:
         for name in ("velocity", "acceleration", "jerk"):
             value = np.asarray(getattr(given, name), dtype=float)
             if value.ndim and value.shape != (count,):
-                raise ProblemError(f"joint {name} limits have shape {value.shape}; the arm has {count} joints")
+                message = f"joint {name} limits have shape {value.shape}; the arm has {count} joints"
+                raise ProblemError(message, name=f"joint {name}", value=value.shape, limit=(count,))
             rows.append(np.broadcast_to(value, (count,)))
         return np.array(rows)
 
@@ -115,13 +117,15 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ProblemError(f"{name} limit {value!r} is not numeric") from error
+        raise ProblemError(f"{name} limit {value!r} is not numeric", name=name, value=value) from error
     if array.ndim > dimensions:
-        raise ProblemError(f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}")
+        message = f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}"
+        raise ProblemError(message, name=name, value=array.shape)
     wrong = ~(array > 0) | (finite & ~np.isfinite(array))
     if array.size == 0 or wrong.any():
         bad = float(array[wrong].flat[0]) if array.size else np.nan
-        raise ProblemError(f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}")
+        message = f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}"
+        raise ProblemError(message, name=name, value=bad, limit=(0.0, np.inf))
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
@@ -136,17 +140,19 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
         try:
             value = np.asarray(getattr(rates, kind), dtype=float)
         except (AttributeError, TypeError, ValueError) as error:
-            raise ProblemError(f"joints along the path: {kind} is missing or not numeric: {error}") from error
+            message = f"joints along the path: {kind} is missing or not numeric: {error}"
+            raise ProblemError(message, name=kind, value=getattr(rates, kind, None)) from error
         if value.shape != shape:
-            raise ProblemError(f"joints along the path: {kind} has shape {value.shape}, expected {shape}")
+            message = f"joints along the path: {kind} has shape {value.shape}, expected {shape}"
+            raise ProblemError(message, name=kind, value=value.shape, limit=shape)
         finite = np.isfinite(value)
         if not finite.all():
             at, joint = np.argwhere(~finite)[0]
+            name, bad, place = joints.names[joint], float(value[at, joint]), float(distance[at])
             what = "position" if kind == "position" else f"{kind} derivative"
-            raise ProblemError(
-                f"the {what} of joint {joints.names[joint]!r} is {value[at, joint]:g}, not finite, at "
-                f"{distance[at]:g} m, the arm is singular there; keep the path away"
-            )
+            message = f"the {what} of joint {name!r} is {bad:g}, not finite, at {place:g} m"
+            message += ", the arm is singular there; keep the path away"
+            raise ProblemError(message, name=name, value=bad, time=place)
     return rates
 
 
@@ -154,10 +160,12 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
     """Curvature at distances, shape (M,), 1/m; ProblemError for another shape or what is not finite."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
-        raise ProblemError(f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}")
+        message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
+        raise ProblemError(message, name="curvature", value=value.shape, limit=np.shape(distance))
     if not np.isfinite(value).all():
         at = int((~np.isfinite(value)).argmax())
-        raise ProblemError(f"the path's curvature is {value[at]:g}, not finite, at {distance[at]:g} m: a cusp")
+        message = f"the path's curvature is {value[at]:g}, not finite, at {distance[at]:g} m: a cusp"
+        raise ProblemError(message, name="curvature", value=float(value[at]), time=float(distance[at]))
     return value
 
 

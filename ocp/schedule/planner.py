@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_positive
 from ocp.schedule.grid import make_grid
 from ocp.schedule.joints import KEPT, Attempt, search
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names
@@ -83,8 +83,7 @@ class Schedule:
         Raises:
             ProblemError: A period that is not positive, or nan.
         """
-        if not isinstance(period, int | float | np.floating) or not (np.isfinite(period) and period > 0):
-            raise ProblemError(f"sample period {period!r} s must be positive and finite")
+        checked_positive("sample period", period)
         times = np.arange(int(np.ceil(self.duration / period * (1 - 1e-12)))) * period
         return self.at(np.append(times, self.duration))
 
@@ -114,21 +113,21 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     missing = [name for name in ("length", "bounds", "by_piece", "curvature", "dense") if not hasattr(path, name)]
     if missing:
         hint = "give a SmoothPath, as models.paths.smooth_path makes it"
-        raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}")
+        raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}", name="path", value=path)
     if not isinstance(limits, LineLimits):
-        raise ProblemError(f"limits {limits!r} must be a LineLimits")
+        raise ProblemError(f"limits {limits!r} must be a LineLimits", name="limits", value=limits)
     if limits.joints is not None and joints is None:
-        raise ProblemError(
-            "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
-        )
+        message = "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
+        raise ProblemError(message, name="joints")
     limited = joints if limits.joints is not None else None
     grid = make_grid(path, limits, limited)
     found = search(grid, limits, limited)
     dips = _dips(found, limits, cause_names(limited.names if limited is not None else ()))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
-        hint = "ask for less, larger blends, or strict=False"
-        raise ProblemError(f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}")
+        hint, one = "ask for less, larger blends, or strict=False", dips[0]
+        message = f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}"
+        raise ProblemError(message, name=one.cause, value=one.asked, limit=one.speed, time=one.start)
     return Schedule(path, limits, found.profile, dips, joints)
 
 

@@ -52,13 +52,15 @@ def _inside(value: ArrayLike, most: float, what: str, place: str) -> Array:
     try:
         array = np.atleast_1d(np.asarray(value, dtype=float))
     except (TypeError, ValueError) as error:
-        raise ProblemError(f"{what} {value!r} is not numeric") from error
+        raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.ndim != 1:
-        raise ProblemError(f"{what} has shape {array.shape}; give one number or a row")
+        message = f"{what} has shape {array.shape}; give one number or a row"
+        raise ProblemError(message, name=what, value=array.shape)
     slack = 1e-9 * most
     inside = (array >= -slack) & (array <= most + slack)
     if not inside.all():
-        raise ProblemError(f"{what} {array[~inside][:3].tolist()} {place}")
+        wrong = array[~inside][:3].tolist()
+        raise ProblemError(f"{what} {wrong} {place}", name=what, value=wrong[0], limit=(0.0, most))
     return np.asarray(np.clip(array, 0.0, most))
 
 

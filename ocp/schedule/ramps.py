@@ -8,13 +8,13 @@ speed, acceleration and jerk; `plan` finds the speeds at their bounds and joins 
 from __future__ import annotations
 
 from collections.abc import MutableMapping
-from math import isfinite, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_positive
 from ocp.schedule.profile import Array, SpeedProfile, advanced
 
 __all__ = ["Memory", "Phases", "Zones", "fastest", "peak_acceleration", "plan", "ramp_distance", "ramp_time", "reach"]
@@ -84,16 +84,14 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
     Raises:
         ProblemError: Values that are not positive; a jerk too low for that mean.
     """
-    for name, value in (("mean acceleration", mean), ("speed", speed), ("jerk", jerk)):
-        if not isinstance(value, int | float) or not (isfinite(value) and value > 0):
-            raise ProblemError(f"{name} {value!r} must be positive and finite")
+    for name, value in (("mean", mean), ("speed", speed), ("jerk", jerk)):
+        checked_positive(f"peak_acceleration: {name}", value)
     time = speed / mean
     square = time * time - 4 * speed / jerk
     if square < 0:
-        raise ProblemError(
-            f"mean acceleration {mean:g} m/s^2 up to {speed:g} m/s needs a jerk of {4 * mean**2 / speed:g} m/s^3 or "
-            f"more, not {jerk:g}"
-        )
+        least = 4 * mean**2 / speed
+        message = f"mean acceleration {mean:g} m/s^2 up to {speed:g} m/s needs a jerk of {least:g} m/s^3 or more"
+        raise ProblemError(f"{message}, not {jerk:g}", name="jerk", value=jerk, limit=(least, np.inf))
     return jerk * (time - sqrt(square)) / 2
 
 
@@ -206,7 +204,8 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
             place, speed, rate = place + way, max(speed, 0.0), rate if abs(rate) > 1e-9 * most else 0.0
     durations, *starts, jerks = np.array(rows).reshape(-1, 5).T
     if not durations.size or not np.isfinite(durations).all():
-        raise ProblemError(f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5].tolist()}")
+        message = f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5].tolist()}"
+        raise ProblemError(message, name="durations", value=durations[:5].tolist())
     s, v, a = (np.append(start, end) for start, end in zip(starts, (zones.bounds[-1], 0.0, 0.0), strict=True))
     return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
 

@@ -43,18 +43,20 @@ class JointTrajectory:
     def __post_init__(self) -> None:
         names = tuple(str(name) for name in self.names)
         if not names or len(set(names)) != len(names):
-            raise ProblemError(f"trajectory: joint names {list(names)} must be there and differ")
+            message = f"trajectory: joint names {list(names)} must be there and differ"
+            raise ProblemError(message, name="names", value=names)
         object.__setattr__(self, "names", names)
         t = np.array(self.t, dtype=float)
         if t.ndim != 1 or not t.size or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise ProblemError("trajectory: times must be finite, increasing, and at least one")
+            raise ProblemError("trajectory: times must be finite, increasing, and at least one", name="times", value=t)
         object.__setattr__(self, "t", t)
         for kind in KINDS:
             values = np.array(getattr(self, kind), dtype=float)
-            if values.shape != (len(t), len(names)):
-                raise ProblemError(f"trajectory: {kind} have shape {values.shape}, expected {(len(t), len(names))}")
+            if values.shape != (shape := (len(t), len(names))):
+                message = f"trajectory: {kind} have shape {values.shape}, expected {shape}"
+                raise ProblemError(message, name=kind, value=values.shape, limit=shape)
             if not np.isfinite(values).all():
-                raise ProblemError(f"trajectory: {kind} are not all finite")
+                raise ProblemError(f"trajectory: {kind} are not all finite", name=kind, value=values)
             object.__setattr__(self, kind, values)
 
     def write_csv(self, path: str | FilePath[str]) -> None:
@@ -75,11 +77,13 @@ class JointTrajectory:
         count = (len(head) - 1) // 3
         names = tuple(column.removesuffix(f".{KINDS[0]}") for column in head[1 : count + 1])
         if count < 1 or head != ["t", *(f"{name}.{kind}" for kind in KINDS for name in names)]:
-            raise ProblemError(f"{path}: the head {head[:4]} is not that of a joint trajectory")
+            message = f"{path}: the head {head[:4]} is not that of a joint trajectory"
+            raise ProblemError(message, name=str(path), value=head)
         try:
             table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(head))
         except ValueError as error:
-            raise ProblemError(f"{path}: a cell is not a number, or a row is not complete: {error}") from error
+            message = f"{path}: a cell is not a number, or a row is not complete: {error}"
+            raise ProblemError(message, name=str(path)) from error
         return cls(names, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def to_ros(self) -> dict[str, Any]:
@@ -91,7 +95,9 @@ class JointTrajectory:
         nanoseconds = np.round(self.t * 1e9).astype(np.int64)
         if (np.diff(nanoseconds) <= 0).any():
             at = int((np.diff(nanoseconds) <= 0).argmax())
-            raise ProblemError(f"trajectory: times {self.t[at]!r} and {self.t[at + 1]!r} s are the same nanosecond")
+            first, second = self.t[at : at + 2].tolist()
+            message = f"trajectory: times {first} and {second} s are the same nanosecond"
+            raise ProblemError(message, name="times", value=second, time=first)
         values = {kind: getattr(self, kind).tolist() for kind in KINDS}
         points = [
             {kind: rows[k] for kind, rows in values.items()}
@@ -111,7 +117,8 @@ class JointTrajectory:
             values = [np.array([p[kind] for p in points], dtype=float) for kind in KINDS]
             names = tuple(message["joint_names"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ProblemError(f"this is no joint trajectory message: {error!r}") from error
+            text = f"this is no joint trajectory message: {error!r}"
+            raise ProblemError(text, name="message", value=message) from error
         return cls(names, t, *values)
 
 

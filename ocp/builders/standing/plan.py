@@ -60,13 +60,13 @@ class Attempt:
     Attributes:
         name: Formulation, mesh, and whether bounds were tightened.
         solution: The plan, or the last iterate; None where there is none.
-        reason: Why it is no plan; None where it is one.
+        failure: Why it is no plan, which is not raised; None where it is one.
         exceeded: Whether nothing is wrong with it but inequalities exceeded between the points of the grid.
     """
 
     name: str
     solution: Solution | None
-    reason: str | None = None
+    failure: SolveError | None = None
     exceeded: bool = False
 
 
@@ -95,13 +95,15 @@ def plan_standing(
         tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
 
     Raises:
-        SolveError: No attempt leads to a plan that passes; says what became of each.
+        SolveError: No attempt leads to a plan that passes; says what became of each, and carries what the last one
+            lacks.
         ProblemError: As standing_problem.
     """
     judge = _Judge(machine, tasks, tolerances, asked.get("along") == "parameter")
     settings = {**IPOPT, **(options or {})}
     trials = _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
     reasons: list[str] = []
+    why = SolveError()
     refused: list[ProblemError] = []
     last: Solution | None = None
     for level, mesh in trials:
@@ -114,11 +116,15 @@ def plan_standing(
                 raise refused[0] from None
             continue
         for attempt in _attempts(problem, level, mesh, settings, judge, diagnosed=level == trials[-1][0]):
-            if attempt.reason is None and attempt.solution is not None:
+            if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
             last = attempt.solution or last
-            reasons.append(f"{attempt.name}: {attempt.reason}")
-    raise SolveError("no standing plan passes its audit:\n" + "\n".join(reasons), last)
+            reasons.append(f"{attempt.name}: {attempt.failure}")
+            why = attempt.failure or why
+    raise SolveError(
+        "no standing plan passes its audit:\n" + "\n".join(reasons), last, why.conflicts,
+        name=why.name, value=why.value, limit=why.limit, time=why.time,
+    )  # fmt: skip
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Formulation]:
@@ -168,22 +174,28 @@ class _Judge:
         try:
             solution = run()
         except SolveError as error:
-            return Attempt(name, error.solution, str(error))
+            return Attempt(name, error.solution, error)
         if not solution.success:
             if "User_Requested_Stop" in solution.status:
-                raise SolveError(f"interrupted in the solve with {name}", solution)
-            return Attempt(name, solution, f"ipopt ended with {solution.status.split(':')[0]}")
+                raise SolveError(f"interrupted in the solve with {name}", solution, name=name)
+            ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
+            return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
         if not audit.passed:
             worst = max(audit.failures, key=lambda finding: finding.value / finding.limit if finding.limit else np.inf)
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            return Attempt(name, solution, f"the audit fails, {worst.name} {worst.value:.2g}", exceeded)
+            details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
+            failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
+            return Attempt(name, solution, failure, exceeded)
         progress = audit.states["path"][:, 0] if self.along_parameter else audit.t
         errors = np.abs(task_errors(self.machine, self.tasks, progress, None, audit.states["joints"])).max(axis=0)
         parts = bind(self.machine, self.tasks).bound
         gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
         if (errors > np.maximum(gaps, STRAY)).any():
-            return Attempt(name, solution, f"a tip strays from its task by {errors.max():.2g} (m or rad)")
+            strays = SolveError(
+                f"a tip strays from its task by {errors.max():.2g} (m or rad)", name="tip", value=errors.max()
+            )
+            return Attempt(name, solution, strays)
         return Attempt(name, solution)
 
 

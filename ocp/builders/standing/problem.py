@@ -40,7 +40,7 @@ from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_choice
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
 from ocp.tasks.equations import TaskEquations, bind
@@ -82,7 +82,8 @@ class Weights:
     def __post_init__(self) -> None:
         for what, value in vars(self).items():
             if not (is_finite(value) and value >= 0):
-                raise ProblemError(f"weights: {what} must be a finite number, zero or above, not {value!r}")
+                message = f"weights: {what} must be a finite number, zero or above, not {value!r}"
+                raise ProblemError(message, name=what, value=value, limit=(0.0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,8 @@ class FreeTime:
     def __post_init__(self) -> None:
         given = (self.lower, self.guess, self.upper)
         if not (all(map(is_finite, given)) and 0 < self.lower <= self.guess <= self.upper):
-            raise ProblemError(
-                f"FreeTime: 0 < lower <= guess <= upper is needed, not {self.lower!r}, {self.guess!r}, {self.upper!r}"
-            )
+            message = "FreeTime: 0 < lower <= guess <= upper is needed, not " + ", ".join(map(repr, given))
+            raise ProblemError(message, name="FreeTime", value=given)
 
 
 def standing_problem(
@@ -157,12 +157,19 @@ def standing_problem(
             manipulability the cost would need.
     """
     zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
-    if not (isinstance(machine, Standing) and isinstance(weights, Weights) and isinstance(limits, Limits)):
-        given = [type(one).__name__ for one in (machine, weights, limits)]
-        raise ProblemError(f"standing_problem takes a Standing machine, Weights and Limits, not {', '.join(given)}")
-    _check_options(control=control, along=along, tip_level=tip_level, start=start, end=end)
+    for one, kind in ((machine, Standing), (weights, Weights), (limits, Limits)):
+        if not isinstance(one, kind):
+            given = ", ".join(type(each).__name__ for each in (machine, weights, limits))
+            message = f"standing_problem takes a Standing machine, Weights and Limits, not {given}"
+            raise ProblemError(message, name=kind.__name__, value=one)
+    checked_choice("control", control, ("acceleration", "jerk"))
+    checked_choice("along", along, ("time", "parameter"))
+    checked_choice("tip_level", tip_level, ("position", "acceleration"))
+    checked_choice("start", start, ("rest", "free"))
+    checked_choice("end", end, ("rest", "free"))
     if tip_level == "acceleration" and control == "jerk":
-        raise ProblemError("tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'")
+        message = "tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'"
+        raise ProblemError(message, name="control", value=control, limit="acceleration")
     equations = bind(machine, tasks)
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
     begin, base = checked_configuration(machine, start_joints, None)
@@ -219,19 +226,6 @@ def standing_problem(
     running += weights.jerk * ca.sumsqr(jerks)
     problem.minimize(running=running, terminal=weights.time * final)
     return problem
-
-
-def _check_options(**options: str) -> None:
-    known = {
-        "control": ("acceleration", "jerk"),
-        "along": ("time", "parameter"),
-        "tip_level": ("position", "acceleration"),
-        "start": ("rest", "free"),
-        "end": ("rest", "free"),
-    }
-    for what, value in options.items():
-        if value not in known[what]:
-            raise ProblemError(f"{what} must be one of {', '.join(known[what])}, not {value!r}")
 
 
 def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:

@@ -47,9 +47,11 @@ def inside_limits(machine: Standing, joints: Array, lower: Array, upper: Array) 
     """
     for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
         if not low - ROUNDING <= value <= high + ROUNDING:
-            raise ProblemError(f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}")
+            message = f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}"
+            raise ProblemError(message, name=name, value=float(value), limit=(low, high))
         if not low < high:
-            raise ProblemError(f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there")
+            message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
+            raise ProblemError(message, name=name, value=float(value), limit=(low, high))
     return np.clip(joints, lower, upper)
 
 
@@ -64,12 +66,12 @@ def check_freedom(machine: Standing, size: int, zmp: ZmpRule, along: str, tip_le
     follows = tip_level == "acceleration" and not pinned  # joints that the tip takes along to its rest
     if left < 0 or (left == 0 and end == "rest" and not follows):
         asked = f"the tip's {size} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
-        if left < 0:
-            raise ProblemError(f"{asked} are more than {machine.joint_size} joints can do; ask for less")
-        raise ProblemError(
-            f"{asked} leave the {machine.joint_size} joints no freedom to come to rest at the end; say end='free', "
-            + ("or pin the point less" if pinned else "or tip_level='acceleration'")
-        )
+        message = f"{asked} are more than {machine.joint_size} joints can do; ask for less"
+        if left == 0:
+            message = f"{asked} leave the {machine.joint_size} joints no freedom to come to rest at the end; "
+            freer = "pin the point less" if pinned else "tip_level='acceleration'"
+            message += f"say end='free', or {freer}"
+        raise ProblemError(message, name="tip", value=size + pinned, limit=machine.joint_size)
 
 
 def check_slope(equations: TaskEquations, joints: Array) -> None:
@@ -77,10 +79,11 @@ def check_slope(equations: TaskEquations, joints: Array) -> None:
     q = ca.SX.sym("q", len(joints))
     slope = ca.Function("slope", [q], [ca.gradient(equations.manipulability(ca.DM(0, 1), q), q)])
     if not np.isfinite(np.array(slope(joints))).all():
-        raise ProblemError(
+        message = (
             f"start_joints {np.round(joints, 4).tolist()}: the task's rows are singular there, and the manipulability "
             "in the cost has no slope; start elsewhere, or say Weights(manipulability=0)"
         )
+        raise ProblemError(message, name="start_joints", value=joints)
 
 
 def check_loads(
@@ -128,10 +131,11 @@ def check_loads(
     if missed is None or missed.max(initial=0.0) <= MISSED:
         return
     words = [f"{what}, by {100 * share:.3g} %" for (_, what), share in zip(rows, missed, strict=True) if share > MISSED]
-    raise ProblemError(
+    message = (
         f"start_joints {np.round(joints, 4).tolist()}: whatever the joints do there, limits are missed: "
         f"{'; '.join(words)}; start elsewhere, load the tip less, or allow for more"
     )
+    raise ProblemError(message, name="start_joints", value=joints)
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:

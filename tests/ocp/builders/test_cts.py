@@ -161,8 +161,9 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
 )
 def test_what_cannot_be_planned_is_named(options: dict[str, Any], message: str) -> None:
     asked = {"targets": falling, "horizon": HORIZON, "symbols": ca.SX, **options}
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         roll_problem(RIG, TUNNEL, **asked)
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_table_that_is_none_is_named() -> None:

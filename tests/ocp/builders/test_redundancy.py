@@ -251,7 +251,7 @@ def test_a_singular_start_is_planned_with_rates_and_refused_in_the_null_space_fo
     ("changes", "message"),
     [
         *REFUSED,
-        ({"formulation": "dynamics"}, "unknown formulation 'dynamics'"),
+        ({"formulation": "dynamics"}, "formulation must be 'rates' or 'null_space', not 'dynamics'"),
         ({"guess_damping": 0.0}, "guess_damping must be positive"),
     ],
 )
@@ -306,7 +306,7 @@ def test_meshes_are_refined_while_the_audit_mends_and_guesses_tried_until_one_is
         audit = SimpleNamespace(passed=found.passed, failures=[found], controls={})
         plans.append(SimpleNamespace(success=True, states={}, cost=cost, number=number, audit=lambda: audit))
         if np.isinf(worst):
-            raise SolveError(f"attempt {number} fails")
+            raise SolveError(f"attempt {number} fails", name=f"attempt {number}")
         return plans[-1]
 
     monkeypatch.setattr(redundancy, "solve", play)
@@ -314,8 +314,9 @@ def test_meshes_are_refined_while_the_audit_mends_and_guesses_tried_until_one_is
     if best is None:
         with pytest.raises(
             SolveError, match=r"0\.005, .*: attempt 0 .*\n.*0\.05, .*: attempt 1 .*\n.*0\.3, .*attempt 2"
-        ):
+        ) as caught:
             plan_minimum_velocity(paper_example(), method=method, **asked)
+        assert caught.value.name == f"attempt {len(script) - 1}"
     else:
         plan: Any = plan_minimum_velocity(paper_example(), method=method, **asked)
         assert plan.number == best

@@ -85,15 +85,18 @@ def test_the_fastest_lift_is_planned_with_held_accelerations() -> None:
 
 def test_a_failure_says_what_became_of_every_attempt() -> None:
     slow = {"limits": replace(LIMITS, velocity=0.2), "options": {"max_iter": 60}}
-    with pytest.raises(SolveError, match=r"(?s)no standing plan .*\ntip acceleration, 8 intervals: .*velocities\[\d\]"):
+    message = r"(?s)no standing plan .*\ntip acceleration, 8 intervals: .*velocities\[\d\]"
+    with pytest.raises(SolveError, match=message) as caught:
         table_request(method=Collocation(8, degree=3, scheme="legendre"), **slow)
+    assert caught.value.name == caught.value.conflicts[0].label
     with pytest.raises(
         SolveError, match=r"tip position, 4 intervals: .*fails"
     ) as caught:  # too coarse, and not refined
         table_request(method=Collocation(4, degree=1, scheme="legendre", control="held"), tolerances={"tip": 0.0})
     assert str(caught.value).count("\n") == 3
+    assert (caught.value.name or "unnamed") in str(caught.value)
     assert caught.value.solution is not None
-    with pytest.raises(ProblemError, match="end must be one of rest, free"):
+    with pytest.raises(ProblemError, match="end must be 'rest' or 'free'"):
         table_request(end="middle")
 
 

@@ -217,8 +217,9 @@ def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
     ],
 )
 def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
-    with pytest.raises(ProblemError, match=words):
+    with pytest.raises(ProblemError, match=words) as caught:
         plan_minimum_time(example("quintic"), LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_joint_jerk_limit_on_a_path_whose_curvature_jumps_is_refused() -> None:

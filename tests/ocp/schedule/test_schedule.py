@@ -272,8 +272,11 @@ def test_a_slower_asked_speed_needs_no_dip() -> None:
 
 
 def test_strict_refuses_and_says_where() -> None:
-    with pytest.raises(ProblemError, match=r"2 place\(s\).*\n.* m: centripetal acceleration permits"):
+    with pytest.raises(ProblemError, match=r"2 place\(s\).*\n.* m: centripetal acceleration permits") as caught:
         schedule(example("quintic"), replace(LIMITS, centripetal=5.0), strict=True)
+    error = caught.value
+    assert f"{error.time:.6g} to " in str(error)
+    assert f"{error.name} permits {error.limit:.4g} of {error.value:.4g} m/s" in str(error)
 
 
 def test_the_last_sample_is_the_end() -> None:
@@ -287,14 +290,17 @@ def test_the_last_sample_is_the_end() -> None:
 @pytest.mark.parametrize("bad", [0.0, -1.0, NAN])
 def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> None:
     for name in ("speed", "acceleration", "jerk", "centripetal"):
-        with pytest.raises(ProblemError, match=f"{name} limit"):
+        with pytest.raises(ProblemError, match=f"{name} limit") as caught:
             replace(LIMITS, **{name: bad})  # type: ignore[arg-type]
-    for values in ((bad, 1.0, 200.0), (5.0, bad, 200.0), (5.0, 1.0, bad)):
-        with pytest.raises(ProblemError, match="positive"):
+        assert caught.value.name == name
+    for name, values in (("mean", (bad, 1.0, 200.0)), ("speed", (5.0, bad, 200.0)), ("jerk", (5.0, 1.0, bad))):
+        with pytest.raises(ProblemError, match=f"{name} must be positive") as caught:
             peak_acceleration(*values)
+        assert caught.value.name == name
     for name in ("velocity", "acceleration", "jerk"):
-        with pytest.raises(ProblemError, match=f"joint {name} limit"):
+        with pytest.raises(ProblemError, match=f"joint {name} limit") as caught:
             LineLimits(1.0, 5.0, 200.0, joints=JointLimits(**{name: [1.0, bad]}))
+        assert caught.value.name == f"joint {name}"
 
 
 @pytest.mark.parametrize(
@@ -310,8 +316,9 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
     ],
 )
 def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         replace(LIMITS, **given)
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
@@ -342,5 +349,6 @@ def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
         calls += [(call, ProblemError, r"not numeric|shape") for call in (plan.at, plan.time_at)]
         calls += [(path.at, ModelError, "distance"), (path.blend, ModelError, "vertex")]
     for call, error, message in calls:
-        with pytest.raises(error, match=message):
+        with pytest.raises(error, match=message) as caught:
             call(wrong)
+        assert vars(caught.value)["name"] in str(caught.value)

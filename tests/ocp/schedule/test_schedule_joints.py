@@ -201,10 +201,11 @@ class BrokenJoints:
 def test_joints_that_are_no_numbers_are_a_named_error(kind: str, value: Any, message: str) -> None:
     path, joints = example("quintic"), BrokenJoints(kind, value)
     plan = schedule(path, FREE)
-    with pytest.raises(ProblemError, match=message):
-        schedule(path, replace(FREE, joints=JointLimits(1.0)), joints=joints)
-    with pytest.raises(ProblemError, match=message):
-        joint_trajectory(plan, joints, 1e-3)
+    limited = replace(FREE, joints=JointLimits(1.0))
+    for call in (lambda: schedule(path, limited, joints=joints), lambda: joint_trajectory(plan, joints, 1e-3)):
+        with pytest.raises(ProblemError, match=message) as caught:
+            call()
+        assert caught.value.name == ("b" if "'b'" in message else kind)
 
 
 @pytest.mark.parametrize(
@@ -298,8 +299,9 @@ def test_a_trajectory_that_is_none_is_a_named_error(wrong: dict[str, Any], messa
     good: dict[str, Any] = {kind: np.zeros((2, 1)) for kind in ("positions", "velocities", "accelerations")}
     good |= {"names": ("a",), "t": np.array([0.0, 1.0])}
     JointTrajectory(**good).to_ros()
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         JointTrajectory(**{**good, **wrong}).to_ros()
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_file_or_message_that_is_no_trajectory_is_a_named_error(sampled: JointTrajectory, tmp_path: File) -> None:
