@@ -119,7 +119,7 @@ def roll_problem(
     for name, value in weights.items():
         if not value >= 0:
             message = f"roll_problem: {name} {value} must not be negative"
-            raise ProblemError(message, name=name, value=value, limit=(0.0, np.inf))
+            raise ProblemError(message, name=name, value=value, limit=0.0)
     checked_positive("roll_problem: clearance_width", clearance_width)
     try:
         checked_clearance(clearance)

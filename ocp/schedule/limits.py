@@ -125,7 +125,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
     if array.size == 0 or wrong.any():
         bad = float(array[wrong].flat[0]) if array.size else np.nan
         message = f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}"
-        raise ProblemError(message, name=name, value=bad, limit=(0.0, np.inf))
+        raise ProblemError(message, name=name, value=bad, limit=0.0)
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:

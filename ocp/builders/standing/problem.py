@@ -40,7 +40,7 @@ from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
-from ocp.errors import ProblemError, checked_choice
+from ocp.errors import ProblemError, checked_choice, checked_nonnegative
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
 from ocp.tasks.equations import TaskEquations, bind
@@ -81,9 +81,7 @@ class Weights:
 
     def __post_init__(self) -> None:
         for what, value in vars(self).items():
-            if not (is_finite(value) and value >= 0):
-                message = f"weights: {what} must be a finite number, zero or above, not {value!r}"
-                raise ProblemError(message, name=what, value=value, limit=(0.0, np.inf))
+            checked_nonnegative(f"weights: {what}", value)
 
 
 @dataclass(frozen=True)

@@ -256,8 +256,9 @@ def test_a_singular_start_is_planned_with_rates_and_refused_in_the_null_space_fo
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         minimum_velocity_problem(paper_example(), **{**ASKED, **changes})
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_what_is_planned_takes_what_is_declared() -> None:

@@ -484,8 +484,9 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
     arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": HORIZON, **changes}
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         standing_problem(machine(), **arguments)
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
@@ -521,8 +522,9 @@ def test_a_path_longer_than_the_arm_is_refused() -> None:
     ],
 )
 def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         make()
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_limits_that_are_lifted_do_not_hold_the_plan() -> None:

@@ -217,8 +217,9 @@ def test_a_start_at_a_limit_to_rounding_is_taken(anymal: Peered, anymal_solution
     ],
 )
 def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: dict[str, float], message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message) as caught:
         pushing.problem(changed(anymal.machine, name, **limits))
+    assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> None:
