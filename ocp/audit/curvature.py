@@ -30,6 +30,10 @@ FLAT = 1e-7
 """Curvature, relative to the largest of the plan, below which the cost counts as not curved."""
 RANK = 1e-9
 """Size of a singular value, relative to the largest, from which on constraints count as dependent."""
+STILL = 1e-3
+"""Least unit of an entry of a state, of the greatest of its entries."""
+SLIP = 1e-6
+"""What a variation that lowers the cost may miss its constraints by, relative to its size."""
 AT_BOUND = 1e-5
 """A value nearer to its bound than this share of its spread or range is held by it."""
 
@@ -201,6 +205,8 @@ class _Along:
         self.rate[np.ix_(range(m), range(nx), z_of)] = rate[:, :, into]
         self.hessian[np.ix_(range(m), z_of, z_of)] = hessian[np.ix_(range(m), into, into)]
         x_unit = self._spreads(self.x, low[places["state"]], high[places["state"]])
+        for part in form.states.values():  # an entry that stands still beside its neighbours moves by rounding alone
+            x_unit[part] = np.maximum(x_unit[part], STILL * x_unit[part].max())
         horizon = [self.solution.horizon] if self.free else []
         self.unit = np.concatenate([x_unit, horizon, *([x_unit] if self.tied else []), self.range])
         z_unit = self.unit[: self.nz]
@@ -384,6 +390,7 @@ def _sweep(along: _Along, held: bool) -> _Swept:
     stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, along.hessian.reshape(n, q, nz + nu, nz + nu), whole)
 
     cost, rows, start_cost, start_rows = _ends(along)
+    sweep = _Linearised(whole, step, stage, metric, cost, rows, start_cost)
     bends = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
     scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
     least, at, flat = np.inf, None, ""
@@ -410,7 +417,9 @@ def _sweep(along: _Along, held: bool) -> _Swept:
             if values[0] < -FLAT * scale:
                 worst = basis @ vectors[:, 0]
                 why = _singular(along, k, worst)
-                return _Swept(least, at, why, None if why else _variation(along, k, worst, gains, step, metric))
+                if why:
+                    return _Swept(least, at, why, None)
+                return _confirmed(least, at, _variation(along, sweep, k, worst, gains), scale)
             curved = values > FLAT * scale
             if not curved.all():
                 label = _label(form, basis @ vectors[:, 0], nu)
@@ -429,32 +438,72 @@ def _sweep(along: _Along, held: bool) -> _Swept:
         if values[0] / scale < least:
             least, at = float(values[0] / scale), 0.0
         if values[0] < -FLAT * scale:
-            return _Swept(least, at, "", _variation(along, 0, None, gains, step, metric, basis @ vectors[:, 0]))
+            return _confirmed(least, at, _variation(along, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
         if values[0] <= FLAT * scale:
             flat = flat or "the cost does not curve along a variation of the start"
     return _Swept(least, at, flat, None)
 
 
+class _Linearised(NamedTuple):
+    """The accessory problem of all stages: variations at the points, the step, the cost; metric; the ends."""
+
+    whole: np.ndarray
+    step: np.ndarray
+    stage: np.ndarray
+    metric: np.ndarray
+    end_cost: np.ndarray
+    end_rows: np.ndarray
+    start_cost: np.ndarray
+
+
+class _Variation(NamedTuple):
+    """A variation, twice its second variation per squared length of its controls, and how far it slips off its rows."""
+
+    controls: np.ndarray
+    states: np.ndarray
+    curvature: float
+    slip: float
+
+
 def _variation(
     along: _Along,
+    sweep: _Linearised,
     first: int,
     controls: np.ndarray | None,
     gains: list[np.ndarray],
-    step: np.ndarray,
-    metric: np.ndarray,
     start: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> _Variation:
     """A variation that begins at an interval with these controls, or at the start, then follows the best feedback."""
     (n, q), nz, nu = along.shape, along.nz, along.nu
     z = np.zeros(nz) if start is None else start
     states, values = np.zeros((n + 1, nz)), np.zeros((n, q * nu))
+    cost, slips = float(z @ sweep.start_cost @ z), [0.0]
     for k in range(first, n):
         states[k] = z
         values[k] = controls if controls is not None and k == first else gains[n - 1 - k] @ z
-        z = step[k] @ np.concatenate([z, values[k]])
+        both = np.concatenate([z, values[k]])
+        cost += float(both @ sweep.stage[k] @ both)
+        slips += [np.abs(along.rows[k * q + j] @ sweep.whole[k, j] @ both).max(initial=0.0) for j in range(q)]
+        z = sweep.step[k] @ both
     states[n] = z
-    values /= np.repeat(metric, nu, axis=1)
-    return values.reshape(n * q, nu) * along.range, states[:, : along.nx] * along.unit[: along.nx]
+    cost += float(z @ sweep.end_cost @ z)
+    slips.append(np.abs(sweep.end_rows @ z).max(initial=0.0))
+    size = max(float(np.abs(states).max()), float(np.abs(values).max()))
+    length = float(np.sum(values**2) + (0.0 if start is None else start @ start))
+    values /= np.repeat(sweep.metric, nu, axis=1)
+    shown = values.reshape(n * q, nu) * along.range, states[:, : along.nx] * along.unit[: along.nx]
+    return _Variation(*shown, cost / length, max(slips) / size)
+
+
+def _confirmed(least: float, at: float | None, found: _Variation, scale: float) -> _Swept:
+    """A negative curvature is believed where the variation itself shows it: its cost falls and its constraints hold.
+
+    Conditions at the ends that path constraints imply already are dependent up to the error of the plan, and what is
+    left over of them then is no freedom.
+    """
+    if found.curvature < -FLAT * scale and found.slip < SLIP:
+        return _Swept(least, at, "", (found.controls, found.states))
+    return _Swept(least, at, f"constraints are nearly dependent at {at or 0.0:.4g} s", None)
 
 
 def _singular(along: _Along, k: int, controls: np.ndarray) -> str:
