@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ocp.audit.accessory import FLAT
 from ocp.audit.costates import Adjoint, adjoint
-from ocp.audit.curvature import FLAT, Curvature, curvature
+from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.principle import Optimality, minimum_principle
 from ocp.audit.reintegration import Reintegration, reintegrate, violations
 from ocp.curves import PiecewisePolynomial
