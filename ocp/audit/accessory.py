@@ -7,6 +7,7 @@ Gauss collocation of its own, three points or more in each interval whatever the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -26,7 +27,7 @@ FLAT = 1e-7
 RANK = 1e-9
 """Size of a singular value, relative to the largest, from which on constraints count as dependent."""
 STILL = 1e-3
-"""Least unit of an entry of a state, of the greatest of its entries."""
+"""Least unit of an entry of a state or control, of the greatest of its entries."""
 AT_BOUND = 1e-5
 """A value nearer to its bound than this share of its spread or range is held by it."""
 
@@ -103,7 +104,7 @@ class AccessoryProblem:
         # multipliers of what holds the controls: least squares with the signs of the minimum principle
         at = [places["control"], form.path.bounds]
         self.low, self.high = low[places["control"]], high[places["control"]]
-        self.range = self._spreads(self.u, self.low, self.high)
+        self.range = _units(self._spreads(self.u, self.low, self.high), form.controls)
         mixed = form.path.uses_control
         reach = np.concatenate([self.range, self._spreads(level, low[at[1]], high[at[1]])])
         values = np.hstack([self.u, level])
@@ -136,9 +137,7 @@ class AccessoryProblem:
         self.rate, self.hessian = np.zeros((m, self.nz, size)), np.zeros((m, size, size))
         self.rate[np.ix_(range(m), range(nx), z_of)] = rate[:, :, into]
         self.hessian[np.ix_(range(m), z_of, z_of)] = hessian[np.ix_(range(m), into, into)]
-        x_unit = self._spreads(self.x, low[places["state"]], high[places["state"]])
-        for part in form.states.values():  # an entry that stands still beside its neighbours moves by rounding alone
-            x_unit[part] = np.maximum(x_unit[part], STILL * x_unit[part].max())
+        x_unit = _units(self._spreads(self.x, low[places["state"]], high[places["state"]]), form.states)
         horizon = [self.solution.horizon] if self.free else []
         self.unit = np.concatenate([x_unit, horizon, *([x_unit] if self.tied else []), self.range])
         z_unit = self.unit[: self.nz]
@@ -175,6 +174,13 @@ class AccessoryProblem:
             rows = self.rows[k][:, self.nz :] / self.range
             won[k] = _won(slope, curved, self.low - self.u[k], self.high - self.u[k], rows)
         return float(np.dot(weights, won))
+
+
+def _units(spreads: np.ndarray, parts: Mapping[str, slice]) -> np.ndarray:
+    """Spreads of entries, of each named part none much below its greatest: one that stands still moves by rounding."""
+    for part in parts.values():
+        spreads[part] = np.maximum(spreads[part], STILL * spreads[part].max())
+    return spreads
 
 
 def _won(slope: np.ndarray, curved: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray) -> float:

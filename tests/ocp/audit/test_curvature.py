@@ -265,3 +265,16 @@ def test_the_long_way_round_a_sphere_is_none(turn: float, verdict: bool) -> None
     plan = solve(pan_tilt(turn), METHOD, guess=guess)
     assert np.abs(plan["tilt"]).max() < 1e-6
     assert plan.audit().passed is verdict
+
+
+def test_an_entry_that_stands_still_is_curved_as_its_neighbours_are() -> None:
+    """The wrist that no task moves: its rate is rounding, and its cost curves upwards all the same."""
+    problem = Problem("wrist")
+    q = problem.state("q", 2, initial=np.zeros(2), terminal=[1.0, np.nan])
+    rates = problem.control("rates", 2)
+    problem.dynamics(q, rates + 1e-17 * ca.sin(7 * problem.time))
+    problem.horizon(1.0)
+    problem.minimize(ca.sumsqr(rates) * (1 + q[0] ** 2))
+    solution, found = look(problem)
+    assert np.abs(solution["rates"][:, 1]).max() < 1e-9
+    assert found.upwards is True
