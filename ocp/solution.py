@@ -269,14 +269,7 @@ def check_belongs(form: Places, solution: Solution) -> None:
 
 
 def in_order_of(form: Places, solution: Solution) -> Solution:
-    """The same plan with its states and controls, which interpolants hold by position, in the order of a problem.
-
-    Raises:
-        ProblemError: Its costates are not those of its states.
-    """
-    if set(solution.costates) != set(solution.states):
-        words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
-        raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
+    """The same plan with its states and controls, which interpolants hold by position, in the order of a problem."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
@@ -307,11 +300,12 @@ def check_structure(solution: Solution) -> None:
             raise refuse(name, f"is no real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}")
         return array
 
-    for name in ("horizon", "cost"):
-        if isinstance(getattr(solution, name), bool) or not isinstance(
-            getattr(solution, name), int | float | np.number
-        ):
-            raise refuse(name, f"is no number: {getattr(solution, name)!r}")
+    if set(solution.costates) != set(solution.states):
+        words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
+        raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
+    for name, number in (("horizon", solution.horizon), ("cost", solution.cost)):
+        if isinstance(number, bool) or not isinstance(number, int | float | np.number):
+            raise refuse(name, f"is no number: {number!r}")
     if not isinstance(solution.success, bool | np.bool_):
         raise refuse("success", f"is neither True nor False: {solution.success!r}")
     if not 0 < solution.horizon < np.inf:

@@ -144,9 +144,9 @@ def audit(
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
             raise ProblemError(words, name=name, value=limit)
     form = Formulation(problem)
+    check_structure(solution)
     check_belongs(form, solution)
     solution = in_order_of(form, solution)
-    check_structure(solution)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     points = max(solution.state_interpolant.values.shape[1] - 1, 1)

@@ -523,6 +523,7 @@ def test_a_plan_is_read_by_the_names_of_its_states() -> None:
         ("success", lambda _: "no", "success"),
         ("cost", lambda _: "cheap", "cost"),
         ("states", lambda pool: {name: values[1:] for name, values in pool.items()}, "state 'a'"),
+        ("states", lambda pool: {name: values[:, 0] for name, values in pool.items()}, "state 'a'"),
         ("states", lambda pool: {name: values + 0j for name, values in pool.items()}, "state 'a'"),
         ("state_interpolant", lambda curve: replace(curve, breaks=curve.breaks / 2), "state_interpolant.breaks"),
         ("control_interpolant", lambda curve: replace(curve, nodes=curve.nodes[::-1]), "control_interpolant.nodes"),
