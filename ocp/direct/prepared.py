@@ -6,6 +6,7 @@ import dataclasses
 import os
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -25,7 +26,7 @@ from ocp.solution import ByName, Guess, Solution
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 
-class DirectMethod:
+class DirectMethod(ABC):
     """A direct method: turns a problem into a nonlinear program on a mesh of intervals.
 
     Attributes:
@@ -39,13 +40,13 @@ class DirectMethod:
     mesh: tuple[float, ...] | None
 
     @property
+    @abstractmethod
     def order(self) -> int:
         """Power of the width with which the integration error of one interval falls."""
-        raise NotImplementedError
 
+    @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
-        raise NotImplementedError
 
     def prepare(
         self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
