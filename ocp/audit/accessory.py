@@ -124,6 +124,11 @@ class AccessoryProblem:
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
+    @property
+    def magnitude(self) -> float:
+        """What the cost curves by over the whole controls, in units of cost."""
+        return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
+
     def _hold(self) -> None:
         """Which limits take directions away: those that push, and those that are only touched."""
         along, m = self.along, len(self.along.s)
@@ -169,7 +174,7 @@ class AccessoryProblem:
             step = along.high[0, i] - along.low[0, i]
             whole = fixed[:, :, i].all(axis=1)
             for k in np.flatnonzero(~whole):
-                before, after = (j for j in (max(k - 1, 0), min(k + 1, n - 1)))
+                before, after = max(int(k) - 1, 0), min(int(k) + 1, n - 1)
                 near = slice(before, after + 1)
                 steep = np.polynomial.polynomial.polyfit(at[near].ravel(), pull[near, :, i].ravel(), 1)[1]
                 rise = u[after, -1, i] - u[before, 0, i]

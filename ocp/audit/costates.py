@@ -83,12 +83,14 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
-    near, at_node = along.stand.near.reshape(n, -1).any(axis=1), along.node_stand.near.any(axis=1)
+    near, at_node = (
+        np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
+    )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
     holding = holders(along, costate)
     for _ in range(ROUNDS):
         back = _Backwards(along, holding)
-        for k in limited:
+        for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
         holding = holders(along, costate)
@@ -102,9 +104,8 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
     standing[:, 0] += atoms[:, 0] / places[:, 0]
     standing[:, -1] += atoms[:, 1] / places[:, -1]
     force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.stand_x[..., :-1].reshape(n, q, m, -1))) @ size
-    for e, k in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        push = np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[k, :, :-1])) @ size
-        force[:, 0] += push
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[nodes, :, :-1])) @ size
     return Adjoint(
         along.mesh * along.solution.horizon,
         costate,
@@ -298,8 +299,8 @@ def _ends(
     lasting = float(along.share @ by_horizon)
     n, q = along.shape
     lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
-    for e, k in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        lasting += float(np.sum(atoms[:, e] * along.node_stand_x[k, :, nx]))
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        lasting += float(np.sum(atoms[:, e] * along.node_stand_x[nodes, :, nx]))
     target = np.concatenate([lam1 - gradient[:nx, 0], -lam0 - gradient[nx : 2 * nx, 0], [-lasting - gradient[-1, 0]]])
     unit = np.concatenate([sizes.state, sizes.state, [solution.horizon]])
 
@@ -338,9 +339,9 @@ def _ends(
     left = np.zeros(2 * nx + 1)
     left[free] = np.abs((target * unit)[free] - matrix @ found)
     multipliers = np.zeros(len(index))
-    for (own, scale), force in zip(owners, found, strict=True):
-        if own >= 0:
-            multipliers[own] += scale * force
+    for (owner, scale), force in zip(owners, found, strict=True):
+        if owner >= 0:
+            multipliers[owner] += scale * force
     charge = float(np.dot(charges, found)) if charges else 0.0
     cut = len(form.end)
     return Ends(float(left[:-1].sum()), float(left[-1]), charge, multipliers[:cut], multipliers[cut:])

@@ -16,6 +16,7 @@ import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
 from ocp.audit.principle import FLAT
+from ocp.problem.formulation import Formulation
 
 __all__ = ["Curvature", "curvature"]
 

@@ -8,6 +8,7 @@ that dx/ds = T f, and a change of the horizon T is a change of the integrands.
 from __future__ import annotations
 
 from copy import copy
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -51,7 +52,7 @@ class Limits:
     @property
     def near(self) -> np.ndarray:
         """Which may push on either side. Shape (M, m), bool."""
-        return self.lower | self.upper
+        return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
         """What multipliers (M, m) win over the gaps to their limits: at least zero. Shape (M, m)."""
@@ -112,7 +113,7 @@ class Linearisation:
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
 
     @property
-    def here(self) -> tuple[object, ...]:
+    def here(self) -> tuple[Any, ...]:
         """The arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
@@ -178,5 +179,3 @@ def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     at, weight = np.polynomial.legendre.leggauss(len(places))
     matrix = [c / 2 * weight @ lagrange(places, c * (at + 1) / 2) for c in places]
     return np.array(matrix), quadrature_weights(places)
-
-

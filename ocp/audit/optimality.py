@@ -21,6 +21,10 @@ CONTROLS_KNOWN = 1e-3
 """Share of their sizes up to which controls are told apart, where the cost itself is nearly nothing."""
 
 
+ROUNDING = 1e-12
+"""Share of what the controls themselves would cost, below which costates are rounding."""
+
+
 @dataclass(frozen=True)
 class Optimality:
     """First and second order conditions along a plan.
@@ -63,7 +67,7 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     return Optimality(
         total,
         cost,
-        float(np.sqrt(cost * max(cost, spread))),
+        max(float(np.sqrt(cost * max(cost, spread))), ROUNDING * accessory.magnitude),
         along.t,
         reduced_slope(along, first.costate, first.holding),
         first,
@@ -79,7 +83,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
     ends = Ends(np.inf, np.inf, np.inf, np.zeros(len(form.end)), np.zeros(len(form.start)))
     t = along.mesh * along.solution.horizon
     shapes = form.nx, along.hold_u.shape[1], along.stand_x.shape[1]
-    parts = [np.full((m, k), np.nan) for k in shapes]
+    costate, holding, standing = (np.full((m, k), np.nan) for k in shapes)
     curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
     return Optimality(
         nothing,
@@ -87,7 +91,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         1.0,
         along.t,
         np.full(m, np.inf),
-        Adjoint(t, *parts, error=nothing, between=nothing, charge=nothing, ends=ends),
+        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, ends),
         values,
         curved,
     )
