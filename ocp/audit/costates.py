@@ -89,12 +89,14 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
     holding = holders(along, costate)
     for _ in range(ROUNDS):
+        before = holding != 0
         back = Backwards(along, holding)
         for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
+        along.follow((inside != 0).any(axis=1) | (atoms != 0).any(axis=1))
         costate, start = back.integrate(last, inside, atoms)
         holding = holders(along, costate)
-        if not (limited.size or along.mixed.size):
+        if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():
             break
     size = along.sizes.state
     places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
@@ -147,7 +149,12 @@ class Backwards:
             self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
                 # multipliers = - inverse (unit slope): the costate equation has them as a feedback of the costate
-                answer = np.einsum("kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu:]) * unit
+                answer = (
+                    np.einsum(
+                        "kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu : nu + along.mixed.size]
+                    )
+                    * unit
+                )
                 feed[held] -= answer @ rate_u[held].transpose(0, 2, 1)
                 given[held] -= np.einsum("kiu,ku->ki", answer, along.cost_y[held, nx + 1 :])
         ahead = along.weight - along.matrix  # of the integral from a point to the end
@@ -185,15 +192,18 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     size, unit = along.sizes.state, along.sizes.control
     limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
     slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
-    columns, charges, owners = [], [], []
+    columns, charges, owners, free = [], [], [], []
     for kind, (limit, slope_x) in enumerate(zip(limits, slopes, strict=True)):
-        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower, limit.below, -1.0)):
+        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower & ~limit.equal, limit.below, -1.0)):
             for j, i in zip(*np.nonzero(side), strict=True):
                 reach = float(np.abs(slope_x[j, i]) @ size)
-                if reach > 0:
+                # an equality pushes where a transcription holds it: one unknown for each of its own
+                elsewhere = limit.equal[i] and (kind, j) != (1, 0) if along.nodal else limit.equal[i] and kind == 1
+                if reach > 0 and not elsewhere:
                     columns.append((kind, j, sign * slope_x[j, i] / reach))
                     charges.append(gap[j, i] / reach)
                     owners.append((kind, j, i, sign / reach))
+                    free.append(bool(limit.equal[i]))
     inside, atoms = np.zeros((q, m)), np.zeros((2, m))
     if not columns:
         return inside, atoms
@@ -222,36 +232,45 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     slopes_c = np.einsum("j,juv,cjv->cju", weight, held, unit * np.einsum("jiu,cji->cju", rate_u, answer))
     target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
     matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    found = nonnegative(matrix, target, TRUSTED * np.array(charges)) * cost
+    found = nonnegative(matrix, target, TRUSTED * np.array(charges), np.array(free, bool)) * cost
     for (kind, j, i, scale), value in zip(owners, found, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
 
 
-def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """The y >= 0 (m,) of least |matrix y - target|^2 / 2 + price . y, by active sets (Lawson, Hanson 1974, ch 23)."""
-    m = matrix.shape[1]
-    y, passive = np.zeros(m), np.zeros(m, bool)
+def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The y (m,) of least |matrix y - target|^2 / 2 + price . y, at least zero but where it is ``free`` (m,), bool.
+
+    By active sets (Lawson, Hanson 1974, chapter 23); of the free ones the least that do it.
+    """
+    y = np.zeros(matrix.shape[1])
+    bound = ~free
+    if free.any():
+        inverse = np.linalg.pinv(matrix[:, free], rcond=DEPENDENT)
+        rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
+        left = target - matrix[:, free] @ (inverse @ target)
+        y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
+        y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
+        return y
     normal, right = matrix.T @ matrix, matrix.T @ target - price
+    passive = np.zeros(len(y), bool)
     small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
-    for _ in range(3 * m + 10):
+    for _ in range(3 * len(y)):
         pull = np.where(passive, -np.inf, right - normal @ y)
-        if not m or pull.max() <= small:
+        if pull.max() <= small:
             break
-        passive[int(np.argmax(pull))] = True
+        passive[np.argmax(pull)] = True
         while True:
             index = np.flatnonzero(passive)
             best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
-            if (best > 0).all():
-                y[:] = 0.0
+            falling = best <= 0
+            if not falling.any():
                 y[index] = best
                 break
-            falling = best <= 0
-            share = np.min(y[index][falling] / (y[index][falling] - best[falling] + np.finfo(float).tiny))
-            y[index] += min(max(share, 0.0), 1.0) * (best - y[index])
-            drop = index[(y[index] <= 1e-15 * np.abs(y).max(initial=0.0)) & falling]
-            if not drop.size:
-                drop = index[falling][:1]
+            ratio = y[index][falling] / np.maximum(y[index][falling] - best[falling], np.finfo(float).tiny)
+            y[index] += float(np.clip(ratio.min(), 0.0, 1.0)) * (best - y[index])
+            drop = index[falling & (y[index] <= 1e-15 * np.abs(y).max())]
+            drop = drop if drop.size else index[falling][:1]
             y[drop], passive[drop] = 0.0, False
     return y
 
@@ -293,7 +312,9 @@ def _ends(
     value, slopes, gradient = (np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, along.p))
     # dT H/dT along the plan, what pushes included
     by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
-    by_horizon += np.einsum("km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu :])
+    by_horizon += np.einsum(
+        "km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu : form.nu + along.mixed.size]
+    )
     lasting = float(along.share @ by_horizon)
     n, q = along.shape
     lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
@@ -310,7 +331,7 @@ def _ends(
     at_horizon = Limits(
         np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
     )
-    columns, charges, owners = [], [], []
+    columns, charges, owners, unsigned = [], [], [], []
     eye = np.eye(2 * nx + 1)
     node = along.node_stand
     into = [*range(nx), 2 * nx], [*range(nx, 2 * nx), 2 * nx]
@@ -321,19 +342,23 @@ def _ends(
         wide[:, where] = along.node_stand_x[k]
         parts.append((node.at(slice(k, k + 1)), wide, np.full(len(wide), -1)))
     for limit, slope_y, own in parts:
-        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (limit.lower[0], limit.below[0], -1.0)):
+        lower = limit.lower[0] & ~limit.equal
+        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (lower, limit.below[0], -1.0)):
             for i in np.flatnonzero(side):
                 reach = float(np.abs(slope_y[i]) @ unit)
                 if reach > 0:
                     columns.append(sign * slope_y[i] / reach)
                     charges.append(gap[i] / reach)
                     owners.append((int(own[i]), sign / reach))
+                    unsigned.append(bool(limit.equal[i]))
     free = np.ones(2 * nx + 1, bool)
     free[:nx] = low[places["terminal"]] < high[places["terminal"]]
     free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
     free[-1] = form.horizon_is_free
     matrix = (np.array(columns).reshape(len(columns), 2 * nx + 1) * unit).T[free]
-    found = nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges)) * cost
+    found = (
+        nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges), np.array(unsigned, bool)) * cost
+    )
     left = np.zeros(2 * nx + 1)
     left[free] = np.abs((target * unit)[free] - matrix @ found)
     multipliers = np.zeros(len(index))

@@ -144,7 +144,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
     size = np.abs(along.hold_u * unit).max(axis=2)
     pushes = (np.abs(multipliers) * size > FLAT * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
-    fixed = pushes.copy()
+    fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
     best = np.zeros(len(won))
     while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
         blocked = fixed.copy()
