@@ -19,11 +19,11 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import DEPENDENT, holders
+from ocp.audit.principle import DEPENDENT, holders, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "Backwards", "Ends", "adjoint", "nonnegative"]
+__all__ = ["Adjoint", "Backwards", "Ends", "adjoint"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -74,11 +74,13 @@ class Adjoint:
     ends: Ends
 
 
-def adjoint(along: Linearisation, cost: float) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float) -> Adjoint:
     """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
 
     Args:
-        along: The plan. cost: A size of the cost, which errors are weighed by.
+        along: The plan.
+        curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
+        cost: A size of the cost, which errors are weighed by.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
@@ -87,15 +89,15 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
         np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
     )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
-    holding = holders(along, costate)
+    holding, across = holders(along, costate, curved)
     for _ in range(ROUNDS):
         before = holding != 0
-        back = Backwards(along, holding)
+        back = Backwards(along, holding, across)
         for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
         along.follow((inside != 0).any(axis=1) | (atoms != 0).any(axis=1))
         costate, start = back.integrate(last, inside, atoms)
-        holding = holders(along, costate)
+        holding, across = holders(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():
             break
     size = along.sizes.state
@@ -133,13 +135,13 @@ def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
 class Backwards:
     """The costate equation over every interval backwards, what holds the controls answering to the costates."""
 
-    def __init__(self, along: Linearisation, holding: np.ndarray) -> None:
+    def __init__(self, along: Linearisation, holding: np.ndarray, across: np.ndarray) -> None:
         self.along = along
         n, q = along.shape
         nx, nu = along.form.nx, along.form.nu
         rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
         feed, given = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
-        unit = along.sizes.control
+        unit, mixed = along.sizes.control, slice(nu, nu + along.mixed.size)
         pushing = holding != 0
         self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
         held = np.flatnonzero(pushing.any(axis=1))
@@ -148,13 +150,11 @@ class Backwards:
             inverse = np.linalg.pinv(rows.transpose(0, 2, 1), rcond=DEPENDENT)
             self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
+                given += np.einsum("km,kmi->ki", holding[:, mixed] * across[:, None], along.row_y[:, along.mixed, :nx])
+                held, inverse = held[~across[held]], inverse[~across[held]]
                 # multipliers = - inverse (unit slope): the costate equation has them as a feedback of the costate
-                answer = (
-                    np.einsum(
-                        "kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu : nu + along.mixed.size]
-                    )
-                    * unit
-                )
+                slopes = along.row_y[held][:, along.mixed, :nx]
+                answer = np.einsum("kmi,kmu->kiu", slopes, inverse[:, mixed]) * unit
                 feed[held] -= answer @ rate_u[held].transpose(0, 2, 1)
                 given[held] -= np.einsum("kiu,ku->ki", answer, along.cost_y[held, nx + 1 :])
         ahead = along.weight - along.matrix  # of the integral from a point to the end
@@ -236,43 +236,6 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     for (kind, j, i, scale), value in zip(owners, found, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
-
-
-def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The y (m,) of least |matrix y - target|^2 / 2 + price . y, at least zero but where it is ``free`` (m,), bool.
-
-    By active sets (Lawson, Hanson 1974, chapter 23); of the free ones the least that do it.
-    """
-    y = np.zeros(matrix.shape[1])
-    bound = ~free
-    if free.any():
-        inverse = np.linalg.pinv(matrix[:, free], rcond=DEPENDENT)
-        rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
-        left = target - matrix[:, free] @ (inverse @ target)
-        y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
-        y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
-        return y
-    normal, right = matrix.T @ matrix, matrix.T @ target - price
-    passive = np.zeros(len(y), bool)
-    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
-    for _ in range(3 * len(y)):
-        pull = np.where(passive, -np.inf, right - normal @ y)
-        if pull.max() <= small:
-            break
-        passive[np.argmax(pull)] = True
-        while True:
-            index = np.flatnonzero(passive)
-            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
-            falling = best <= 0
-            if not falling.any():
-                y[index] = best
-                break
-            ratio = y[index][falling] / np.maximum(y[index][falling] - best[falling], np.finfo(float).tiny)
-            y[index] += float(np.clip(ratio.min(), 0.0, 1.0)) * (best - y[index])
-            drop = index[falling & (y[index] <= 1e-15 * np.abs(y).max())]
-            drop = drop if drop.size else index[falling][:1]
-            y[drop], passive[drop] = 0.0, False
-    return y
 
 
 def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem
@@ -58,7 +59,7 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
     size = abs(solution.cost) or along.slope_size or 1.0
-    first = adjoint(along, size)
+    first = adjoint(along, _curved(along), size)
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
     cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
@@ -66,7 +67,7 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     total = lost(along, first.costate, first.holding, accessory.curved)
     if accessory.flat.any() and total.sum() > DEGENERATE * cost:
         costate = better_costates(along, first.costate, first.holding, accessory.flat)
-        less = lost(along, costate, holders(along, costate), accessory.curved)
+        less = lost(along, costate, holders(along, costate, accessory.curved)[0], accessory.curved)
         total = min(total, less, key=np.sum)
     total = np.maximum(total, 0.0) + first.charge
     total[0] += first.ends.charge
@@ -81,6 +82,17 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
         hamiltonian(form, solution, p),
         second,
     )
+
+
+def _curved(along: Linearisation) -> np.ndarray | None:
+    """T H_uu at the points but for its path constraints, (M, nu, nu), where an inequality with a control needs it."""
+    form = along.form
+    if form.path.equality[along.mixed].all():
+        return None
+    lam = form.sym("lam", form.nx)
+    total = along.scaled[0] + ca.dot(lam, along.scaled[1])
+    (curved,) = form.sampled([ca.hessian(total, form.u)[0]], *along.here, (lam, along.costate))
+    return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
