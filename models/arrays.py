@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import isfinite, isnan
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -54,20 +55,12 @@ def checked_array(
             `name` is `what`.
     """
     array = _read(value, owner, what)
-    if array.ndim == 0 and len(shape) == 1 and isinstance(shape[0], str):
-        array = array.reshape(1)
-    fits = array.ndim == len(shape) and all(
-        size >= least if isinstance(wanted, str) else size == wanted
-        for size, wanted in zip(array.shape, shape, strict=True)
-    )
-    if not fits:
-        expected = str(shape).replace("'", "")
-        hint = f", {least} at least" if any(isinstance(wanted, str) for wanted in shape) else ""
-        message = f"{owner}: {what} has shape {array.shape}, expected {expected}{hint}"
-        raise ModelError(message, name=what, value=array, limit=shape)
-    wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
-    if wrong.any():
-        raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
+    if array.shape != shape:
+        array = _shaped(array, shape, owner, what, least)
+    if not np.isfinite(array).all():
+        wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
+        if wrong.any():
+            raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
     if positive and not (array > 0).all():
         shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
         raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
@@ -79,6 +72,22 @@ def _read(value: ArrayInput, owner: str, what: str) -> Array:
         return np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise ModelError(f"{owner}: {what} {value!r} is not numeric", name=what, value=value) from error
+
+
+def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, what: str, least: int) -> Array:
+    """The array itself, or a bare number as a list of one, where it fits a shape that names free dimensions."""
+    if array.ndim == 0 and len(shape) == 1 and isinstance(shape[0], str):
+        array = array.reshape(1)
+    fits = array.ndim == len(shape) and all(
+        size >= least if isinstance(wanted, str) else size == wanted
+        for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("'", "")
+        hint = f", {least} at least" if any(isinstance(wanted, str) for wanted in shape) else ""
+        message = f"{owner}: {what} has shape {array.shape}, expected {expected}{hint}"
+        raise ModelError(message, name=what, value=array, limit=shape)
+    return array
 
 
 def _shown(array: Array, wrong: Any, what: str) -> str:
@@ -96,6 +105,8 @@ def checked_number(
     value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
 ) -> float:
     """`value` as a float; arguments and errors as of checked_array."""
+    if isinstance(value, float) and (isfinite(value) or not (finite or isnan(value))) and (value > 0 or not positive):
+        return float(value)  # nothing to say, and no array needed: a robot has hundreds of numbers
     return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
 
 
