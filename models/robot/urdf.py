@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
+from math import cos, isfinite, sin
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 from warnings import warn
@@ -229,13 +230,13 @@ def _contents(source: Source) -> str:
 
 def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
     links, refused = [], []
-    for element in tree.findall("link"):
-        link = _link(element)
+    for said in map(_said_of_link, tree.findall("link")):
         try:
-            link = replace(link, any_inertia=False)
+            links.append(Link(**said))
+            continue
         except ModelError as error:
             refused.append(str(error))
-        links.append(link)
+        links.append(Link(**said, any_inertia=True))  # raises what is wrong beside the inertia
     if refused and rule == "warn":
         warn(
             f"inertias that no body can have are taken as given: {'; '.join(refused)}. Correct the file, or have no "
@@ -248,19 +249,20 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
     return tuple(links)
 
 
-def _link(element: ElementTree.Element) -> Link:
+def _said_of_link(element: ElementTree.Element) -> dict[str, Any]:
+    """Attributes of Link, by name."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes = tuple(_shape(each, owner) for each in element.findall("collision"))
     body = _only(element, "inertial", owner)
     if body is None:
-        return Link(name, collisions=shapes)
+        return {"name": name, "collisions": shapes}
     center, turn = origin_of(body, owner)
     mass = number_of(child_of(body, "mass", owner), "value", owner)
     given = child_of(body, "inertia", owner)
     xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in MOMENTS)
     inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return Link(name, mass, center, inertia, any_inertia=True, collisions=shapes)
+    return {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia, "collisions": shapes}
 
 
 def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
@@ -340,7 +342,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
     if origin is not None:
         shift = numbers_of(origin, "xyz", owner, 3) if "xyz" in origin.attrib else shift
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)  # in numbers: a file has hundreds
+    (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in angles.tolist())  # a file has hundreds
     turn = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
@@ -380,23 +382,32 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """An attribute of one number; ModelError naming `owner` otherwise."""
-    return float(numbers_of(element, key, owner, 1)[0])
+    """An attribute of one number, inf and nan among them; ModelError naming `owner` otherwise."""
+    return _numbers(element, key, owner, 1)[0]
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """An attribute of `count` numbers, shape (count,); ModelError naming `owner` otherwise."""
+    """An attribute of `count` finite numbers, shape (count,); ModelError naming `owner` otherwise."""
+    values = _numbers(element, key, owner, count)
+    if not all(map(isfinite, values)):
+        raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))
+    return np.array(values)
+
+
+def _numbers(element: ElementTree.Element, key: str, owner: str, count: int) -> list[float]:
     text = text_of(element, key, owner)
-    words, where = text.split(), f"{owner}: {key}={text!r} of <{element.tag}>"
     try:
         if "_" in text:  # Python would read 1_0 as ten
             raise ValueError
-        values = np.array([float(word) for word in words])
+        values = [float(word) for word in text.split()]
     except ValueError:
         hint = f": {XACRO}" if "${" in text or "$(" in text else ""
-        raise ModelError(f"{where} is not numeric{hint}", name=key, value=text) from None
-    if count > 1 and not np.isfinite(values).all():
-        raise ModelError(f"{where} is not finite", name=key, value=text)
-    if values.size != count:
-        raise ModelError(f"{where} has {values.size} numbers, not {count}", name=key, value=text, limit=count)
+        raise ModelError(f"{_where(element, key, owner)} is not numeric{hint}", name=key, value=text) from None
+    if len(values) != count:
+        message = f"{_where(element, key, owner)} has {len(values)} numbers, not {count}"
+        raise ModelError(message, name=key, value=text, limit=count)
     return values
+
+
+def _where(element: ElementTree.Element, key: str, owner: str) -> str:
+    return f"{owner}: {key}={element.get(key)!r} of <{element.tag}>"
