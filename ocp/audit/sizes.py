@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ocp.problem.formulation import Bounds, Formulation, Rows
@@ -69,6 +70,7 @@ class Sizes:
     Attributes:
         state, control: Of every entry; the entries of one named vector share the largest. Shape (nx,), (nu,).
         path, start, end: Of every constraint row. Shape (rows,).
+        cost: The integral of the running cost's absolute value, not below a millionth of what the cost is made of.
     """
 
     state: np.ndarray
@@ -76,6 +78,7 @@ class Sizes:
     path: np.ndarray
     start: np.ndarray
     end: np.ndarray
+    cost: float
 
 
 def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Sizes:
@@ -99,8 +102,21 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
     declared = _of(bounds, places["control"])
     control, acts = _sizes_of(form.controls.values(), grid.controls, declared, [])
     entries = np.concatenate([state, control]), np.concatenate([moves, acts])
-    rows = [_rows_of(form, kind, grid, horizon, p, bounds, entries) for kind in ("path", "start", "end")]
-    return Sizes(state, control, *rows)
+    path, start, end = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("path", "start", "end"))
+    running = form.sampled([form.running], grid.states, grid.controls, grid.t, horizon, p)[0][:, 0]
+    parts = np.where(np.isfinite(running), np.abs(running), 0.0)
+    spent = float(np.sum(np.diff(grid.t) * (parts[:-1] + parts[1:]) / 2))
+    made_of = [
+        _made_of(form, what, grid, at, horizon, p, entries)[0][0]
+        for what, at in ((form.running, spaced(grid)), (form.terminal, spaced(grid)[-1:]))
+    ]
+    return Sizes(state, control, path, start, end, max(spent, FLOOR * (horizon * made_of[0] + made_of[1])))
+
+
+def spaced(grid: FineGrid) -> np.ndarray:
+    """Some of the samples of a grid, from its first to its last."""
+    last = len(grid.t) - 1
+    return np.linspace(0, last, min(PLACES, last + 1)).astype(int)
 
 
 def _of(bounds: Bounds, index: np.ndarray) -> Bounds:
@@ -154,30 +170,10 @@ def _rows_of(
     rows: Rows = getattr(form, kind)
     if len(rows) == 0:
         return np.zeros(0)
-    last = len(grid.t) - 1
-    spaced = np.linspace(0, last, min(PLACES, last + 1)).astype(int)
-    picked = {"path": spaced, "start": spaced[:1], "end": spaced[-1:]}[kind]
-
-    entry, moves = (
-        np.concatenate([part, part]) for part in entries
-    )  # of the states and controls there, and of those at the start
-    both = form.nx + form.nu
-    used = 2 * both if kind == "end" and form.ties_ends else both
-    steps = np.vstack([np.zeros(2 * both), *(s * np.diag(entry)[:used] for s in (1.0, -1.0))])
-    at = np.tile(picked, len(steps))
-    x, u = grid.states[at], grid.controls[at]
-    first = np.broadcast_to(np.concatenate([grid.states[0], grid.controls[0]]), (len(at), both))
-    columns = np.hstack([x, u, first]) + np.repeat(steps, len(picked), axis=0)
-    x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
-    more = (form.x0, x0), (form.u0, u0)
-    g = form.sampled([rows.expression], x, u, grid.t[at], horizon, p, *more)[0].reshape(len(steps), len(picked), -1)
-    change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0)).max(axis=1).reshape(2, used, -1).max(axis=0)
-    own, largest = _spread(g[0])
+    picked = {"path": spaced(grid), "start": spaced(grid)[:1], "end": spaced(grid)[-1:]}[kind]
+    made_of, moved, own, largest = _made_of(form, rows.expression, grid, picked, horizon, p, entries)
     if kind == "path":
         own, largest = _spread(form.sampled([rows.expression], grid.states, grid.controls, grid.t, horizon, p)[0])
-    told, every = change[moves[:used]].sum(axis=0), change.sum(axis=0)
-    moved = told > ROUNDING * every
-    made_of = np.where(moved, told, every)
     size = np.maximum(np.maximum(own, made_of), FLOOR * largest)
     sides = np.abs(np.array(_of(bounds, rows.bounds)))
     bound = np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0)
@@ -186,3 +182,32 @@ def _rows_of(
         mine = rows.of(name)
         size[mine] = _floored(size[mine], unknown[mine], np.minimum(1.0, bound[mine]), still[mine])[0]
     return np.asarray(size)
+
+
+def _made_of(
+    form: Formulation,
+    expression: Any,
+    grid: FineGrid,
+    picked: np.ndarray,
+    horizon: float,
+    p: np.ndarray,
+    entries: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each row of an expression at some samples: the sum of its changes where one entry alone moves by its size.
+
+    And whether anything that moves is in it, its spread, and its largest absolute value. Shape (rows,) each.
+    """
+    entry, moves = (np.concatenate([part, part]) for part in entries)  # of the states and controls there, and at start
+    both = form.nx + form.nu
+    used = 2 * both if ca.depends_on(expression, ca.vertcat(form.x0, form.u0)) else both
+    steps = np.vstack([np.zeros(2 * both), *(s * np.diag(entry)[:used] for s in (1.0, -1.0))])
+    at = np.tile(picked, len(steps))
+    first = np.broadcast_to(np.concatenate([grid.states[0], grid.controls[0]]), (len(at), both))
+    columns = np.hstack([grid.states[at], grid.controls[at], first]) + np.repeat(steps, len(picked), axis=0)
+    x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
+    found = form.sampled([expression], x, u, grid.t[at], horizon, p, (form.x0, x0), (form.u0, u0))[0]
+    g = found.reshape(len(steps), len(picked), -1)
+    change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0)).max(axis=1).reshape(2, used, -1).max(axis=0)
+    told, every = change[moves[:used]].sum(axis=0), change.sum(axis=0)
+    moved = told > ROUNDING * every
+    return np.where(moved, told, every), moved, *_spread(g[0])
