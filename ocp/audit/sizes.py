@@ -7,7 +7,6 @@ changing a unit or naming a distant bound changes no verdict. The size of a cons
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 
-__all__ = ["FineGrid", "Sizes", "fine_grid", "sizes"]
+__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "sizes", "sizes_along"]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which a plan is looked at
 FLOOR = 1e-6  # of the largest value: what is smaller cannot be told from the solver's own tolerance
@@ -68,7 +67,7 @@ class Sizes:
     """The size of everything that is judged along a plan, positive, in its own unit.
 
     Attributes:
-        state, control: Of every entry; the entries of one named vector share the largest. Shape (nx,), (nu,).
+        state, control: Of every entry, for one vector may hold metres and rad. Shape (nx,), (nu,).
         path, start, end: Of every constraint row. Shape (rows,).
         cost: The integral of the running cost's absolute value, not below a millionth of what the cost is made of.
     """
@@ -98,9 +97,9 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
         np.where(low == high, low, np.nan) for low, high in (_of(bounds, places[k]) for k in ("initial", "terminal"))
     ]
     declared = _of(bounds, places["state"])
-    state, moves = _sizes_of(form.states.values(), np.vstack([grid.states, *ends]), declared, ends)
+    state, moves = _sizes_of(np.vstack([grid.states, *ends]), declared, ends)
     declared = _of(bounds, places["control"])
-    control, acts = _sizes_of(form.controls.values(), grid.controls, declared, [])
+    control, acts = _sizes_of(grid.controls, declared, [])
     entries = np.concatenate([state, control]), np.concatenate([moves, acts])
     path, start, end = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("path", "start", "end"))
     running = form.sampled([form.running], grid.states, grid.controls, grid.t, horizon, p)[0][:, 0]
@@ -123,19 +122,19 @@ def _of(bounds: Bounds, index: np.ndarray) -> Bounds:
     return bounds[0][index], bounds[1][index]
 
 
-def _sizes_of(
-    groups: Iterable[slice], values: np.ndarray, declared: Bounds, ends: list[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def _sizes_of(values: np.ndarray, declared: Bounds, ends: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Sizes of entries (n,) whose values are (M, n), and which of them move, or are told to be anywhere but at zero."""
     spread, largest = _spread(values)
-    known = np.any([np.nan_to_num(end) != 0 for end in ends], axis=0) if ends else np.zeros(spread.shape, dtype=bool)
+    known = np.zeros(spread.shape, dtype=bool)
+    for end in ends:
+        known |= np.abs(np.nan_to_num(end)) > STILL
+    return _floored(np.maximum(spread, FLOOR * largest), known, np.minimum(1.0, _least(declared)))
+
+
+def _least(declared: Bounds) -> np.ndarray:
+    """Absolute value of the nearer of two bounds that are neither zero nor infinite. Shape (n,)."""
     sides = np.abs(np.array(declared))
-    bound = np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf)
-    least = np.ones_like(spread)
-    for group in groups:
-        spread[group], largest[group] = spread[group].max(initial=0.0), largest[group].max(initial=0.0)
-        known[group], least[group] = known[group].any(), min(1.0, bound[group].min(initial=np.inf))
-    return _floored(np.maximum(spread, FLOOR * largest), known, least)
+    return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
 
 def _floored(
@@ -174,13 +173,13 @@ def _rows_of(
     made_of, moved, own, largest = _made_of(form, rows.expression, grid, picked, horizon, p, entries)
     if kind == "path":
         own, largest = _spread(form.sampled([rows.expression], grid.states, grid.controls, grid.t, horizon, p)[0])
+    made_of = np.where(moved | (largest <= STILL), made_of, 0.0)  # what is there though nothing moves has a size
     size = np.maximum(np.maximum(own, made_of), FLOOR * largest)
-    sides = np.abs(np.array(_of(bounds, rows.bounds)))
-    bound = np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0)
-    unknown, still = np.zeros(len(rows), dtype=bool), np.where(moved, 0.0, STILL)
+    least = np.minimum(1.0, _least(_of(bounds, rows.bounds)))
+    still, told = np.where(moved, 0.0, STILL), ~moved & (largest > STILL)
     for name in rows.names:
         mine = rows.of(name)
-        size[mine] = _floored(size[mine], unknown[mine], np.minimum(1.0, bound[mine]), still[mine])[0]
+        size[mine] = _floored(size[mine], told[mine], least[mine], still[mine])[0]
     return np.asarray(size)
 
 
@@ -197,17 +196,43 @@ def _made_of(
 
     And whether anything that moves is in it, its spread, and its largest absolute value. Shape (rows,) each.
     """
-    entry, moves = (np.concatenate([part, part]) for part in entries)  # of the states and controls there, and at start
-    both = form.nx + form.nu
-    used = 2 * both if ca.depends_on(expression, ca.vertcat(form.x0, form.u0)) else both
-    steps = np.vstack([np.zeros(2 * both), *(s * np.diag(entry)[:used] for s in (1.0, -1.0))])
-    at = np.tile(picked, len(steps))
-    first = np.broadcast_to(np.concatenate([grid.states[0], grid.controls[0]]), (len(at), both))
-    columns = np.hstack([grid.states[at], grid.controls[at], first]) + np.repeat(steps, len(picked), axis=0)
-    x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
-    found = form.sampled([expression], x, u, grid.t[at], horizon, p, (form.x0, x0), (form.u0, u0))[0]
-    g = found.reshape(len(steps), len(picked), -1)
-    change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0)).max(axis=1).reshape(2, used, -1).max(axis=0)
-    told, every = change[moves[:used]].sum(axis=0), change.sum(axis=0)
+    x, u = grid.states[picked], grid.controls[picked]
+    begin = grid.states[0], grid.controls[0]
+    here, change = changes(form, expression, (x, u, grid.t[picked]), begin, horizon, p, entries[0])
+    change = change.max(axis=1)
+    moves = np.resize(entries[1], len(change))
+    told, every = change[moves].sum(axis=0), change.sum(axis=0)
     moved = told > ROUNDING * every
-    return np.where(moved, told, every), moved, *_spread(g[0])
+    return np.where(moved, told, every), moved, *_spread(here)
+
+
+def changes(
+    form: Formulation,
+    expression: Any,
+    samples: tuple[np.ndarray, np.ndarray, np.ndarray],
+    begin: tuple[np.ndarray, np.ndarray],
+    horizon: float,
+    p: np.ndarray,
+    moves: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of an expression at K samples, and by how much each changes where one entry alone moves.
+
+    Args:
+        samples: States (K, nx), controls (K, nu) and times (K,), s. begin: States and controls at the start.
+        moves: Of each state and control, there or at the start, one way and the other. Shape (nx + nu,).
+
+    Returns:
+        Shapes (K, rows) and (entries, K, rows), the larger change of the two ways; entries at the start come last.
+    """
+    x, u, t = samples
+    both, count = form.nx + form.nu, len(t)
+    used = 2 * both if ca.depends_on(expression, ca.vertcat(form.x0, form.u0)) else both
+    steps = np.vstack([np.zeros(2 * both), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
+    at = np.tile(np.arange(count), len(steps))
+    first = np.broadcast_to(np.concatenate(begin), (len(at), both))
+    columns = np.hstack([x[at], u[at], first]) + np.repeat(steps, count, axis=0)
+    x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
+    found = form.sampled([expression], x, u, t[at], horizon, p, (form.x0, x0), (form.u0, u0))[0]
+    g = found.reshape(len(steps), count, -1)
+    change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
+    return g[0], change.reshape(2, used, count, -1).max(axis=0)

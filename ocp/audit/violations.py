@@ -1,4 +1,8 @@
-"""How far every bound and constraint of a problem is missed along a plan, between its points too."""
+"""How far every bound and constraint of a problem is missed along a plan, between its points too.
+
+A constraint is judged by its size along the plan, and where it is missed most by how it changes right there: the square
+of a distance hardly changes near zero, and a plan that goes through the middle of a thing misses little of it.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ocp.audit.reintegration import Reintegration
-from ocp.audit.sizes import Sizes
+from ocp.audit.sizes import FLOOR, Sizes, changes
 from ocp.problem.formulation import Bounds, Formulation
 
 __all__ = ["Violation", "violations"]
+
+SHIFT = 1e-3  # of the sizes of states and controls, by which they are moved to see how a constraint changes
 
 
 @dataclass(frozen=True)
@@ -59,25 +65,40 @@ def violations(
             if kind in ("initial", "terminal"):
                 given = low == high
             if np.any(given):
-                miss = missed(values[at][:, place][:, given], low[given], high[given], size[place][given])
-                found.append(Violation(f"{what} {name}", name, again.t[at], *miss))
-    starts = (form.x0, states[0]), (form.u0, again.controls[0])
+                over = beyond(values[at][:, place][:, given], low[given], high[given])
+                found.append(judged(f"{what} {name}", name, again.t[at], over, size[place][given]))
+    begin = states[0], again.controls[0]
+    entries = SHIFT * np.concatenate([sizes.state, sizes.control])
     for kind, at in (("path", slice(None)), ("start", first), ("end", last)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
             continue
-        g = form.sampled([rows.expression], states[at], again.controls[at], again.t[at], horizon, p, *starts)[0]
+        x, u, t = states[at], again.controls[at], again.t[at]
+        starts = (form.x0, begin[0]), (form.u0, begin[1])
+        g = form.sampled([rows.expression], x, u, t, horizon, p, *starts)[0]
+        over = beyond(g, lower[rows.bounds], upper[rows.bounds])
+        size = np.tile(size, (len(t), 1))
+        worst = np.argmax(over, axis=0), np.arange(len(rows))
+        if np.any(over[worst] > FLOOR * size[worst]):  # by how much it changes where it is missed most
+            change = changes(
+                form, rows.expression, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries
+            )[1]
+            here = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
+            size[worst] = np.clip(here, FLOOR * size[worst], size[worst])
         for name in rows.names:
             mine = rows.of(name)
-            miss = missed(g[:, mine], lower[rows.bounds[mine]], upper[rows.bounds[mine]], size[mine])
-            found.append(Violation(name, name, again.t[at], *miss))
+            found.append(judged(name, name, t, over[:, mine], size[:, mine]))
     return found
 
 
-def missed(
-    values: np.ndarray, lower: np.ndarray, upper: np.ndarray, sizes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At each of K points the largest violation, the largest share of a row's size, and that size. Shape (K,) each."""
-    over = np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
+def beyond(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """How far values (K, m) are beyond their bounds, at least 0; infinite where they are not a number."""
+    return np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
+
+
+def judged(label: str, name: str, t: np.ndarray, over: np.ndarray, sizes: np.ndarray) -> Violation:
+    """What is missed (K, m), and as shares of sizes (m,) or (K, m), by most at each time."""
     shares = over / sizes
-    return over.max(axis=1), shares.max(axis=1), sizes[np.argmax(shares, axis=1)]
+    most = np.argmax(shares, axis=1)[:, None]
+    size = np.take_along_axis(np.broadcast_to(sizes, over.shape), most, axis=1)[:, 0]
+    return Violation(label, name, t, over.max(axis=1), shares.max(axis=1), size)
