@@ -217,7 +217,8 @@ def audit(
     findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
 
-    names = [*form.states, *form.controls, *[c for kind in (form.path, form.start, form.end) for c in kind.names]]
+    rows = (form.path, form.start, form.end, form.watch)
+    names = [*form.states, *form.controls, *[name for kind in rows for name in kind.names]]
     for name in limits:
         if name not in names:
             raise unknown_name("name in tolerances", name, names)

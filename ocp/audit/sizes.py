@@ -16,11 +16,12 @@ import numpy as np
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 
-__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "sizes", "sizes_along"]
+__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "integral", "sizes", "sizes_along"]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which a plan is looked at
 FLOOR = 1e-6  # of the largest value: what is smaller cannot be told from the solver's own tolerance
 ROUNDING = 1e-9  # of the largest of its kind: what moves less stands still
+HELD = 1e-2  # of what it is made of: a task that asks for less of a way is judged by this share of it
 STILL = 1e-12  # SI units: what moves less, and is not told to move, stands still
 PLACES = 32  # of the horizon, at which a constraint is looked at for what it is made of
 
@@ -68,7 +69,7 @@ class Sizes:
 
     Attributes:
         state, control: Of every entry, for one vector may hold metres and rad. Shape (nx,), (nu,).
-        path, start, end: Of every constraint row. Shape (rows,).
+        path, start, end, watch: Of every constraint row. Shape (rows,).
         cost: The integral of the running cost's absolute value, not below a millionth of what the cost is made of.
     """
 
@@ -77,6 +78,7 @@ class Sizes:
     path: np.ndarray
     start: np.ndarray
     end: np.ndarray
+    watch: np.ndarray
     cost: float
 
 
@@ -109,7 +111,8 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
         _made_of(form, what, grid, at, horizon, p, entries)[0][0]
         for what, at in ((form.running, spaced(grid)), (form.terminal, spaced(grid)[-1:]))
     ]
-    return Sizes(state, control, path, start, end, max(spent, FLOOR * (horizon * made_of[0] + made_of[1])))
+    watch = _watched(form, grid, horizon, p, bounds, entries)
+    return Sizes(state, control, path, start, end, watch, max(spent, FLOOR * (horizon * made_of[0] + made_of[1])))
 
 
 def spaced(grid: FineGrid) -> np.ndarray:
@@ -169,7 +172,8 @@ def _rows_of(
     rows: Rows = getattr(form, kind)
     if len(rows) == 0:
         return np.zeros(0)
-    picked = {"path": spaced(grid), "start": spaced(grid)[:1], "end": spaced(grid)[-1:]}[kind]
+    some = spaced(grid)
+    picked = some[:1] if kind == "start" else some[-1:] if kind == "end" else some
     made_of, moved, own, largest = _made_of(form, rows.expression, grid, picked, horizon, p, entries)
     if kind == "path":
         own, largest = _spread(form.sampled([rows.expression], grid.states, grid.controls, grid.t, horizon, p)[0])
@@ -181,6 +185,37 @@ def _rows_of(
         mine = rows.of(name)
         size[mine] = _floored(size[mine], told[mine], least[mine], still[mine])[0]
     return np.asarray(size)
+
+
+def _watched(
+    form: Formulation,
+    grid: FineGrid,
+    horizon: float,
+    p: np.ndarray,
+    bounds: Bounds,
+    entries: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Sizes of the watched rows: the longest way of those of one name, or what they are made of. Shape (rows,)."""
+    rows = form.watch
+    if len(rows) == 0:
+        return np.zeros(0)
+    made_of = _rows_of(form, "watch", grid, horizon, p, bounds, entries)
+    made_of = np.where(form.watch_integral, horizon, 1.0) * made_of
+    starts = (form.x0, grid.states[0]), (form.u0, grid.controls[0])
+    rate = form.sampled([form.watch_way], grid.states, grid.controls, grid.t, horizon, p, *starts)[0]
+    way = _spread(integral(rate, grid.t))[0]
+    size = made_of.copy()
+    for name in rows.names:
+        mine = rows.of(name)
+        if form.problem.declared.watch[name].way is not None:
+            size[mine] = max(way[mine].max(), HELD * made_of[mine].max())
+    return np.asarray(size)
+
+
+def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Of columns (M, n) over times (M,), from the first to each. Shape (M, n)."""
+    steps = np.diff(t)[:, None] * (rates[1:] + rates[:-1]) / 2
+    return np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def _made_of(

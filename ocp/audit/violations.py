@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ocp.audit.reintegration import Reintegration
-from ocp.audit.sizes import FLOOR, Sizes, changes
+from ocp.audit.sizes import FLOOR, Sizes, changes, integral
 from ocp.problem.formulation import Bounds, Formulation
 
 __all__ = ["Violation", "violations"]
@@ -69,17 +69,21 @@ def violations(
                 found.append(judged(f"{what} {name}", name, again.t[at], over, size[place][given]))
     begin = states[0], again.controls[0]
     entries = SHIFT * np.concatenate([sizes.state, sizes.control])
-    for kind, at in (("path", slice(None)), ("start", first), ("end", last)):
+    for kind, at in (("path", slice(None)), ("start", first), ("end", last), ("watch", slice(None))):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
             continue
         x, u, t = states[at], again.controls[at], again.t[at]
         starts = (form.x0, begin[0]), (form.u0, begin[1])
         g = form.sampled([rows.expression], x, u, t, horizon, p, *starts)[0]
+        if kind == "watch":
+            g = np.where(form.watch_integral, integral(g, t), g)
         over = beyond(g, lower[rows.bounds], upper[rows.bounds])
         size = np.tile(size, (len(t), 1))
         worst = np.argmax(over, axis=0), np.arange(len(rows))
-        if np.any(over[worst] > FLOOR * size[worst]):  # by how much it changes where it is missed most
+        if kind != "watch" and np.any(
+            over[worst] > FLOOR * size[worst]
+        ):  # by how much it changes where it is missed most
             change = changes(
                 form, rows.expression, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries
             )[1]
