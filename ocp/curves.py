@@ -20,6 +20,7 @@ __all__ = [
     "integrator",
     "lagrange",
     "lagrange_expressions",
+    "newton_coefficients",
     "quadrature_weights",
     "rk4_step",
 ]
@@ -109,6 +110,18 @@ def lagrange_expressions(nodes: np.ndarray, place: Any) -> Any:
                 product = product * (place - other) / (node - other)
         polynomials.append(product)
     return ca.vertcat(*polynomials)
+
+
+def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Divided differences c of values (K, d, n) at nodes (d,). Shape (K, d, n).
+
+    The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations.
+    """
+    found = np.array(values, dtype=float)
+    for i in range(1, len(nodes)):
+        width = (nodes[i:] - nodes[:-i])[None, :, None]
+        found[:, i:] = (found[:, i:] - found[:, i - 1 : -1]) / width
+    return found
 
 
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:

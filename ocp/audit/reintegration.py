@@ -7,13 +7,13 @@ happens between the points of a plan, a push of a millisecond say, is met by a s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ocp.audit.sizes import FineGrid, Sizes
-from ocp.curves import dormand_prince_step, lagrange_expressions
+from ocp.curves import dormand_prince_step, newton_coefficients
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
@@ -86,10 +86,11 @@ def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, grid: Fine
     def on_grid(start: np.ndarray, after: np.ndarray) -> np.ndarray:
         return np.concatenate([start[:, None], after], axis=1).reshape(-1, form.nx)
 
-    found = flow.integrate(np.repeat(np.arange(n), cells), starts).reshape(n, cells, -1)
+    after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
+    found = after.reshape(n, cells, -1)
     local = on_grid(starts, found[:, :, :-1])
     local_cost = float(found[:, -1, -1].sum())
-    found = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1]).reshape(n, cells, -1)
+    found = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1], steps)[0].reshape(n, cells, -1)
     states = on_grid(np.vstack([starts[:1], found[:-1, -1, :-1]]), found[:, :, :-1])
     cost = float(found[-1, -1, -1])
     lost = ~np.isfinite(states).all(axis=1)
@@ -119,59 +120,83 @@ def _worst(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(np.isnan(values), np.inf, values).max(axis=1, initial=0.0))
 
 
+class Steps(NamedTuple):
+    """Steps of an integration in their order: the cell of each, its place and its width in the interval. (S,) each."""
+
+    cell: np.ndarray
+    place: np.ndarray
+    width: np.ndarray
+
+    @classmethod
+    def even(cls, cells: int, each: int) -> Steps:
+        """One step a cell, of which an interval has ``each``."""
+        cell = np.arange(cells)
+        return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
+
+    @classmethod
+    def together(cls, parts: list[Steps]) -> Steps:
+        """The steps of several parts in order."""
+        cell, place, width = (np.concatenate(values) for values in zip(*parts, strict=True))
+        order = np.lexsort((place, cell))
+        return cls(cell[order], place[order], width[order])
+
+
 class Flow:
     """The dynamics and the running cost under the controls of a plan, to be integrated from any states."""
 
     def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, sizes: Sizes) -> None:
         curve = solution.control_interpolant
         self._columns = np.vstack(
-            [curve.values.reshape(len(curve.values), -1).T, curve.breaks[:-1], np.diff(curve.breaks)]
+            [
+                newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1).T,
+                curve.breaks[:-1],
+                np.diff(curve.breaks),
+            ]
         )
         self._tolerance = TOLERANCE * np.append(sizes.state, sizes.cost)
         self._step = step_function(form, curve.nodes, solution.horizon, p).mapaccum("steps", BLOCK)
-        self._cells = len(curve.values)
+        self._intervals = len(curve.values)
 
-    def integrate(self, chain: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
         """States and cost at the ends of all cells, which divide the intervals evenly; nan where it breaks down.
 
         Args:
             chain: Which cells follow each other, increasing. Shape (cells,). starts: State of each chain at its start,
-                where its cost is zero. Shape (chains, nx).
+                where its cost is zero. Shape (chains, nx). steps: To begin with; None: one a cell.
 
         Returns:
-            Shape (cells, nx + 1).
+            Shape (cells, nx + 1), and the steps that it took; where it breaks down, those that it tried last.
         """
+        each = len(chain) // self._intervals
         found = np.full((len(chain), starts.shape[1] + 1), np.nan)
-        each = len(chain) // self._cells
-        cell = np.arange(len(chain))
-        interval, place, width = cell // each, (cell % each) / each, np.full(len(chain), 1.0 / each)
-        last = np.ones(len(chain), dtype=bool)
+        cell, place, width = Steps.even(len(chain), each) if steps is None else steps
         now = np.hstack([starts, np.zeros((len(starts), 1))])
+        taken: list[Steps] = []
         for _ in range(MOST_ROUNDS):
-            first = np.diff(chain, prepend=-1) > 0
-            after, error = self._run(first, now[chain], interval, place, width)
-            before = np.vstack([now[chain[:1]], after[:-1]])
+            own = chain[cell]
+            first, last = np.diff(own, prepend=-1) > 0, np.diff(cell, append=len(chain)) > 0
+            after, error = self._run(first, now[own], cell // each, place, width)
+            before = np.where(first[:, None], now[own], np.roll(after, 1, axis=0))
             allowed = self._tolerance + ROUNDING * np.maximum(np.abs(before), np.abs(after))
             good = (error <= allowed).all(axis=1)  # what is not a number is not
             count = np.cumsum(~good)
             kept = count == (count - ~good)[first][np.cumsum(first) - 1]  # nothing before it in its chain is bad
             found[cell[kept & last]] = after[kept & last]
-            now[chain[kept]] = after[kept]  # the last of each chain stays
+            now[own[kept]] = after[kept]  # the last of each chain stays
+            taken.append(Steps(cell[kept], place[kept], width[kept]))
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = (error / allowed).max(axis=1)
             wanted = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / ORDER))
-            pieces = np.where(good, 1, np.clip(wanted, 2, MOST_PIECES)).astype(int)[~kept]
+            known = np.isfinite(before).all(axis=1)  # what begins nowhere waits
+            pieces = np.where(good | ~known, 1, np.clip(wanted, 2, MOST_PIECES)).astype(int)[~kept]
+            cell, place, width = cell[~kept], place[~kept], width[~kept]
             if not pieces.size or pieces.sum() > MOST_STEPS:
                 break
-            chain, cell, interval, place, width, last = (
-                np.repeat(part[~kept], pieces) for part in (chain, cell, interval, place, width, last)
-            )
-            number = np.arange(len(chain)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-            of = np.repeat(pieces, pieces)
-            width = width / of
+            cell, place, width = (np.repeat(part, pieces) for part in (cell, place, width))
+            number = np.arange(len(cell)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+            width = width / np.repeat(pieces, pieces)
             place = place + number * width
-            last &= number == of - 1
-        return found
+        return found, Steps.together([*taken, Steps(cell, place, width)])
 
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
@@ -193,20 +218,22 @@ class Flow:
 def step_function(form: Formulation, nodes: np.ndarray, horizon: float, p: np.ndarray) -> Any:
     """One step (x, data) -> (x behind it, its error); x with the cost below it.
 
-    Data are: whether to start anew, from where, place and width of the step in its interval, the control's values at
-    ``nodes`` of the interval, and start and width of the interval in fractions of the horizon.
+    Data are: whether to start anew, from where, place and width of the step in its interval, the divided differences
+    of the control at ``nodes`` of the interval, and start and width of the interval in fractions of the horizon.
     """
     function = form.function("f", [form.f, form.running], ["f", "running"])
     flat = function.is_a("SXFunction") and function.n_instructions() <= INLINE
     sym, size, nw = (ca.SX if flat else ca.MX).sym, form.nx + 1, form.nu * len(nodes)
     x, data = sym("x", size), sym("data", 1 + size + 2 + nw + 2)
     new, start, place, width = data[0], data[1 : 1 + size], data[1 + size], data[2 + size]
-    values = ca.reshape(data[3 + size : 3 + size + nw], form.nu, len(nodes))
+    differences = ca.reshape(data[3 + size : 3 + size + nw], form.nu, len(nodes))
     s, h = data[3 + size + nw], data[4 + size + nw]
 
     def slope(within: float, state: Any) -> Any:
         at = place + within * width
-        u = ca.mtimes(values, lagrange_expressions(nodes, at))
+        u = differences[:, -1]
+        for i in range(len(nodes) - 2, -1, -1):
+            u = differences[:, i] + (at - nodes[i]) * u
         return ca.vertcat(*function(state[: form.nx], u, (s + h * at) * horizon, horizon, p))
 
     after, error = dormand_prince_step(slope, ca.if_else(new, start, x), h * width * horizon)
