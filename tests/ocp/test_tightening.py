@@ -1,5 +1,11 @@
+"""Limits hold between the points too, and the plan keeps the bounds that it was solved under."""
+
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -7,7 +13,10 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
-from tests.ocp.problems import double_integrator, plant
+from ocp.direct.prepared import Prepared
+from ocp.problem.formulation import Formulation
+from ocp.solution import drawn_in_at, in_order_of
+from tests.ocp.problems import double_integrator, plant, van_der_pol
 
 METHODS = [
     Collocation(10, degree=3),
@@ -34,20 +43,202 @@ def beyond(solution: Solution) -> float:
     return float(max((at["q"] - 1 / 9).max(), (np.abs(at["u"]) - 9).max(), (np.abs(power) - 4.5).max()))
 
 
+@cache
+def tightened(method: Any) -> Solution:
+    return tighten(walled(), method)
+
+
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_limits_hold_between_the_points(method: Any) -> None:
-    plain, tight = solve(walled(), method), tighten(walled(), method)
+    plain, tight = solve(walled(), method), tightened(method)
     assert beyond(plain) > 5e-5
     assert beyond(tight) <= 1.001e-6
     assert plain.cost <= tight.cost <= plain.cost * 1.2
     assert not [f for f in tight.audit().failures if f.name.startswith(("bounds", "power"))]
 
 
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> None:
+    """States q, v, control u, path row power: at its own points the plan is within what was left of their bounds."""
+    tight = tightened(method)
+    mesh = tight.control_interpolant.breaks
+    assert tight.drawn_in is not None
+    assert tight.drawn_in.shape == (2, len(mesh) - 1, 4)
+    assert (tight.drawn_in >= 0).all()
+    assert tight.drawn_in[1, :, 0].max() > 0  # the ceiling
+    assert not tight.drawn_in[:, :, 1].any()  # a speed without bounds
+    lower, upper = np.array([-np.inf, -np.inf, -9, -4.5]), np.array([1 / 9, np.inf, 9, 4.5])
+    curve = tight.control_interpolant
+    owner = np.repeat(np.arange(len(mesh) - 1), len(curve.nodes))
+    at = mesh[owner] + np.diff(mesh)[owner] * np.tile(curve.nodes, len(mesh) - 1)
+    u = curve.values.reshape(-1, 1)
+    shared = drawn_in_at(tight.drawn_in, mesh, at)
+    states = np.hstack([tight.at_fraction(at)["q"], tight.at_fraction(at)["v"]])
+    values = np.hstack([states, u, u * states[:, 1:]])
+    jumps = [False, False, *[getattr(method, "control", "") != "linear"] * 2]
+    below, above = np.where(jumps, tight.drawn_in[:, owner], shared)
+    points = isinstance(method, Collocation) and method.control == "points"  # where all of it is asked
+    looked_at = slice(None) if points else slice(2, 3)
+    inside = (at > 0) & (at < 1)  # the ends of q and v are given
+    assert (values >= lower + below - 1e-7)[inside, looked_at].all()
+    assert (values <= upper - above + 1e-7)[inside, looked_at].all()
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
+    tight = tightened(method)
+    assert tight.drawn_in is not None
+    at = tight.t / tight.horizon
+    _, above = drawn_in_at(tight.drawn_in, tight.control_interpolant.breaks, at)[:, :, 0]
+    assert (tight["q"][:, 0] <= 1 / 9 - above + 1e-7)[1:-1].all()
+    reached = np.isclose(tight["q"][:, 0], 1 / 9 - above, rtol=0, atol=1e-6)
+    assert (reached & (above > 1e-5)).any()
+
+
+def test_a_control_that_may_jump_is_drawn_in_for_its_own_interval_alone() -> None:
+    """Van der Pol's control leaves its limit in one interval, and only there its polynomial goes beyond."""
+    tight = tighten(van_der_pol(lower=-0.5, upper=0.3, horizon=4.0), Collocation(10))
+    assert tight.drawn_in is not None
+    assert np.argwhere(tight.drawn_in)[:, 1:].tolist() == [[7, 2]]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_few_solves_are_enough(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    solved = []
+    once = Prepared.solve
+
+    def counted(self: Prepared, *arguments: Any, **named: Any) -> Solution:
+        solved.append(self)
+        return once(self, *arguments, **named)
+
+    monkeypatch.setattr(Prepared, "solve", counted)
+    tighten(walled(), method)
+    assert len(solved) <= 4
+
+
+def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
+    drawn = np.zeros((2, 3, 1))
+    drawn[0, :, 0], drawn[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
+    mesh = np.array([0.0, 0.2, 0.7, 1.0])
+    below, above = drawn_in_at(drawn, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
+    assert below.tolist() == [1, 1, 3, 3, 3, 2, 2]
+    assert above.tolist() == [0, 0, 0, 0, 5, 5, 5]
+
+
+def test_what_was_drawn_in_comes_back_from_a_file(tmp_path: Path) -> None:
+    tight = tightened(METHODS[0])
+    tight.save(tmp_path / "plan.npz")
+    loaded = Solution.load(tmp_path / "plan.npz")
+    assert loaded.drawn_in is not None
+    assert tight.drawn_in is not None
+    assert loaded.drawn_in.tobytes() == tight.drawn_in.tobytes()
+    solve(walled(), METHODS[0]).save(tmp_path / "plan.npz")
+    assert Solution.load(tmp_path / "plan.npz").drawn_in is None
+
+
+@pytest.mark.parametrize("damage", ["intervals", "entries", "negative", "nan", "inf", "words", "flat"])
+def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: Path) -> None:
+    drawn = tightened(METHODS[0]).drawn_in
+    assert drawn is not None
+    bad = {
+        "intervals": drawn[:, 1:],
+        "entries": drawn[:, :, :2],
+        "negative": drawn - 1.0,
+        "nan": drawn * np.nan,
+        "inf": drawn + np.inf,
+        "words": drawn.astype(str),
+        "flat": drawn[0],
+    }[damage]
+    replace(tightened(METHODS[0]), drawn_in=bad).save(tmp_path / "plan.npz")
+    with pytest.raises(ProblemError, match="drawn_in") as caught:
+        Solution.load(tmp_path / "plan.npz")
+    assert caught.value.name == "drawn_in"
+
+
+def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
+    tight = tightened(METHODS[0])
+    assert tight.drawn_in is not None
+    other = Problem("walled, declared in another order")
+    v, q = other.state("v"), other.state("q", upper=1 / 9)
+    u = other.control("u")
+    other.dynamics(q, v)
+    other.dynamics(v, u)
+    other.path("power", u * v, lower=-4.5, upper=4.5)
+    other.horizon(1.0)
+    moved = in_order_of(Formulation(other), tight)
+    assert moved.drawn_in is not None
+    np.testing.assert_array_equal(moved.drawn_in, tight.drawn_in[:, :, [1, 0, 2, 3]])
+
+
+def round_a_disc() -> Problem:
+    """A point that goes round a disc: a curved path inequality of the states."""
+    problem = Problem("round a disc")
+    x = problem.state("x", 2, initial=[-1.0, 0.01], terminal=[1.0, 0.0])
+    u = problem.control("u", 2)
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.path("clear", ca.sumsqr(x), lower=0.25)
+    problem.minimize(running=ca.sumsqr(u) / 2)
+    return problem
+
+
+def weak_motor() -> Problem:
+    """A pendulum swung up in a given time by a torque that does not hold it, its power limited too."""
+    problem = Problem("weak motor")
+    angle = problem.state("angle", initial=0.0, terminal=2.0)
+    rate = problem.state("rate", initial=0.0, terminal=0.0, upper=1.1)
+    torque = problem.control("torque", lower=-2.0, upper=2.0)
+    problem.dynamics(angle, rate)
+    problem.dynamics(rate, torque - ca.sin(angle))
+    problem.path("power", torque * rate, upper=0.9)
+    problem.horizon(2.5)
+    problem.minimize(running=torque**2 / 2)
+    return problem
+
+
+def hurried() -> Problem:
+    """A carriage whose speed is limited, in a free time with a little effort."""
+    problem, _, v, u = double_integrator("hurried", horizon=None, limit=4.0)
+    final = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
+    problem.path("speed", v, upper=0.7)
+    problem.minimize(terminal=final, running=0.02 * u**2)
+    return problem
+
+
+PANEL: dict[str, Callable[[], Problem]] = {
+    "walled": walled,
+    "limited control": lambda: van_der_pol(lower=-0.5, upper=0.3, horizon=4.0),
+    "round a disc": round_a_disc,
+    "weak motor": weak_motor,
+    "hurried": hurried,
+}
+PANEL_METHODS = [
+    Collocation(30),
+    Collocation(30, 4, "legendre"),
+    Collocation(40, control="held"),
+    MultipleShooting(40, steps=2),
+    MultipleShooting(40, steps=2, control="linear"),
+]
+
+
+@pytest.mark.parametrize("method", PANEL_METHODS, ids=str)
+@pytest.mark.parametrize("name", PANEL)
+def test_a_tightened_plan_with_an_active_limit_does_what_is_asked(name: str, method: Any) -> None:
+    tight = tighten(PANEL[name](), method)
+    audit = tight.audit()
+    asked = ("solver", "integration", "cost, relative", "reported", "horizon", "bounds", "start", "end", "state jump")
+    rows = [f for f in audit.findings if f.name.startswith(asked) or f.name in audit.constraints]
+    assert not [f for f in rows if not f.passed]
+    assert max(audit.constraints.values()) < 2e-6 + 10 * audit.integration_error
+
+
 def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:
     problem, q, u = plant("free", state="q", initial=0.0, terminal=1.0, lower=-1.0, upper=2.0, u={"upper": 5.0})
     problem.dynamics(q, u)
     problem.minimize(running=u**2)
-    assert tighten(problem, Collocation(4)).cost == solve(problem, Collocation(4)).cost
+    tight = tighten(problem, Collocation(4))
+    assert tight.cost == solve(problem, Collocation(4)).cost
+    assert tight.drawn_in is None
 
 
 def test_it_takes_parameters_and_a_free_horizon() -> None:

@@ -99,7 +99,11 @@ def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Ver
         began = time.monotonic()
         if name == "drawn" and kind == "bounds met":
             continue  # beyond its bounds
-        plan, said = (quadratic.plan(problem), "") if name == "drawn" else _solved(problem, METHODS[name](24), check=False, options={"max_iter": 200})
+        plan, said = (
+            (quadratic.plan(problem), "")
+            if name == "drawn"
+            else _solved(problem, METHODS[name](24), check=False, options={"max_iter": 200})
+        )
         if plan is None:
             # a method may see for itself that there is no minimum
             outcome = "unsolved" if minimum and kind != "bounds met" else "fail"

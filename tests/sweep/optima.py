@@ -170,7 +170,9 @@ def pendulum(seed: int) -> Known:
     problem.minimize(u**2)
 
     def canonical(t: Array, y: Array) -> Array:
-        return np.array([y[1], -stiff * np.sin(y[0]) - drag * y[1] - y[3] / 2, stiff * np.cos(y[0]) * y[3], -y[2] + drag * y[3]])
+        return np.array(
+            [y[1], -stiff * np.sin(y[0]) - drag * y[1] - y[3] / 2, stiff * np.cos(y[0]) * y[3], -y[2] + drag * y[3]]
+        )
 
     def ends_met(first: Array, last: Array) -> Array:
         return np.array([first[0] - ends[0], first[1], last[0] - ends[1], last[1]])

@@ -95,7 +95,9 @@ class Quadratic:
         limits = {} if self.bound == np.inf else {"lower": -self.bound, "upper": self.bound}
         u = problem.control("u", m, guess=0.0, **limits)
         rate = ca.mtimes(self.a, x) + ca.mtimes(self.b, u)
-        running = ca.bilin(ca.DM(self.q), x, x) / 2 + ca.bilin(ca.DM(self.r), u, u) / 2 + ca.dot(x, ca.mtimes(self.s, u))
+        running = (
+            ca.bilin(ca.DM(self.q), x, x) / 2 + ca.bilin(ca.DM(self.r), u, u) / 2 + ca.dot(x, ca.mtimes(self.s, u))
+        )
         if self.push is not None:
             w = problem.control("w", lower=-1.0, upper=1.0, guess=0.9)
             rate, running = rate + ca.DM(self.push) * w, running - self.pull * w + w**2 / 2

@@ -175,14 +175,7 @@ def test_a_control_at_its_bound_beside_a_path_equality_hides_no_made_up_costates
         bounded.minimize(bu**2 / 2)
         along = {name: (lambda t, n=name: bare.at(t)[n][:, 0]) for name in ("q", "v", "u")}
         costates = {n: (lambda t, n=n: np.interp(t, bare.t, bare.costate(n)[:, 0])) for n in ("q", "v")}
-        plan = drawn(
-            bounded,
-            {n: along[n] for n in ("q", "v")},
-            {"u": along["u"], "w": along["v"]},
-            costates,
-            1.0,
-            40,
-        )
+        plan = drawn(bounded, {n: along[n] for n in ("q", "v")}, {"u": along["u"], "w": along["v"]}, costates, 1.0, 40)
         is_no_minimum(plan.audit())
 
 
@@ -307,7 +300,9 @@ def test_each_of_several_multipliers_has_its_own_sign() -> None:
     problem.end("walls", x, [-9.0, -9.0, 1.0], [1.0, 9.0, 9.0])
     for last, verdict in ((2.0, holds), (1.0, is_no_minimum)):
         ends = np.array([1.0, 2.0, last])
-        plan = drawn(problem, {"x": lambda t, e=ends: np.outer(t, e)}, {"u": ends.tolist()}, {"x": (-ends).tolist()}, 1.0)
+        plan = drawn(
+            problem, {"x": lambda t, e=ends: np.outer(t, e)}, {"u": ends.tolist()}, {"x": (-ends).tolist()}, 1.0
+        )
         verdict(plan.audit())
 
 
@@ -392,7 +387,9 @@ def test_parts_of_the_cost_that_cancel_hide_no_loss(slope: float) -> None:
     holds(drawn(problem, {"x": 0.0}, {"u": 0.0}, {"x": -slope}, 1.0).audit())
 
 
-@pytest.mark.parametrize("make", [MultipleShooting, lambda n: Collocation(n, control="held")], ids=["shooting", "radau"])
+@pytest.mark.parametrize(
+    "make", [MultipleShooting, lambda n: Collocation(n, control="held")], ids=["shooting", "radau"]
+)
 def test_held_controls_on_a_coarse_mesh_do_not_pass_for_the_optimum(make: Callable[[int], Any]) -> None:
     """Least effort with N held controls costs 6 N^2 / (N^2 - 1): 7 % too much on 4 intervals, 0.03 % on 60."""
     problem, _, _, u = double_integrator("held")

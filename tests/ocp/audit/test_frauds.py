@@ -199,11 +199,15 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         yield f"{pool} swapped by name", swapped_names(pool)
         yield (
             f"{pool} reported otherwise",
-            lambda s, pool=pool: replace(s, **{pool: {n: v + 0.05 * (np.ptp(v) or 1) for n, v in getattr(s, pool).items()}}),
+            lambda s, pool=pool: replace(
+                s, **{pool: {n: v + 0.05 * (np.ptp(v) or 1) for n, v in getattr(s, pool).items()}}
+            ),
         )
         yield (
             f"{pool} reported late",
-            lambda s, pool=pool: replace(s, **{pool: {n: np.roll(v, 2, axis=0) + 1e-3 for n, v in getattr(s, pool).items()}}),
+            lambda s, pool=pool: replace(
+                s, **{pool: {n: np.roll(v, 2, axis=0) + 1e-3 for n, v in getattr(s, pool).items()}}
+            ),
         )
         curve = CURVES[pool]
         yield f"{pool}: one row less", field(pool, lambda d: {n: v[1:] for n, v in d.items()})
@@ -214,7 +218,10 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         yield f"{pool}: a name missing", field(pool, lambda d: dict(list(d.items())[1:]))
         yield f"{pool}: another name", field(pool, lambda d: {f"{n}'": v for n, v in d.items()})
         yield f"{pool}: one column more", field(pool, lambda d: {n: np.hstack([v, v[:, :1]]) for n, v in d.items()})
-        yield f"{pool}: nan reported", field(pool, lambda d: {n: np.where(np.arange(len(v))[:, None] == 3, np.nan, v) for n, v in d.items()})
+        yield (
+            f"{pool}: nan reported",
+            field(pool, lambda d: {n: np.where(np.arange(len(v))[:, None] == 3, np.nan, v) for n, v in d.items()}),
+        )
         yield f"{curve}: breaks beyond 1", part(curve, breaks=lambda b: 1.2 * b)
         yield f"{curve}: breaks below 0", part(curve, breaks=lambda b: b - 0.1)
         yield f"{curve}: breaks backwards", part(curve, breaks=lambda b: b[::-1])
@@ -245,7 +252,14 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         "true": lambda c: True,
     }.items():
         yield f"cost {name}", field("cost", change)
-    for name, factor in {"longer": 1.02, "shorter": 0.98, "twice": 2.0, "nothing": 0.0, "negative": -1.0, "nan": np.nan}.items():
+    for name, factor in {
+        "longer": 1.02,
+        "shorter": 0.98,
+        "twice": 2.0,
+        "nothing": 0.0,
+        "negative": -1.0,
+        "nan": np.nan,
+    }.items():
         yield f"horizon {name}", field("horizon", lambda h, f=factor: f * h)
         yield f"horizon {name}, with its times", lambda s, f=factor: replace(s, horizon=f * s.horizon, t=f * s.t)
     for name, value in {"infinite": np.inf, "a word": "1", "none": None, "true": True}.items():

@@ -97,9 +97,7 @@ START = np.array([0.3, 0.8, 0.9])
 def circle(machine: FixedBase, radius: float, period: float) -> TipTask:
     x, y, _ = np.array(ca.DM(machine.tip_pose((), START).position)).ravel()
     turn = 2 * np.pi / period
-    return TipTask(
-        position=lambda t: [x + radius * (1 - ca.cos(turn * t)), y - radius * ca.sin(turn * t)], rows=(3, 4)
-    )
+    return TipTask(position=lambda t: [x + radius * (1 - ca.cos(turn * t)), y - radius * ca.sin(turn * t)], rows=(3, 4))
 
 
 def test_one_lap_does_not_pass_for_two() -> None:
@@ -124,11 +122,25 @@ def test_one_lap_does_not_pass_for_two() -> None:
         lambda s: replace(s, t=s.t[::-1].copy()),
         lambda s: replace(s, t=np.where(np.arange(len(s.t)) == 5, np.nan, s.t)),
         lambda s: replace(s, state_interpolant=replace(s.state_interpolant, breaks=2 * s.state_interpolant.breaks)),
-        lambda s: replace(s, control_interpolant=replace(s.control_interpolant, breaks=s.control_interpolant.breaks - 0.1)),
-        lambda s: replace(s, control_interpolant=replace(s.control_interpolant, breaks=s.control_interpolant.breaks**3)),
+        lambda s: replace(
+            s, control_interpolant=replace(s.control_interpolant, breaks=s.control_interpolant.breaks - 0.1)
+        ),
+        lambda s: replace(
+            s, control_interpolant=replace(s.control_interpolant, breaks=s.control_interpolant.breaks**3)
+        ),
         lambda s: replace(s, horizon=1.02 * s.horizon),
     ],
-    ids=["last t", "all t", "t late", "t backwards", "t nan", "breaks to 2", "breaks from -0.1", "breaks moved", "horizon"],
+    ids=[
+        "last t",
+        "all t",
+        "t late",
+        "t backwards",
+        "t nan",
+        "breaks to 2",
+        "breaks from -0.1",
+        "breaks moved",
+        "horizon",
+    ],
 )
 def test_times_and_breaks_outside_the_plan_are_refused(beyond: Callable[[Solution], Solution]) -> None:
     plan = solve(least_effort(), METHODS["radau"])
@@ -151,9 +163,7 @@ def test_a_plan_that_stands_still_does_not_go_a_small_way(way: float, where: str
     def build() -> Problem:
         problem = Problem("small way")
         x = problem.state(
-            "x",
-            initial=way if where == "initial" else 0.0,
-            terminal={"initial": 0.0, "terminal": way}.get(where),
+            "x", initial=way if where == "initial" else 0.0, terminal={"initial": 0.0, "terminal": way}.get(where)
         )
         u = problem.control("u")
         problem.dynamics(x, u)
@@ -207,15 +217,13 @@ def test_a_small_thing_beside_a_large_one_is_not_drowned_in_it() -> None:
         problem.path("both", u, [large, 0.5], [large, 1.5])
         problem.minimize((u[0] / large) ** 2 + u[1] ** 2)
         costates = {"x": [-2 / large, -2.0]}
-        holds(drawn(problem, {"x": lambda t, g=large: np.outer(t, [g, 1.0])}, {"u": [large, 1.0]}, costates, 1.0).audit())
+        holds(
+            drawn(problem, {"x": lambda t, g=large: np.outer(t, [g, 1.0])}, {"u": [large, 1.0]}, costates, 1.0).audit()
+        )
         for wrong in (0.0, 0.6, 0.9):  # the small one stops short, or its motion is not that of its control
             for rate in (wrong, 1.0):
                 plan = drawn(
-                    problem,
-                    {"x": lambda t, w=wrong, g=large: np.outer(t, [g, w])},
-                    {"u": [large, rate]},
-                    costates,
-                    1.0,
+                    problem, {"x": lambda t, w=wrong, g=large: np.outer(t, [g, w])}, {"u": [large, rate]}, costates, 1.0
                 )
                 does_not_do_what_is_asked(plan.audit())
 
@@ -296,7 +304,9 @@ def test_the_width_of_a_range_of_a_control_excuses_nothing(wide: float) -> None:
         problem, _, _, u = double_integrator("pulling")
         problem.minimize(u**2 / 2)
         if floor:
-            problem.declared.controls["u"] = replace(problem.declared.controls["u"], lower=ca.SX(0.0), upper=ca.SX(wide))
+            problem.declared.controls["u"] = replace(
+                problem.declared.controls["u"], lower=ca.SX(0.0), upper=ca.SX(wide)
+            )
         return problem
 
     does_not_do_what_is_asked(of(solve(build(False), Collocation(20)), build(True)).audit())
@@ -464,11 +474,7 @@ def test_no_rule_lets_the_zero_moment_point_leave_the_foot() -> None:
         try:
             rule = IndexAtLeast(value)
             problem = standing_problem(
-                machine,
-                TipTask(velocity=lambda t: [0.0 * t, 0.1 + 0.0 * t], rows=(4, 5)),
-                start,
-                1.0,
-                zmp=rule,
+                machine, TipTask(velocity=lambda t: [0.0 * t, 0.1 + 0.0 * t], rows=(4, 5)), start, 1.0, zmp=rule
             )
         except ProblemError:
             continue
