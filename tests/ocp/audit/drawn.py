@@ -99,20 +99,28 @@ def of(plan: Solution, problem: Problem) -> Solution:
 
 
 def holds(audit: Audit) -> None:
-    """The plan is sound: nothing fails."""
-    assert audit.passed, str(audit)
+    """The plan does what is asked and is a local minimum."""
+    assert audit.feasible, str(audit)
+    assert audit.optimal is True, str(audit)
+    assert audit.passed
 
 
 def is_no_minimum(audit: Audit) -> None:
     """The motion does what is asked, and some other one beside it costs less."""
-    assert not audit.passed, str(audit)
+    assert audit.feasible, str(audit)
+    assert audit.optimal is False, str(audit)
+    assert not audit.passed
 
 
 def is_no_proven_minimum(audit: Audit) -> None:
-    """The motion does what is asked; whether it is a minimum is denied or left open, never granted."""
-    assert not audit.passed, str(audit)
+    """The motion does what is asked; whether it is a minimum is denied or left open with a reason, never granted."""
+    assert audit.feasible, str(audit)
+    assert audit.optimal is not True, str(audit)
+    assert audit.optimal is False or audit.undecided
+    assert not audit.passed
 
 
 def does_not_do_what_is_asked(audit: Audit) -> None:
     """The motion is not the one that the problem asks for."""
-    assert not audit.passed, str(audit)
+    assert not audit.feasible, str(audit)
+    assert not audit.passed

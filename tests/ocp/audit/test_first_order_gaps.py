@@ -173,8 +173,8 @@ def test_a_control_at_its_bound_beside_a_path_equality_hides_no_made_up_costates
         bw = bounded.control("w")
         bounded.path("tie", bw - bv, 0.0, 0.0)
         bounded.minimize(bu**2 / 2)
-        along = {name: (lambda t, n=name: bare.at(t)[n][:, 0]) for name in ("q", "v", "u")}
-        costates = {n: (lambda t, n=n: np.interp(t, bare.t, bare.costate(n)[:, 0])) for n in ("q", "v")}
+        along = {name: (lambda t, n=name, b=bare: b.at(t)[n][:, 0]) for name in ("q", "v", "u")}
+        costates = {n: (lambda t, n=n, b=bare: np.interp(t, b.t, b.costate(n)[:, 0])) for n in ("q", "v")}
         plan = drawn(bounded, {n: along[n] for n in ("q", "v")}, {"u": along["u"], "w": along["v"]}, costates, 1.0, 40)
         is_no_minimum(plan.audit())
 

@@ -50,12 +50,8 @@ def test_a_plan_past_its_conjugate_point_does_not_pass(
     first = np.pi if order == 1 else 4.730040744862704
     for factor, verdict in ((share, is_no_minimum), (0.97, holds)):
         problem = to_rest(factor * first / stiffness ** (1 / (2 * order)), stiffness, unit, price, order)
-        try:
-            plan = solve(problem, METHODS[method], check=False)
-        except Exception as error:  # a method may see for itself that there is no minimum
-            assert factor > 1, error
-            continue
-        if plan.success or factor < 1:
+        plan = solve(problem, METHODS[method], check=False)
+        if plan.success or factor < 1:  # a method may see for itself that there is no minimum
             verdict(plan.audit())
 
 
