@@ -12,7 +12,7 @@ import numpy as np
 
 from ocp import Collocation, Indirect, MultipleShooting, ProblemError, Solution, SolveError, solve
 from tests.sweep.optima import FAMILIES, miss
-from tests.sweep.quadratics import least_curvature, random_quadratic
+from tests.sweep.quadratics import Quadratic, least_curvature, random_quadratic
 
 __all__ = ["COUNTS", "METHODS", "OPTIMA", "QUADRATIC", "Verdict", "judged", "table"]
 
@@ -127,11 +127,11 @@ def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Ver
     return found
 
 
-def _exact(quadratic: Any) -> float:
+def _exact(quadratic: Quadratic) -> float:
     return float(quadratic.plan(quadratic.problem()).cost)
 
 
-def _size(quadratic: Any) -> float:
+def _size(quadratic: Quadratic) -> float:
     """Of the cost, none of whose parts may cancel."""
     along, _ = quadratic.extremal()
     t = np.linspace(0, quadratic.horizon, 201)

@@ -45,11 +45,12 @@ class Known:
 def miss(known: Known, plan: Solution, places: int = 12) -> float:
     """How far a plan misses what is asked, as a share of the spread of each thing: by Runge-Kutta steps of its own.
 
-    The greatest of the defects within each interval, from the plan's own state at its start, at the ends, of the bounds.
+    The greatest of the defects within each interval from the plan's own state at its start, at the ends, of bounds.
     """
     curve = plan.control_interpolant
     mesh, n = curve.breaks * plan.horizon, len(curve.breaks) - 1
-    order, offset = {}, 0  # states in the order of the family
+    order: dict[str, list[int]] = {}  # of the states of the family
+    offset = 0
     for name, values in plan.states.items():
         order[name] = list(range(offset, offset + values.shape[1]))
         offset += values.shape[1]
@@ -69,17 +70,16 @@ def miss(known: Known, plan: Solution, places: int = 12) -> float:
             k3 = known.rate(t + step / 2, state + step / 2 * k2, u[1])
             k4 = known.rate(t + step, state + step * k3, u[2])
             state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            place = curve.breaks[k] + (curve.breaks[k + 1] - curve.breaks[k]) * (j + 1) / places - 1e-13
-            worst = max(
-                worst, float((np.abs(plan.state_interpolant(np.array([place]))[0, index] - state) / spread).max())
-            )
+            here = curve.breaks[k] + (curve.breaks[k + 1] - curve.breaks[k]) * (j + 1) / places - 1e-13
+            defect = np.abs(plan.state_interpolant(np.array([here]))[0, index] - state)
+            worst = max(worst, float((defect / spread).max()))
     for given, found in ((known.start, x[0]), (known.end, x[-1])):
         held = np.isfinite(given)
         worst = max(worst, float((np.abs(found - given) / spread)[held].max(initial=0.0)))
     piece, place = np.repeat(np.arange(n), 21), np.tile(np.linspace(0, 1, 21), n)
-    u = curve.within(piece, place)
+    pushes = curve.within(piece, place)
     for name, (low, high) in known.bounds.items():
-        values = x[:, known.states.index(name)] if name in known.states else u
+        values = x[:, known.states.index(name)] if name in known.states else pushes
         size = max(abs(bound) for bound in (low, high) if np.isfinite(bound))
         worst = max(worst, float(np.maximum(values - high, low - values).max() / size))
     return worst

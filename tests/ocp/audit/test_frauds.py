@@ -11,7 +11,7 @@ import io
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import files
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,8 @@ def plan(kind: str) -> Solution:
 
 def reported(solution: Solution, pool: str, curve: PiecewisePolynomial) -> Solution:
     """The plan with another curve, which its reported values follow."""
-    values, offset, found = curve(solution.t / solution.horizon), 0, {}
+    values, offset = curve(solution.t / solution.horizon), 0
+    found: dict[str, Array] = {}
     for name, old in getattr(solution, pool).items():
         found[name] = values[:, offset : offset + old.shape[1]]
         offset += old.shape[1]
@@ -102,7 +103,7 @@ def reported(solution: Solution, pool: str, curve: PiecewisePolynomial) -> Solut
     return replace(solution, **changes)
 
 
-def on_values(pool: str, change: Callable[[Array, Array], Array]) -> Edit:
+def on_values(pool: str, change: Any) -> Edit:
     """An edit of the values (N, d, n) of a curve, given their spreads (n,)."""
 
     def edit(solution: Solution) -> Solution:
@@ -155,7 +156,8 @@ def swapped_columns(pool: str) -> Edit:
     def edit(solution: Solution) -> Solution:
         curve = getattr(solution, CURVES[pool])
         values = curve.values[..., ::-1] if curve.values.shape[2] > 1 else 2 * curve.values
-        return replace(solution, **{CURVES[pool]: replace(curve, values=values)})
+        changes: dict[str, Any] = {CURVES[pool]: replace(curve, values=values)}
+        return replace(solution, **changes)
 
     return edit
 
@@ -170,7 +172,8 @@ def swapped_names(pool: str) -> Edit:
             arrays = arrays[::-1]
         else:
             arrays = [arrays[0][:, ::-1] if arrays[0].shape[1] > 1 else arrays[0][::-1] + 0.1]
-        return replace(solution, **{pool: dict(zip(names, arrays, strict=True))})
+        changes: dict[str, Any] = {pool: dict(zip(names, arrays, strict=True))}
+        return replace(solution, **changes)
 
     return edit
 
@@ -181,13 +184,25 @@ def part(curve: str, **changes: Callable[[Array], Any]) -> Edit:
     def edit(solution: Solution) -> Solution:
         old = getattr(solution, curve)
         new = {name: change(getattr(old, name)) for name, change in changes.items()}
-        return replace(solution, **{curve: replace(old, **new)})
+        changed: dict[str, Any] = {curve: replace(old, **new)}
+        return replace(solution, **changed)
 
     return edit
 
 
-def field(name: str, change: Callable[[Any], Any]) -> Edit:
-    return lambda solution: replace(solution, **{name: change(getattr(solution, name))})
+def field(name: str, change: Any) -> Edit:
+    """An edit of one attribute by a function of it."""
+
+    def edit(solution: Solution) -> Solution:
+        changed: dict[str, Any] = {name: change(getattr(solution, name))}
+        return replace(solution, **changed)
+
+    return edit
+
+
+def stretched(factor: float) -> Edit:
+    """Another horizon, with its times."""
+    return lambda solution: replace(solution, horizon=factor * solution.horizon, t=factor * solution.t)
 
 
 def frauds() -> Iterator[tuple[str, Edit]]:
@@ -199,16 +214,9 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         yield f"{pool} swapped by name", swapped_names(pool)
         yield (
             f"{pool} reported otherwise",
-            lambda s, pool=pool: replace(
-                s, **{pool: {n: v + 0.05 * (np.ptp(v) or 1) for n, v in getattr(s, pool).items()}}
-            ),
+            field(pool, lambda d: {n: v + 0.05 * (np.ptp(v) or 1) for n, v in d.items()}),
         )
-        yield (
-            f"{pool} reported late",
-            lambda s, pool=pool: replace(
-                s, **{pool: {n: np.roll(v, 2, axis=0) + 1e-3 for n, v in getattr(s, pool).items()}}
-            ),
-        )
+        yield f"{pool} reported late", field(pool, lambda d: {n: np.roll(v, 2, axis=0) + 1e-3 for n, v in d.items()})
         curve = CURVES[pool]
         yield f"{pool}: one row less", field(pool, lambda d: {n: v[1:] for n, v in d.items()})
         yield f"{pool}: flat arrays", field(pool, lambda d: {n: v.ravel() for n, v in d.items()})
@@ -238,7 +246,7 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         yield f"{curve}: a piece less", part(curve, values=lambda v: v[:-1])
         yield f"{curve}: flat values", part(curve, values=lambda v: v.ravel())
         yield f"{curve}: a column more", part(curve, values=lambda v: np.concatenate([v, v[..., :1]], axis=2))
-    for name, change in {
+    costs: dict[str, Any] = {
         "a hundredth cheaper": lambda c: 0.99 * c,
         "a hundredth dearer": lambda c: 1.01 * c,
         "negative": lambda c: -c,
@@ -250,7 +258,8 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         "complex": lambda c: c + 1j,
         "a list": lambda c: [c],
         "true": lambda c: True,
-    }.items():
+    }
+    for name, change in costs.items():
         yield f"cost {name}", field("cost", change)
     for name, factor in {
         "longer": 1.02,
@@ -261,10 +270,10 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         "nan": np.nan,
     }.items():
         yield f"horizon {name}", field("horizon", lambda h, f=factor: f * h)
-        yield f"horizon {name}, with its times", lambda s, f=factor: replace(s, horizon=f * s.horizon, t=f * s.t)
+        yield f"horizon {name}, with its times", stretched(factor)
     for name, value in {"infinite": np.inf, "a word": "1", "none": None, "true": True}.items():
         yield f"horizon {name}", field("horizon", lambda h, v=value: v)
-    for name, change in {
+    times: dict[str, Any] = {
         "scaled": lambda t: 1.02 * t,
         "late": lambda t: t + 0.02,
         "backwards": lambda t: t[::-1],
@@ -278,7 +287,8 @@ def frauds() -> Iterator[tuple[str, Edit]]:
         "in columns": lambda t: t[:, None],
         "uneven": lambda t: t[-1] * (t / t[-1]) ** 1.5,
         "nothing": lambda t: t[:0],
-    }.items():
+    }
+    for name, change in times.items():
         yield f"times {name}", field("t", change)
     for word in (False, "no", "yes", None, 1, 0, "True", [True]):
         yield f"success {word!r}", field("success", lambda _, w=word: w)
@@ -337,7 +347,7 @@ def test_every_fraud_fails_or_is_refused_by_name(kind: str, capfd: pytest.Captur
     passed = []
     for name, edit in {**FRAUDS, **FOR_ONE.get(kind, {})}.items():
         try:
-            outcome = found_out(lambda e=edit: e(genuine), lambda s: s.audit())
+            outcome = found_out(partial(edit, genuine), lambda s: s.audit())
         except Exception as error:
             outcome = f"passed on: {type(error).__name__}: {error}"
         if outcome.startswith("passed"):
@@ -374,7 +384,7 @@ def test_rounding_of_numbers_passes(kind: str) -> None:
 FileEdit = Callable[[dict[str, Array]], None]
 
 
-def head(change: Callable[[dict[str, Any]], Any]) -> FileEdit:
+def head(change: Any) -> FileEdit:
     """An edit of the JSON of a file; what is returned, if anything, takes its place."""
 
     def edit(arrays: dict[str, Array]) -> None:
@@ -421,7 +431,7 @@ def file_frauds(genuine: Solution) -> Iterator[tuple[str, FileEdit]]:
         yield f"head without {name}", head(lambda h, n=name: h.pop(n) and None)
         yield f"{name} an object", head(lambda h, n=name: h.update({n: {"a": [1, None]}}))
         yield f"{name} a list", head(lambda h, n=name: h.update({n: [1, 2]}))
-    for name, values in {
+    of_head: dict[str, list[Any]] = {
         "success": ["no", 1, None, 0.0],
         "cost": ["1", None, True, 1e400],
         "horizon": ["1", None, 0, -1, 1e400],
@@ -429,7 +439,8 @@ def file_frauds(genuine: Solution) -> Iterator[tuple[str, FileEdit]]:
         "iterations": ["many"],
         "name": [None, 5],
         "status": [5],
-    }.items():
+    }
+    for name, values in of_head.items():
         for value in values:
             yield f"{name} {value!r}", head(lambda h, n=name, v=value: h.update({n: v}))
     yield "head not JSON", put("head", np.frombuffer(b"{'a'", dtype=np.uint8))
@@ -475,7 +486,7 @@ def test_every_fraud_in_a_file_fails_or_is_refused_by_name(
         edit(edited)
         file = written(tmp_path / "edited.npz", edited)
         try:
-            outcome = found_out(lambda f=file: Solution.load(f), lambda s: s.audit(genuine.problem))
+            outcome = found_out(partial(Solution.load, file), lambda s: s.audit(genuine.problem))
         except Exception as error:
             outcome = f"passed on: {type(error).__name__}: {error}"
         if outcome.startswith("passed"):

@@ -26,7 +26,7 @@ from tests.ocp.builders.standing_tasks import table_plan
 from tests.ocp.problems import double_integrator
 from tests.ocp.test_tightening import walled
 
-METHODS = {
+METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "radau-held": Collocation(80, control="held"),
     "legendre": Collocation(20, scheme="legendre"),

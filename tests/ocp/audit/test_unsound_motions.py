@@ -88,7 +88,7 @@ def arm(size: float = 1.0, joints: int = 3) -> FixedBase:
         links.append(Link(f"link{i}", 1.0, (size / 2, 0, 0), np.diag([0.01, 0.1, 0.1]) * size**2))
         mount = (0.0 if i == 0 else size, 0, 0)
         made.append(Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, mount, axis=(0, 0, 1)))
-    return FixedBase(Robot(links, made, tip_translation=(size, 0, 0)))
+    return FixedBase(Robot(tuple(links), tuple(made), tip_translation=(size, 0, 0)))
 
 
 START = np.array([0.3, 0.8, 0.9])
@@ -175,7 +175,7 @@ def test_a_plan_that_stands_still_does_not_go_a_small_way(way: float, where: str
         return problem
 
     back = -1.0 if where == "initial" else 1.0
-    going = {"x": lambda t: way * (1 - t) if where == "initial" else way * t}
+    going: dict[str, Any] = {"x": lambda t: way * (1 - t) if where == "initial" else way * t}
     holds(drawn(build(), going, {"u": back * way}, {"x": 0.0 if where == "path" else -back * way}, 1.0).audit())
     for place in (0.0, way):
         plan = drawn(build(), {"x": place}, {"u": 0.0}, {"x": 0.0}, 1.0)
@@ -275,7 +275,7 @@ def test_the_width_of_a_range_excuses_nothing(wide: float, where: str) -> None:
 
     def build(floor: bool) -> Problem:
         problem = Problem("floor")
-        bounds = {"lower": 0.0, "upper": wide} if floor and where == "state" else {}
+        bounds: dict[str, Any] = {"lower": 0.0, "upper": wide} if floor and where == "state" else {}
         q = problem.state("q", initial=1.0, terminal=None if where == "end" else 1.0, **bounds)
         v = problem.state("v", initial=0.0)
         u = problem.control("u")
