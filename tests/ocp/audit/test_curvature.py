@@ -245,6 +245,25 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     np.testing.assert_allclose(balance(gradient, eye, lower, upper), expected)
 
 
+def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
+    """Against all subsets of the limits, each with the multipliers that least squares give it."""
+    rng = np.random.default_rng(5)
+    gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
+    upper = rng.random((200, 2)) < 0.7
+    found = balance(gradient, rows, np.zeros_like(upper), upper)
+    assert (found >= 0).all()
+    assert (found[~upper] == 0).all()
+    for k in range(200):
+        best = np.inf
+        for pattern in ([], [0], [1], [0, 1]):
+            if not upper[k][pattern].all():
+                continue
+            y = np.linalg.lstsq(rows[k, pattern].T, -gradient[k], rcond=None)[0] if pattern else np.zeros(0)
+            if (y >= 0).all():
+                best = min(best, float(np.linalg.norm(gradient[k] + rows[k, pattern].T @ y)))
+        assert np.linalg.norm(gradient[k] + rows[k].T @ found[k]) == pytest.approx(best, abs=1e-9)
+
+
 METHODS = (METHOD, Collocation(20, 3, "legendre"), MultipleShooting(40, control="linear"), Indirect())
 
 
