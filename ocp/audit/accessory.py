@@ -119,6 +119,13 @@ class AccessoryProblem:
         self.hessian *= self.unit * self.unit[:, None]
 
     @property
+    def flat(self) -> np.ndarray:
+        """Controls along which the Hamiltonian does not curve. Shape (nu,), bool."""
+        bends = np.abs(self.curved * self.range * self.range[:, None]).max(axis=(0, 2), initial=0.0)
+        pull = np.abs(slope(self.along, self.adjoint.costate) * self.range).max(initial=0.0)
+        return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
+
+    @property
     def spread(self) -> float:
         """What the cost curves by over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
@@ -162,15 +169,10 @@ class AccessoryProblem:
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
-        largest = float(np.abs(self.curved * self.range * self.range[:, None]).max(initial=0.0))
         pull = slope(along, self.adjoint.costate).reshape(n, q, nu)
-        force = np.abs(pull * self.range).max(axis=(1, 2), initial=0.0).max(initial=0.0)
         fixed, u = self.fixed.reshape(n, q, nu), along.u.reshape(n, q, nu)
         at = along.s.reshape(n, q)
-        for i in range(nu):
-            bend = np.abs(self.curved[:, i] * self.range[i] * self.range).max(initial=0.0)
-            if bend > FLAT * max(largest, force):
-                continue
+        for i in np.flatnonzero(self.flat):
             step = along.high[0, i] - along.low[0, i]
             whole = fixed[:, :, i].all(axis=1)
             for k in np.flatnonzero(~whole):

@@ -23,7 +23,7 @@ from ocp.audit.principle import DEPENDENT, holders
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "Ends", "adjoint", "nonnegative"]
+__all__ = ["Adjoint", "Backwards", "Ends", "adjoint", "nonnegative"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -89,7 +89,7 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
     holding = holders(along, costate)
     for _ in range(ROUNDS):
-        back = _Backwards(along, holding)
+        back = Backwards(along, holding)
         for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
@@ -128,7 +128,7 @@ def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
     return values[:-1], values[1:]
 
 
-class _Backwards:
+class Backwards:
     """The costate equation over every interval backwards, what holds the controls answering to the costates."""
 
     def __init__(self, along: Linearisation, holding: np.ndarray) -> None:
@@ -177,9 +177,7 @@ class _Backwards:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
 
-def _pushes(
-    back: _Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Pushes of the limits of the states in interval k that explain its costates best: (q, m), (2, m)."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.stand.lower.shape[1]

@@ -122,7 +122,7 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """What the controls at each point could win within their limits, to second order, in cost per unit of s. (M,).
+    """What the controls could win in each interval within their limits, to second order, in units of cost. (N,).
 
     Args:
         along: The plan. costate: (M, nx).
@@ -132,9 +132,9 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     A control moves within its limits, and by its size at most where the Hamiltonian does not curve along it. Rows that
     push stay where they are.
     """
-    nu = along.form.nu
+    nu, n = along.form.nu, along.shape[0]
     if not nu:
-        return np.zeros(len(along.s))
+        return np.zeros(n)
     unit = along.sizes.control
     won = along.hold.charge(multipliers).sum(axis=1)
     gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
@@ -158,8 +158,35 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
             best[members] = np.maximum(best[members], -change)
             blocked[members, :nu] |= room <= DEPENDENT
         if (blocked == fixed).all():
-            return np.asarray(won + best)
+            break
         fixed = blocked
+    by_interval = ((won + best) * along.share).reshape(n, -1).sum(axis=1)
+    if along.mixed.size:
+        return np.asarray(by_interval)
+    free = slope(along, costate) * unit
+    flat = np.abs(curved).max(axis=(0, 2)) <= FLAT * max(scale, float(np.abs(free).max(initial=0.0)))
+    return np.asarray(by_interval + _kinks(along, free[:, flat], -low[:, flat], high[:, flat]))
+
+
+def _kinks(along: Linearisation, pull: np.ndarray, down: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """What the quadrature of max(pull, 0) down + max(-pull, 0) up (M, m) misses of intervals where pull turns. (N,)."""
+    (n, q), m = along.shape, pull.shape[1]
+    pull = pull.reshape(n, q, m)
+    turns = (pull.min(axis=1) < 0) & (pull.max(axis=1) > 0)
+    off = along.places - along.weight @ along.places
+    steep = np.einsum("j,kjm->km", along.weight * off, pull) / (along.weight @ off**2)
+    mean = np.einsum("j,kjm->km", along.weight, pull)
+    line = mean[:, None] + steep[:, None] * off[:, None]
+    first, last = mean + steep * (0.0 - along.weight @ along.places), mean + steep * (1.0 - along.weight @ along.places)
+    missed = np.zeros((n, m))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for sign, room in ((1.0, down), (-1.0, up)):
+            a, b = np.maximum(sign * first, 0.0), np.maximum(sign * last, 0.0)
+            exact = (b**2 - a**2) / (2 * sign * (last - first))
+            seen = np.einsum("j,kjm->km", along.weight, np.maximum(sign * line, 0.0))
+            width = np.minimum(room.reshape(n, q, m).mean(axis=1), 1.0)
+            missed += np.where(turns, width * (exact - seen), 0.0)
+    return np.asarray(along.width * missed.sum(axis=1))
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, rows: np.ndarray, scale: float) -> np.ndarray:
