@@ -23,6 +23,7 @@ __all__ = [
     "Solution",
     "check_belongs",
     "check_structure",
+    "drawn_in_at",
     "in_order_of",
     "stack",
     "unstack",
@@ -32,6 +33,7 @@ ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 1
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
+AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
 PLAIN = ("t", "variables", "multipliers")
 PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
@@ -79,6 +81,9 @@ class Solution:
         variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
+        drawn_in: By how much the lower and the upper bounds were drawn in, interval by interval, in the order states,
+            controls, path rows of the problem; at a node between two intervals the larger of both holds. None where the
+            plan was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
     """
 
     name: str
@@ -103,6 +108,7 @@ class Solution:
     seconds: dict[str, float]
     problem: Any = field(default=None, compare=False, repr=False)
     refinement: Refinement | None = None
+    drawn_in: np.ndarray | None = None
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
@@ -183,6 +189,8 @@ class Solution:
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
+        if self.drawn_in is not None:
+            arrays["drawn_in"] = self.drawn_in
         arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
         temporary = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
         try:
@@ -220,6 +228,7 @@ class Solution:
             if past is not None:
                 rounds = tuple(past["intervals"]), tuple(past["errors"])
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
+            fields["drawn_in"] = arrays.get("drawn_in")
             solution = cls(**head, **fields, **{name: arrays[name] for name in PLAIN})
             check_structure(solution)
             return solution
@@ -281,7 +290,22 @@ def in_order_of(form: Places, solution: Solution) -> Solution:
         curve = getattr(solution, interpolant)
         changes[pool] = {name: own[name] for name in names}
         changes[interpolant] = replace(curve, values=curve.values[:, :, columns])
+        if solution.drawn_in is not None and pool != "costates":
+            first = 0 if pool == "states" else sum(values.shape[1] for values in solution.states.values())
+            drawn = changes.setdefault("drawn_in", solution.drawn_in.copy())
+            drawn[:, :, first : first + len(columns)] = solution.drawn_in[:, :, first + columns]
     return replace(solution, **changes) if changes else solution
+
+
+def drawn_in_at(drawn_in: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """By how much bounds that are drawn in (2, N, m) on a mesh (N + 1,) are so at fractions ``at`` (M,).
+
+    At a node between two intervals it is the larger of both. Shape (2, M, m).
+    """
+    last = len(mesh) - 2
+    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
+    left, right = (drawn_in[:, side] for side in sides)
+    return np.asarray(np.maximum(left, right))
 
 
 def check_structure(solution: Solution) -> None:
@@ -329,3 +353,12 @@ def check_structure(solution: Solution) -> None:
         if values.shape != (breaks.size - 1, nodes.size, columns):
             shape = (breaks.size - 1, nodes.size, columns)
             raise refuse(f"{interpolant}.values", f"have shape {values.shape}, not {shape}")
+    if solution.drawn_in is not None:
+        drawn, entries = (
+            real("drawn_in", solution.drawn_in, 3),
+            sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values()),
+        )
+        shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
+        if drawn.shape[:2] != shape[:2] or drawn.shape[2] < entries or not (drawn >= 0).all() or np.isinf(drawn).any():
+            words = f"is no array of finite numbers, zero or above, of shape {shape} or with path rows behind"
+            raise refuse("drawn_in", words)

@@ -6,6 +6,8 @@ bound is drawn in, interval by interval, by what the plan exceeded it there, unt
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,8 @@ import numpy as np
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError
-from ocp.problem.formulation import Bounds, Formulation
-from ocp.solution import ByName, Guess, Solution
+from ocp.problem.formulation import Formulation
+from ocp.solution import ByName, Guess, Solution, drawn_in_at
 
 __all__ = ["tighten"]
 
@@ -36,7 +38,8 @@ def tighten(
     """Solve so that every inequality holds between the points of the grid as well.
 
     The plan is the optimum under bounds that are drawn in where it would have exceeded them, so it costs a little more
-    than that of :func:`ocp.methods.solve`; finer grids close the gap. Equalities are not touched: refine for them.
+    than that of :func:`ocp.methods.solve`; finer grids close the gap. Equalities are not touched: refine for them. The
+    plan keeps the bounds that it was solved under, ``Solution.drawn_in``: it is an optimum under those alone.
 
     Args:
         problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
@@ -52,20 +55,24 @@ def tighten(
     form, fragment = prepared.formulation, prepared.fragment
     p = form.parameter_vector(dict(parameters or {}))
     bounds = form.bound_values(p)
-    where = _places(form, fragment)
-    moves = {key: np.zeros(len(where[key[-1]][0])) for key in ("lbx", "ubx", "lbg", "ubg")}
+    index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
+    low, high = bounds[0][index], bounds[1][index]
+    with np.errstate(invalid="ignore"):
+        most = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
+    places = _places(form, fragment)
+    drawn = np.zeros((2, len(fragment.mesh) - 1, len(index)))
     for _ in range(MOST_ROUNDS):
+        moves = {}
+        for kind, place in places.items():
+            moves[f"lb{kind}"], moves[f"ub{kind}"] = place(drawn)
         solution = prepared.solve(parameters, guess, tighter=moves)
-        beyond, times = _excess(form, solution, p, bounds)
-        if max(part.max(initial=0.0) for part in beyond) <= tolerance:
-            return solution
-        for side, part in zip(("l", "u"), beyond, strict=True):
-            for kind, (entry, left, right) in where.items():
-                most = np.where(entry >= 0, np.maximum(part[left, entry], part[right, entry]), 0.0)
-                moves[f"{side}b{kind}"] += np.where(most > tolerance / 2, DRAWN_IN * most, 0.0)
+        beyond, times = _excess(form, solution, p, low, high)
+        if beyond.max(initial=0.0) <= tolerance:
+            return replace(solution, drawn_in=drawn) if drawn.any() else solution
+        drawn = np.minimum(drawn + np.where(beyond > tolerance / 2, DRAWN_IN * beyond, 0.0), most)
         guess = solution
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
-    either = np.maximum(*beyond)
+    either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
     raise SolveError(
         f"problem {form.name!r}: after {MOST_ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
@@ -78,28 +85,28 @@ def tighten(
     )
 
 
-def _places(form: Formulation, fragment: Fragment) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of variables ("x") and rows ("g"): which state, control or path row, else -1, and the intervals it stands in."""
+def _places(form: Formulation, fragment: Fragment) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """Of variables ("x") and rows ("g"): by how much their bounds move, (2, n), for bounds drawn in by (2, N, m)."""
     entry_of = np.full(max(int(index.max(initial=0)) for index in form.bounds.places.values()) + 1, -1)
     offsets = {"state": 0, "initial": 0, "terminal": 0, "control": form.nx, "path": form.nx + form.nu}
     for kind, offset in offsets.items():
         index = form.bounds.places[kind]
         entry_of[index] = offset + np.arange(len(index))
-    found, n = {}, len(fragment.mesh) - 1
-    for kind, index, at in (
-        ("x", fragment.variable_bounds, fragment.variable_fraction),
-        ("g", fragment.row_bounds, fragment.row_fractions),
-    ):
-        left = np.clip(np.searchsorted(fragment.mesh, at - 1e-12) - 1, 0, n - 1)
-        right = np.clip(np.searchsorted(fragment.mesh, at + 1e-12) - 1, 0, n - 1)
-        found[kind] = (entry_of[index], left, right)
-    return found
+
+    def place(index: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        entry, every = entry_of[index], np.arange(len(index))
+        return lambda drawn: np.where(entry >= 0, drawn_in_at(drawn, fragment.mesh, at)[:, every, entry], 0.0)
+
+    return {
+        "x": place(fragment.variable_bounds, fragment.variable_fraction),
+        "g": place(fragment.row_bounds, fragment.row_fractions),
+    }
 
 
 def _excess(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Largest excess below and above the bounds in every interval, (N, nx + nu + path) each; ends of intervals, s."""
+    form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Largest excess below and above the bounds (m,) in every interval, (2, N, m); ends of intervals, s."""
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     pieces = (len(solution.state_interpolant.breaks) - 1) // n
@@ -111,15 +118,13 @@ def _excess(
     u = solution.control_interpolant.within(owner, np.tile(place, n))
     horizon = solution.horizon
     g = form.sampled([form.path.expression], x, u, horizon * s, horizon, p)[0]
-    index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
-    low, high = bounds[0][index], bounds[1][index]
     given = np.where(low < high, 1.0, np.nan)  # equalities are not looked at
     values = np.hstack([x, u, g]) * given
-    below, above = (
+    beyond = [
         _peaks(np.where(np.isfinite(part), part, -np.inf).reshape(n, len(place), -1)).clip(min=0.0)
         for part in (low - values, values - high)
-    )
-    return (below, above), breaks * horizon
+    ]
+    return np.stack(beyond), breaks * horizon
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:

@@ -1,5 +1,10 @@
+"""Limits hold between the points too, and the plan keeps the bounds that it was solved under."""
+
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -7,6 +12,8 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
+from ocp.problem.formulation import Formulation
+from ocp.solution import drawn_in_at, in_order_of
 from tests.ocp.problems import double_integrator, plant
 
 METHODS = [
@@ -34,20 +41,129 @@ def beyond(solution: Solution) -> float:
     return float(max((at["q"] - 1 / 9).max(), (np.abs(at["u"]) - 9).max(), (np.abs(power) - 4.5).max()))
 
 
+@cache
+def tightened(method: Any) -> Solution:
+    return tighten(walled(), method)
+
+
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_limits_hold_between_the_points(method: Any) -> None:
-    plain, tight = solve(walled(), method), tighten(walled(), method)
+    plain, tight = solve(walled(), method), tightened(method)
     assert beyond(plain) > 5e-5
     assert beyond(tight) <= 1.001e-6
     assert plain.cost <= tight.cost <= plain.cost * 1.2
     assert not [f for f in tight.audit().failures if f.name.startswith(("bounds", "power"))]
 
 
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> None:
+    """States q, v, control u, path row power: at its own points the plan is within what was left of their bounds."""
+    tight = tightened(method)
+    mesh = tight.control_interpolant.breaks
+    assert tight.drawn_in is not None
+    assert tight.drawn_in.shape == (2, len(mesh) - 1, 4)
+    assert (tight.drawn_in >= 0).all()
+    assert tight.drawn_in[1, :, 0].max() > 0  # the ceiling
+    assert not tight.drawn_in[:, :, 1].any()  # a speed without bounds
+    lower, upper = np.array([-np.inf, -np.inf, -9, -4.5]), np.array([1 / 9, np.inf, 9, 4.5])
+    at = tight.t / tight.horizon
+    values = np.hstack([tight["q"], tight["v"], tight["u"], tight["u"] * tight["v"]])
+    below, above = drawn_in_at(tight.drawn_in, mesh, at)
+    inside = slice(1, -1)  # the ends of q and v are given
+    assert (values >= lower + below - 1e-7)[inside].all()
+    assert (values <= upper - above + 1e-7)[inside].all()
+    reach = np.isclose(values, upper - above, rtol=0, atol=1e-6) & (above > 1e-5)
+    assert reach[:, 0].any()  # an active limit is met where it was drawn in to, not where the problem has it
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_a_plan_is_the_optimum_under_the_bounds_that_it_keeps(method: Any) -> None:
+    """Solved anew under these bounds alone, as places of their own, it is the same plan."""
+    tight = tightened(method)
+    assert tight.drawn_in is not None
+    problem, _, v, u = double_integrator("walled", (0.0, 1.0), (0.0, -1.0), limit=9.0, ceiling=1 / 9)
+    problem.path("power", u * v, lower=-4.5, upper=4.5)
+    problem.minimize(running=u**2 / 2)
+    prepared = method.prepare(problem)
+    fragment, form = prepared.fragment, prepared.formulation
+    moves = {}
+    for kind, index, at in (
+        ("x", fragment.variable_bounds, fragment.variable_fraction),
+        ("g", fragment.row_bounds, fragment.row_fractions),
+    ):
+        by = drawn_in_at(tight.drawn_in, fragment.mesh, at)
+        for side, letter in enumerate("lu"):
+            move = np.zeros(len(index))
+            for entry, what in enumerate([("state", 0), ("state", 1), ("control", 0), ("path", 0)]):
+                mine = index == form.bounds.places[what[0]][what[1]]
+                move[mine] = by[side, mine, entry]
+            moves[f"{letter}b{kind}"] = move
+    again = prepared.solve(tighter=moves)
+    assert again.cost == pytest.approx(tight.cost, rel=1e-7)
+    np.testing.assert_allclose(again["q"], tight["q"], atol=1e-6)
+
+
+def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
+    drawn = np.zeros((2, 3, 1))
+    drawn[0, :, 0], drawn[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
+    mesh = np.array([0.0, 0.2, 0.7, 1.0])
+    below, above = drawn_in_at(drawn, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
+    assert below.tolist() == [1, 1, 3, 3, 3, 2, 2]
+    assert above.tolist() == [0, 0, 0, 0, 5, 5, 5]
+
+
+def test_what_was_drawn_in_comes_back_from_a_file(tmp_path: Path) -> None:
+    tight = tightened(METHODS[0])
+    tight.save(tmp_path / "plan.npz")
+    loaded = Solution.load(tmp_path / "plan.npz")
+    assert loaded.drawn_in is not None
+    assert tight.drawn_in is not None
+    assert loaded.drawn_in.tobytes() == tight.drawn_in.tobytes()
+    solve(walled(), METHODS[0]).save(tmp_path / "plan.npz")
+    assert Solution.load(tmp_path / "plan.npz").drawn_in is None
+
+
+@pytest.mark.parametrize("damage", ["intervals", "entries", "negative", "nan", "inf", "words", "flat"])
+def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: Path) -> None:
+    drawn = tightened(METHODS[0]).drawn_in
+    assert drawn is not None
+    bad = {
+        "intervals": drawn[:, 1:],
+        "entries": drawn[:, :, :2],
+        "negative": drawn - 1.0,
+        "nan": drawn * np.nan,
+        "inf": drawn + np.inf,
+        "words": drawn.astype(str),
+        "flat": drawn[0],
+    }[damage]
+    replace(tightened(METHODS[0]), drawn_in=bad).save(tmp_path / "plan.npz")
+    with pytest.raises(ProblemError, match="drawn_in") as caught:
+        Solution.load(tmp_path / "plan.npz")
+    assert caught.value.name == "drawn_in"
+
+
+def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
+    tight = tightened(METHODS[0])
+    assert tight.drawn_in is not None
+    other = Problem("walled, declared in another order")
+    v, q = other.state("v"), other.state("q", upper=1 / 9)
+    u = other.control("u")
+    other.dynamics(q, v)
+    other.dynamics(v, u)
+    other.path("power", u * v, lower=-4.5, upper=4.5)
+    other.horizon(1.0)
+    moved = in_order_of(Formulation(other), tight)
+    assert moved.drawn_in is not None
+    np.testing.assert_array_equal(moved.drawn_in, tight.drawn_in[:, :, [1, 0, 2, 3]])
+
+
 def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:
     problem, q, u = plant("free", state="q", initial=0.0, terminal=1.0, lower=-1.0, upper=2.0, u={"upper": 5.0})
     problem.dynamics(q, u)
     problem.minimize(running=u**2)
-    assert tighten(problem, Collocation(4)).cost == solve(problem, Collocation(4)).cost
+    tight = tighten(problem, Collocation(4))
+    assert tight.cost == solve(problem, Collocation(4)).cost
+    assert tight.drawn_in is None
 
 
 def test_it_takes_parameters_and_a_free_horizon() -> None:
