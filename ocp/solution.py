@@ -82,8 +82,9 @@ class Solution:
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
         drawn_in: By how much the lower and the upper bounds were drawn in, interval by interval, in the order states,
-            controls, path rows of the problem; at a node between two intervals the larger of both holds. None where the
-            plan was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
+            controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
+            jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
+            was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
     """
 
     name: str
@@ -300,7 +301,7 @@ def in_order_of(form: Places, solution: Solution) -> Solution:
 def drawn_in_at(drawn_in: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
     """By how much bounds that are drawn in (2, N, m) on a mesh (N + 1,) are so at fractions ``at`` (M,).
 
-    At a node between two intervals it is the larger of both. Shape (2, M, m).
+    At a node between two intervals the larger of both, as holds for what they share. Shape (2, M, m).
     """
     last = len(mesh) - 2
     sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
@@ -354,10 +355,8 @@ def check_structure(solution: Solution) -> None:
             shape = (breaks.size - 1, nodes.size, columns)
             raise refuse(f"{interpolant}.values", f"have shape {values.shape}, not {shape}")
     if solution.drawn_in is not None:
-        drawn, entries = (
-            real("drawn_in", solution.drawn_in, 3),
-            sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values()),
-        )
+        drawn = real("drawn_in", solution.drawn_in, 3)
+        entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
         shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
         if drawn.shape[:2] != shape[:2] or drawn.shape[2] < entries or not (drawn >= 0).all() or np.isinf(drawn).any():
             words = f"is no array of finite numbers, zero or above, of shape {shape} or with path rows behind"

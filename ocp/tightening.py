@@ -6,7 +6,6 @@ bound is drawn in, interval by interval, by what the plan exceeded it there, unt
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,13 +15,14 @@ from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError
 from ocp.problem.formulation import Formulation
-from ocp.solution import ByName, Guess, Solution, drawn_in_at
+from ocp.solution import AT_NODE, ByName, Guess, Solution
 
 __all__ = ["tighten"]
 
 PLACES_A_DEGREE = 10  # places looked at for each degree of the plan's polynomials in an interval
 MOST_ROUNDS = 20
-DRAWN_IN = 1.2  # share of the excess that a bound is drawn in by: the plan follows it in part only
+FOLLOWED = 0.8  # share of a bound's move that the plan is taken to follow, until it is seen
+LEAST_SHARE = 0.1  # of a bound's move: a plan that follows it less is not moved by it
 
 
 def tighten(
@@ -59,18 +59,24 @@ def tighten(
     low, high = bounds[0][index], bounds[1][index]
     with np.errstate(invalid="ignore"):
         most = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
-    places = _places(form, fragment)
+    places = _places(form, fragment, shared=method.control == "linear")
     drawn = np.zeros((2, len(fragment.mesh) - 1, len(index)))
+    move, before, followed = np.zeros_like(drawn), np.zeros_like(drawn), np.full_like(drawn, FOLLOWED)
     for _ in range(MOST_ROUNDS):
         moves = {}
-        for kind, place in places.items():
-            moves[f"lb{kind}"], moves[f"ub{kind}"] = place(drawn)
+        for kind, (entry, left, right) in places.items():
+            both = np.maximum(drawn[:, left, entry], drawn[:, right, entry])
+            moves[f"lb{kind}"], moves[f"ub{kind}"] = np.where(entry >= 0, both, 0.0)
         solution = prepared.solve(parameters, guess, tighter=moves)
         beyond, times = _excess(form, solution, p, low, high)
         if beyond.max(initial=0.0) <= tolerance:
             return replace(solution, drawn_in=drawn) if drawn.any() else solution
-        drawn = np.minimum(drawn + np.where(beyond > tolerance / 2, DRAWN_IN * beyond, 0.0), most)
-        guess = solution
+        # as in the secant method, each bound by itself; one that its neighbours moved says nothing
+        share = (before - beyond) / np.where(move > 0, move, np.inf)
+        followed = np.where((beyond > 0) & (share > LEAST_SHARE), np.minimum(share, 1.0), followed)
+        drawn_before, before, guess = drawn, beyond, solution
+        drawn = np.minimum(drawn + np.where(beyond > tolerance / 2, beyond / followed, 0.0), most)
+        move = drawn - drawn_before
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -85,22 +91,30 @@ def tighten(
     )
 
 
-def _places(form: Formulation, fragment: Fragment) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-    """Of variables ("x") and rows ("g"): by how much their bounds move, (2, n), for bounds drawn in by (2, N, m)."""
+def _places(
+    form: Formulation, fragment: Fragment, shared: bool
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of variables ("x") and rows ("g"): which state, control or path row, else -1, and the intervals it stands in.
+
+    Args:
+        shared: Whether a control at a node belongs to both intervals; else it, and what contains it, may jump there.
+    """
     entry_of = np.full(max(int(index.max(initial=0)) for index in form.bounds.places.values()) + 1, -1)
     offsets = {"state": 0, "initial": 0, "terminal": 0, "control": form.nx, "path": form.nx + form.nu}
     for kind, offset in offsets.items():
         index = form.bounds.places[kind]
         entry_of[index] = offset + np.arange(len(index))
-
-    def place(index: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        entry, every = entry_of[index], np.arange(len(index))
-        return lambda drawn: np.where(entry >= 0, drawn_in_at(drawn, fragment.mesh, at)[:, every, entry], 0.0)
-
-    return {
-        "x": place(fragment.variable_bounds, fragment.variable_fraction),
-        "g": place(fragment.row_bounds, fragment.row_fractions),
-    }
+    alone = np.concatenate([np.zeros(form.nx, bool), np.ones(form.nu, bool), form.path.uses_control, [False]]) & ~shared
+    found, last = {}, len(fragment.mesh) - 2
+    for kind, index, at in (
+        ("x", fragment.variable_bounds, fragment.variable_fraction),
+        ("g", fragment.row_bounds, fragment.row_fractions),
+    ):
+        left, right = (np.clip(np.searchsorted(fragment.mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
+        own = left if kind == "x" else np.clip(fragment.row_stages, 0, last)
+        entry = entry_of[index]
+        found[kind] = entry, np.where(alone[entry], own, left), np.where(alone[entry], own, right)
+    return found
 
 
 def _excess(

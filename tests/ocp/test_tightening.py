@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
+from ocp.direct.prepared import Prepared
 from ocp.problem.formulation import Formulation
 from ocp.solution import drawn_in_at, in_order_of
-from tests.ocp.problems import double_integrator, plant
+from tests.ocp.problems import double_integrator, plant, van_der_pol
 
 METHODS = [
     Collocation(10, degree=3),
@@ -66,41 +67,52 @@ def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> Non
     assert tight.drawn_in[1, :, 0].max() > 0  # the ceiling
     assert not tight.drawn_in[:, :, 1].any()  # a speed without bounds
     lower, upper = np.array([-np.inf, -np.inf, -9, -4.5]), np.array([1 / 9, np.inf, 9, 4.5])
-    at = tight.t / tight.horizon
-    values = np.hstack([tight["q"], tight["v"], tight["u"], tight["u"] * tight["v"]])
-    below, above = drawn_in_at(tight.drawn_in, mesh, at)
-    inside = slice(1, -1)  # the ends of q and v are given
-    assert (values >= lower + below - 1e-7)[inside].all()
-    assert (values <= upper - above + 1e-7)[inside].all()
-    reach = np.isclose(values, upper - above, rtol=0, atol=1e-6) & (above > 1e-5)
-    assert reach[:, 0].any()  # an active limit is met where it was drawn in to, not where the problem has it
+    curve = tight.control_interpolant
+    owner = np.repeat(np.arange(len(mesh) - 1), len(curve.nodes))
+    at = mesh[owner] + np.diff(mesh)[owner] * np.tile(curve.nodes, len(mesh) - 1)
+    u = curve.values.reshape(-1, 1)
+    shared = drawn_in_at(tight.drawn_in, mesh, at)
+    states = np.hstack([tight.at_fraction(at)["q"], tight.at_fraction(at)["v"]])
+    values = np.hstack([states, u, u * states[:, 1:]])
+    jumps = [False, False, *[getattr(method, "control", "") != "linear"] * 2]
+    below, above = np.where(jumps, tight.drawn_in[:, owner], shared)
+    points = isinstance(method, Collocation) and method.control == "points"  # where all of it is asked
+    looked_at = slice(None) if points else slice(2, 3)
+    inside = (at > 0) & (at < 1)  # the ends of q and v are given
+    assert (values >= lower + below - 1e-7)[inside, looked_at].all()
+    assert (values <= upper - above + 1e-7)[inside, looked_at].all()
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
-def test_a_plan_is_the_optimum_under_the_bounds_that_it_keeps(method: Any) -> None:
-    """Solved anew under these bounds alone, as places of their own, it is the same plan."""
+def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
     tight = tightened(method)
     assert tight.drawn_in is not None
-    problem, _, v, u = double_integrator("walled", (0.0, 1.0), (0.0, -1.0), limit=9.0, ceiling=1 / 9)
-    problem.path("power", u * v, lower=-4.5, upper=4.5)
-    problem.minimize(running=u**2 / 2)
-    prepared = method.prepare(problem)
-    fragment, form = prepared.fragment, prepared.formulation
-    moves = {}
-    for kind, index, at in (
-        ("x", fragment.variable_bounds, fragment.variable_fraction),
-        ("g", fragment.row_bounds, fragment.row_fractions),
-    ):
-        by = drawn_in_at(tight.drawn_in, fragment.mesh, at)
-        for side, letter in enumerate("lu"):
-            move = np.zeros(len(index))
-            for entry, what in enumerate([("state", 0), ("state", 1), ("control", 0), ("path", 0)]):
-                mine = index == form.bounds.places[what[0]][what[1]]
-                move[mine] = by[side, mine, entry]
-            moves[f"{letter}b{kind}"] = move
-    again = prepared.solve(tighter=moves)
-    assert again.cost == pytest.approx(tight.cost, rel=1e-7)
-    np.testing.assert_allclose(again["q"], tight["q"], atol=1e-6)
+    at = tight.t / tight.horizon
+    _, above = drawn_in_at(tight.drawn_in, tight.control_interpolant.breaks, at)[:, :, 0]
+    assert (tight["q"][:, 0] <= 1 / 9 - above + 1e-7)[1:-1].all()
+    reached = np.isclose(tight["q"][:, 0], 1 / 9 - above, rtol=0, atol=1e-6)
+    assert (reached & (above > 1e-5)).any()
+
+
+def test_a_control_that_may_jump_is_drawn_in_for_its_own_interval_alone() -> None:
+    """Van der Pol's control leaves its limit in one interval, and only there its polynomial goes beyond."""
+    tight = tighten(van_der_pol(lower=-0.5, upper=0.3, horizon=4.0), Collocation(10))
+    assert tight.drawn_in is not None
+    assert np.argwhere(tight.drawn_in)[:, 1:].tolist() == [[7, 2]]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_few_solves_are_enough(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    solved = []
+    once = Prepared.solve
+
+    def counted(self: Prepared, *arguments: Any, **named: Any) -> Solution:
+        solved.append(self)
+        return once(self, *arguments, **named)
+
+    monkeypatch.setattr(Prepared, "solve", counted)
+    tighten(walled(), method)
+    assert len(solved) <= 4
 
 
 def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
