@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -167,6 +168,68 @@ def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
     moved = in_order_of(Formulation(other), tight)
     assert moved.drawn_in is not None
     np.testing.assert_array_equal(moved.drawn_in, tight.drawn_in[:, :, [1, 0, 2, 3]])
+
+
+def round_a_disc() -> Problem:
+    """A point that goes round a disc: a curved path inequality of the states."""
+    problem = Problem("round a disc")
+    x = problem.state("x", 2, initial=[-1.0, 0.01], terminal=[1.0, 0.0])
+    u = problem.control("u", 2)
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.path("clear", ca.sumsqr(x), lower=0.25)
+    problem.minimize(running=ca.sumsqr(u) / 2)
+    return problem
+
+
+def weak_motor() -> Problem:
+    """A pendulum swung up in a given time by a torque that does not hold it, its power limited too."""
+    problem = Problem("weak motor")
+    angle = problem.state("angle", initial=0.0, terminal=2.0)
+    rate = problem.state("rate", initial=0.0, terminal=0.0, upper=1.1)
+    torque = problem.control("torque", lower=-2.0, upper=2.0)
+    problem.dynamics(angle, rate)
+    problem.dynamics(rate, torque - ca.sin(angle))
+    problem.path("power", torque * rate, upper=0.9)
+    problem.horizon(2.5)
+    problem.minimize(running=torque**2 / 2)
+    return problem
+
+
+def hurried() -> Problem:
+    """A carriage whose speed is limited, in a free time with a little effort."""
+    problem, _, v, u = double_integrator("hurried", horizon=None, limit=4.0)
+    final = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
+    problem.path("speed", v, upper=0.7)
+    problem.minimize(terminal=final, running=0.02 * u**2)
+    return problem
+
+
+PANEL: dict[str, Callable[[], Problem]] = {
+    "walled": walled,
+    "limited control": lambda: van_der_pol(lower=-0.5, upper=0.3, horizon=4.0),
+    "round a disc": round_a_disc,
+    "weak motor": weak_motor,
+    "hurried": hurried,
+}
+PANEL_METHODS = [
+    Collocation(30),
+    Collocation(30, 4, "legendre"),
+    Collocation(40, control="held"),
+    MultipleShooting(40, steps=2),
+    MultipleShooting(40, steps=2, control="linear"),
+]
+
+
+@pytest.mark.parametrize("method", PANEL_METHODS, ids=str)
+@pytest.mark.parametrize("name", PANEL)
+def test_a_tightened_plan_with_an_active_limit_does_what_is_asked(name: str, method: Any) -> None:
+    tight = tighten(PANEL[name](), method)
+    audit = tight.audit()
+    asked = ("solver", "integration", "cost, relative", "reported", "horizon", "bounds", "start", "end", "state jump")
+    rows = [f for f in audit.findings if f.name.startswith(asked) or f.name in audit.constraints]
+    assert not [f for f in rows if not f.passed]
+    assert max(audit.constraints.values()) < 2e-6 + 10 * audit.integration_error
 
 
 def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:
