@@ -71,7 +71,7 @@ class AuditError(Detailed, RuntimeError):
 
 
 class RefinementWarning(Detailed, UserWarning):
-    """A refinement that stopped at its cap before its tolerance was reached."""
+    """A refinement that stopped with a row of the audit beyond its limit; ``value`` is the share that it is of it."""
 
 
 @contextmanager
