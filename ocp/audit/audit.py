@@ -7,14 +7,12 @@ a grid ten times as fine, and the minimum principle is checked with multipliers 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ocp.audit.accessory import FLAT
-from ocp.audit.costates import Adjoint, adjoint
-from ocp.audit.curvature import Curvature, curvature
-from ocp.audit.principle import Optimality, minimum_principle
+from ocp.audit.optimality import Optimality, optimality
+from ocp.audit.principle import FLAT
 from ocp.audit.reintegration import Reintegration, reintegrate, violations
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
@@ -34,10 +32,12 @@ class Finding:
 
     Attributes:
         name: What was looked at.
-        value: How far it is off, in the unit of the thing itself or relative where the name says so.
+        value: How far it is off, in ``unit`` or relative where the name says so.
         limit: What it may be, or None where it is only told.
         time: Where it is worst, s, or None.
         note: What the value means where that is not plain.
+        verdict: "feasible" or "optimal", to which of the two it belongs.
+        unit: Of value and limit, "" where they are shares or no unit was declared.
     """
 
     name: str
@@ -45,6 +45,8 @@ class Finding:
     limit: float | None = None
     time: float | None = None
     note: str = ""
+    verdict: str = "feasible"
+    unit: str = ""
 
     @property
     def passed(self) -> bool:
@@ -58,17 +60,18 @@ class Audit:
     Attributes:
         name: Of the problem.
         findings: One for every check.
+        undecided: Why it is not decided whether the plan is a local minimum, or "".
         constraints: Worst violation of every bound and constraint by name, on the fine grid; 0 where it holds.
         integration_error: Largest distance of the plan's states from the re-integrated ones, relative to the size of
             each state, over the whole horizon. local_errors: the same of each interval alone, from its own start. (N,)
         t, states, controls: The re-integrated plan: times, s (M,), and values by name, each (M, n). Interior mesh
             times stand twice, with the controls of both sides.
-        optimality: Stationarity and Hamiltonian. adjoint: The costates and their conditions at the ends.
-        curvature: The second variation of the cost.
+        optimality: Costates, multipliers, curvature, and what the plan loses. lost: of the cost in each interval. (N,)
     """
 
     name: str
     findings: tuple[Finding, ...]
+    undecided: str
     constraints: dict[str, float]
     integration_error: float
     local_errors: np.ndarray
@@ -76,18 +79,33 @@ class Audit:
     states: dict[str, np.ndarray]
     controls: dict[str, np.ndarray]
     optimality: Optimality
-    adjoint: Adjoint
-    curvature: Curvature
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the motion does what is asked: dynamics, bounds, constraints, ends, horizon, the cost reported."""
+        return all(finding.passed for finding in self.findings if finding.verdict == "feasible")
+
+    @property
+    def optimal(self) -> bool | None:
+        """Whether the plan is a local minimum; None where that is not decided, see ``undecided``."""
+        if not all(finding.passed for finding in self.findings if finding.verdict == "optimal"):
+            return False
+        return None if self.undecided else True
 
     @property
     def passed(self) -> bool:
-        """Whether every finding is within its limit."""
-        return all(finding.passed for finding in self.findings)
+        """Whether the plan is feasible, and a local minimum."""
+        return self.feasible and self.optimal is True
 
     @property
     def failures(self) -> tuple[Finding, ...]:
         """The findings beyond their limits."""
         return tuple(finding for finding in self.findings if not finding.passed)
+
+    @property
+    def lost(self) -> np.ndarray:
+        """What of the cost each interval loses to the extremal beside the plan, in units of cost. Shape (N,)."""
+        return self.optimality.lost
 
     def __getitem__(self, name: str) -> Finding:
         """A finding by its name."""
@@ -96,17 +114,38 @@ class Audit:
                 return finding
         raise unknown_name("finding", name, [finding.name for finding in self.findings])
 
+    @property
+    def sentence(self) -> str:
+        """What follows from the findings, in one sentence."""
+        if not self.feasible:
+            worst = next(f for f in self.failures if f.verdict == "feasible")
+            where = "" if worst.time is None else f" at {worst.time:.4g} s"
+            return f"must not be run: {worst.name} is {worst.value:.3g}{where}, {worst.limit:.3g} allowed"
+        if self.optimal is None:
+            return f"may be run; whether it is a local minimum is not decided: {self.undecided}"
+        if not self.optimal:
+            worst = next(f for f in self.failures if f.verdict == "optimal")
+            return f"may be run, but is no local minimum: {worst.name} is {worst.value:.3g}, {worst.limit:.3g} allowed"
+        share = float(self.lost.sum()) / self.optimality.cost_size
+        return f"may be run; a local minimum; at most {share:.2g} of its cost dearer than the extremal beside it"
+
     def __str__(self) -> str:
         width = max(len(finding.name) for finding in self.findings)
         lines = [f"Audit of {self.name!r}: {'passed' if self.passed else 'FAILED'}"]
-        lines.append(f"  {'check':<{width}}  {'value':>10}  {'limit':>10}  {'at, s':>8}")
-        for f in self.findings:
-            limit = "" if f.limit is None else f"{f.limit:.2e}"
-            time = "" if f.time is None else f"{f.time:.4f}"
-            verdict = "" if f.limit is None else "ok" if f.passed else "FAILED"
-            line = f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {time:>8}  {verdict:<6}  {f.note}"
-            lines.append(line.rstrip())
-        return "\n".join(lines)
+        words = {True: "yes", False: "NO", None: "not decided"}
+        for verdict, holds in (("feasible", self.feasible), ("optimal", self.optimal)):
+            title = f"{verdict}: {words[holds]}"
+            lines.append(f"  {title:<{width}}  {'value':>10}  {'limit':>10}  {'unit':<6}  {'at, s':>8}")
+            for f in self.findings:
+                if f.verdict == verdict:
+                    limit = "" if f.limit is None else f"{f.limit:.2e}"
+                    time = "" if f.time is None else f"{f.time:.4f}"
+                    ok = "" if f.limit is None else "ok" if f.passed else "FAILED"
+                    line = (
+                        f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
+                    )
+                    lines.append(line.rstrip())
+        return "\n".join([*lines, f"The plan {self.sentence}."])
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not a number fails by name
@@ -116,9 +155,10 @@ def audit(
     *,
     integration: float = 1e-3,
     constraints: float = 1e-3,
-    stationarity: float = 1e-2,
-    drift: float = 5e-2,
+    lost: float = 1e-3,
     costates: float = 1e-2,
+    stationarity: float | None = None,
+    drift: float | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Audit:
     """Check a plan independently of the solver that made it.
@@ -128,9 +168,12 @@ def audit(
         integration: Largest relative distance from the re-integrated states, and relative error of the cost.
         constraints: Largest violation of a bound or constraint, as a share of its scale: the width of its range, else
             the size of its bound, else 1.
-        stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts.
-        drift: Largest change of the Hamiltonian where time does not enter, relative to its parts.
-        costates: Largest error of the costates against their own equation, and of the conditions at the ends, relative.
+        lost: What of its cost the plan may lose to the extremal beside it, as a share.
+        costates: Largest error of the costates against their own equation, summed over the plan, and of the conditions
+            at the ends, as a share of the cost.
+        stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts; None: it is told, and judged
+            by the cost that it loses.
+        drift: Largest change of the Hamiltonian where time does not enter, relative to its parts; None: it is told.
         tolerances: Largest violation by name of a state, control or constraint, in its own unit.
 
     Raises:
@@ -138,8 +181,9 @@ def audit(
             unknown.
     """
     limits = checked_mapping("audit: tolerances", tolerances)
-    named = {"integration": integration, "constraints": constraints, "stationarity": stationarity}
-    for name, limit in {**named, "drift": drift, "costates": costates, **limits}.items():
+    named = {"integration": integration, "constraints": constraints, "lost": lost, "costates": costates, **limits}
+    told = {"stationarity": stationarity, "drift": drift}
+    for name, limit in {**named, **{k: v for k, v in told.items() if v is not None}}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
             raise ProblemError(words, name=name, value=limit)
@@ -152,14 +196,14 @@ def audit(
     points = max(solution.state_interpolant.values.shape[1] - 1, 1)
     pieces = (len(solution.state_interpolant.breaks) - 1) // (len(solution.control_interpolant.breaks) - 1)
     again = reintegrate(form, solution, p, GRID_FACTOR * points * max(pieces, 1))
-    optimality = minimum_principle(form, solution, p, bounds)
+    found = optimality(form, solution, p, bounds)
 
     scale = state_scale(form, again.plan)
     errors = np.abs(again.states - again.plan) / scale
     local = np.abs(again.local - again.plan) / scale
     n = int(again.interval[-1]) + 1
     local_errors = local.reshape(n, -1).max(axis=1)
-    findings = [Finding("solver", 0.0 if solution.success else np.inf, 0.0, None, solution.status)]
+    findings = []
     note = "" if again.broke_down is None else f"the integration broke down at {again.broke_down:.6g} s"
     findings.append(worst("integration error, relative", errors.max(axis=1), again.t, integration, note))
     findings.append(worst("integration error of one interval", local.max(axis=1), again.t, integration))
@@ -181,23 +225,21 @@ def audit(
 
     findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, integration))
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, None))
-    findings += optimality_findings(form, optimality, stationarity, drift)
-    costate = adjoint(form, solution, p, bounds)
-    findings += costate_findings(costate, optimality, costates)
-    second = curvature(form, solution, p, bounds)
-    findings += curvature_findings(second, solution)
+    findings += optimality_findings(form, found, lost, costates, stationarity, drift)
+    undecided = found.curvature.flat
+    if not solution.success:
+        undecided = f"the solver says {solution.status}"
     return Audit(
         form.name,
         tuple(findings),
+        undecided,
         total,
         float(np.max(errors)) if np.all(np.isfinite(errors)) else np.inf,
         np.where(np.isfinite(local_errors), local_errors, np.inf),
         again.t,
         unstack(solution.states, again.states),
         unstack(solution.controls, again.controls),
-        optimality,
-        costate,
-        second,
+        found,
     )
 
 
@@ -209,49 +251,32 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
     return Finding("horizon", miss, HORIZON_SLACK * solution.horizon, None, f"{solution.horizon:.6g} s, asked {asked}")
 
 
-def optimality_findings(form: Formulation, found: Optimality, stationarity: float, drift: float) -> list[Finding]:
-    """Stationarity and constancy of the Hamiltonian."""
-    findings = []
-    if form.nu:
-        note = f"{np.max(found.stationarity, initial=0.0):.2e} in cost per unit of control and second"
-        gradient = found.stationarity / found.gradient_scale
-        findings.append(worst("stationarity, relative", gradient, found.t, stationarity, note))
-    name, limit, note = "Hamiltonian drift, relative", drift, f"{found.drift:.2e} in cost per second"
-    if not form.autonomous:
-        name, note = "Hamiltonian change, relative", f"{note}; time enters the problem"
-    findings.append(
-        Finding(name, found.drift / found.hamiltonian_scale, limit if form.autonomous else None, None, note)
-    )
-    return findings
-
-
-def costate_findings(found: Adjoint, optimality: Optimality, limit: float) -> list[Finding]:
-    """The costate equation and the conditions at the ends."""
-    findings = []
-    if found.integrated is None:
-        findings.append(Finding("costate equation, relative", 0.0, None, None, f"not integrated: {found.reason}"))
-    else:
-        errors = np.abs(found.integrated - found.plan).max(axis=1) / found.scale
-        findings.append(worst("costate equation, relative", errors, found.t, limit))
-    note = f"{found.transversality:.2e} in cost per unit of state"
-    findings.append(Finding("transversality, relative", found.transversality / found.scale, limit, None, note))
-    if found.horizon:
-        note = f"{found.horizon:.2e} in cost per second"
-        relative = found.horizon / optimality.hamiltonian_scale
-        findings.append(Finding("condition of the free horizon, relative", relative, limit, None, note))
-    return findings
-
-
-def curvature_findings(found: Curvature, solution: Solution) -> list[Finding]:
-    """Second order: a negative curvature fails; where it is not decided, and what the controls lose, is only told."""
-    note = f"not decided: {found.flat}" if found.upwards is None else f"least {found.least:.3g} of the largest"
-    limit = None if found.upwards is None else 0.0
-    size = max(abs(solution.cost), np.finfo(float).tiny)
-    downwards = 0.0 if found.upwards is not False else max(-found.least, FLAT)
-    return [
-        Finding("curvature downwards, relative", downwards, limit, found.time, note),
-        Finding("cost lost by the controls, relative", found.lost / size, None, None, f"{found.lost:.3g} of the cost"),
+def optimality_findings(
+    form: Formulation, found: Optimality, lost: float, costates: float, stationarity: float | None, drift: float | None
+) -> list[Finding]:
+    """First and second order."""
+    cost, errors = found.cost_size, found.error_size
+    share = float(found.lost.sum()) / cost
+    rows = [
+        Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
+        Finding("costate equation, relative", float(found.adjoint.error.sum()) / errors, costates),
+        worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
+        Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]
+    if form.horizon_is_free:
+        rows.append(Finding("condition of the free horizon, relative", found.adjoint.ends.horizon / errors, costates))
+    second = found.curvature
+    note = f"not decided: {second.flat}" if second.upwards is None else f"least {second.least:.3g} of the largest"
+    downwards = 0.0 if second.upwards is not False else max(-second.least, FLAT)
+    limit = None if second.upwards is None else 0.0
+    rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
+    if form.nu:
+        rows.append(worst("stationarity, relative", found.stationarity, found.t, stationarity))
+    change, limit = found.hamiltonian.drift, drift if form.autonomous else None
+    name = "Hamiltonian drift, relative" if form.autonomous else "Hamiltonian change, relative"
+    note = f"{change:.2e} in cost per second" + ("" if form.autonomous else "; time enters the problem")
+    rows.append(Finding(name, change / found.hamiltonian.scale, limit, None, note))
+    return [replace(row, verdict="optimal") for row in rows]
 
 
 def state_scale(form: Formulation, plan: np.ndarray) -> np.ndarray:

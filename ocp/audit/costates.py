@@ -1,311 +1,347 @@
 """The costates of a plan against their own equation, lambda' = -dH/dx, and against the conditions at the ends.
 
-The costates come from the multipliers of whatever method made the plan; here they are integrated backwards along the
-plan, by an integrator that has never seen these multipliers. Bryson, Ho 1975, chapters 2 and 3.
-
-A bound of a state pushes on the costate with a density along an arc. A transcription that holds the bound at nodes only
-has an atom there instead: its costate follows the costate equation inside an interval and jumps at the nodes (at a free
-end that is at a bound, away from the gradient of the final cost). The reported value at a node is that before the jump.
-The value behind it is found from the costate equation, and a jump is accepted only where a bound is active and with the
-sign that its multiplier must have (Hartl, Sethi, Vickson 1995).
+The costates that a plan reports come from the multipliers of whatever method made it. Here each interval is integrated
+backwards from the reported costate at its end, by Gauss collocation, with multipliers of the active limits found anew.
+Limits of the states push on the costate with a density along an arc, and with an atom where a transcription holds them
+at single points, or where an arc begins (Hartl, Sethi, Vickson 1995): both are looked for, with the signs that they
+must have, and what they win over the gap to their limit counts as cost that is lost. What of the costates no such push
+explains is their error. It is stated in units of cost, each costate times the size of its state, and summed over the
+intervals, so that an error in every interval does not hide what all of them make together (Bryson, Ho 1975, chapters 2
+and 3).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ocp.console import quiet
-from ocp.curves import integrator, lagrange_expressions
-from ocp.problem.formulation import Bounds, Formulation
-from ocp.solution import Solution, stack
+from ocp.audit.linearisation import Limits, Linearisation
+from ocp.audit.principle import DEPENDENT, holders
+from ocp.curves import lagrange
+from ocp.solution import stack
 
-__all__ = ["Adjoint", "active_sides", "adjoint", "costates_at_samples"]
+__all__ = ["Adjoint", "Ends", "adjoint", "nonnegative"]
 
-IMMATERIAL = 1e-7  # share of the cost
-ACTIVE_WITHIN = 1e-5  # a bound nearer than this, relative to its scale, is active
+ROUNDS = 3
+"""Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
+TRUSTED = 1e-2
+"""Error of the costates, as a share of the cost, that weighs as much as a gap to a limit of the same share."""
+
+
+class Ends(NamedTuple):
+    """The conditions at the ends of a plan.
+
+    Attributes:
+        transversality: What of the costates at the ends no multiplier of an end condition explains, in units of cost.
+        horizon: What of the derivative in a free horizon none explains, times the horizon, in units of cost.
+        charge: What the multipliers win over the gaps to their limits, in units of cost.
+        end, start: Multipliers of the end and start conditions. Shapes (m,).
+    """
+
+    transversality: float
+    horizon: float
+    charge: float
+    end: np.ndarray
+    start: np.ndarray
 
 
 @dataclass(frozen=True)
 class Adjoint:
-    """How well the costates of a plan meet their equations.
+    """How well the costates of a plan meet their equations. Errors are in units of cost.
 
     Attributes:
-        t: Ends of the intervals in which the costates are interpolated, s. Shape (N + 1,).
-        integrated: Costates integrated backwards from the plan's own at the end. Shape (N + 1, nx), or None.
-        plan: The plan's costates there. Shape (N + 1, nx).
-        reason: Why they were not integrated, or "".
-        transversality: Largest entry that no multiplier of an end condition explains, in cost per unit of the state; a
-            bound that is active at an end explains what has the sign of its multiplier.
-        horizon: H(T) + dPhi/dT where the final time is free, in cost per second; 0 where it is given.
-        scale: Largest costate, or where all are immaterial the size at which they would not be.
+        t: Ends of the intervals, s. Shape (N + 1,).
+        costate: At the Gauss points, integrated backwards in every interval from the plan's own at its end. (N q, nx).
+        holding: Multipliers of the limits of the controls at the Gauss points, per unit of s. Shape (N q, nu + r).
+        standing: Multipliers of the limits of the states at the Gauss points, per unit of s, those at the ends of the
+            intervals spread over their neighbours. Shape (N q, nx + r').
+        error: Of the costates over each interval, from end to end. Shape (N,).
+        between: Of what is reported between the ends of an interval. Shape (N,).
+        charge: What the multipliers of the states' limits win over the gaps to them, in each interval. Shape (N,).
+        ends: The conditions at the ends.
     """
 
     t: np.ndarray
-    integrated: np.ndarray | None
-    plan: np.ndarray
-    reason: str
-    transversality: float
-    horizon: float
-    scale: float
-
-    @property
-    def error(self) -> float:
-        """Largest difference of integrated and plan's costates, relative to the largest costate of the plan."""
-        if self.integrated is None:
-            return 0.0
-        return float(np.max(np.abs(self.integrated - self.plan), initial=0.0) / self.scale)
+    costate: np.ndarray
+    holding: np.ndarray
+    standing: np.ndarray
+    error: np.ndarray
+    between: np.ndarray
+    charge: np.ndarray
+    ends: Ends
 
 
-def adjoint(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Adjoint:
-    """Integrate the costates of a plan backwards and look at their conditions at the ends."""
-    breaks = solution.state_interpolant.breaks
-    n = len(breaks) - 1
-    costates = solution.costate_interpolant
-    plan = costates(costates.breaks)
-    size = float(np.max(np.abs(costates.values), initial=1.0 if form.indifferent else 0.0))
-    scale = max(size, immaterial(solution)) or 1.0
-    ends = end_residuals(form, solution, p, bounds)
-    reason = obstacle(form, solution, bounds)
-    integrated = None
-    if not reason:
-        pieces = CostatePieces(form, solution, p)
-        everywhere = np.full((n + 1, form.nx), np.inf)
-        everywhere[-1] = plan[-1]
-        for k in reversed(range(n)):
-            everywhere[k] = pieces.backwards(everywhere[k + 1], range(k, k + 1))
-            if not np.all(np.isfinite(everywhere[k])):
-                everywhere[: k + 1] = np.inf
+def adjoint(along: Linearisation, cost: float) -> Adjoint:
+    """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
+
+    Args:
+        along: The plan. cost: A size of the cost, which errors are weighed by.
+    """
+    (n, q), m = along.shape, along.stand.lower.shape[1]
+    first, last = _ends_of_intervals(along)
+    costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
+    near, at_node = (
+        np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
+    )
+    limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
+    holding = holders(along, costate)
+    for _ in range(ROUNDS):
+        back = _Backwards(along, holding)
+        for k in limited.tolist():
+            inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
+        costate, start = back.integrate(last, inside, atoms)
+        holding = holders(along, costate)
+        if not (limited.size or along.mixed.size):
+            break
+    size = along.sizes.state
+    places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
+    node = along.node_stand
+    lumps = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
+    standing = inside / places
+    standing[:, 0] += atoms[:, 0] / places[:, 0]
+    standing[:, -1] += atoms[:, 1] / places[:, -1]
+    force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.stand_x[..., :-1].reshape(n, q, m, -1))) @ size
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[nodes, :, :-1])) @ size
+    return Adjoint(
+        along.mesh * along.solution.horizon,
+        costate,
+        holding,
+        standing.reshape(n * q, m),
+        np.abs(first - start) @ size,
+        np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
+        stand.sum(axis=(1, 2)) + lumps[0] + lumps[1],
+        _ends(along, costate, holding, inside, atoms, cost),
+    )
+
+
+def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
+    """The reported costates at the start and at the end of every interval, (N, nx) each, each from its own side."""
+    curve, mesh = along.solution.costate_interpolant, along.mesh
+    if len(curve.breaks) == len(mesh) and np.array_equal(curve.breaks, mesh):
+        pieces = np.arange(len(mesh) - 1)
+        return curve.within(pieces, np.zeros(len(pieces))), curve.within(pieces, np.ones(len(pieces)))
+    values = curve(mesh)
+    return values[:-1], values[1:]
+
+
+class _Backwards:
+    """The costate equation over every interval backwards, what holds the controls answering to the costates."""
+
+    def __init__(self, along: Linearisation, holding: np.ndarray) -> None:
+        self.along = along
+        n, q = along.shape
+        nx, nu = along.form.nx, along.form.nu
+        rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
+        feed, given = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
+        unit = along.sizes.control
+        pushing = holding != 0
+        self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
+        held = np.flatnonzero(pushing.any(axis=1))
+        if held.size:
+            rows = np.where(pushing[held, :, None], along.hold_u[held] * unit, 0.0)
+            inverse = np.linalg.pinv(rows.transpose(0, 2, 1), rcond=DEPENDENT)
+            self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
+            if along.mixed.size:
+                # multipliers = - inverse (unit slope): the costate equation has them as a feedback of the costate
+                answer = np.einsum("kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu:]) * unit
+                feed[held] -= answer @ rate_u[held].transpose(0, 2, 1)
+                given[held] -= np.einsum("kiu,ku->ki", answer, along.cost_y[held, nx + 1 :])
+        ahead = along.weight - along.matrix  # of the integral from a point to the end
+        self.ahead = ahead
+        h = along.width
+        self.feed, self.given = feed.reshape(n, q, nx, nx), given.reshape(n, q, nx)
+        system = np.eye(q * nx) - np.einsum("k,ij,kjab->kiajb", h, ahead, self.feed).reshape(n, q * nx, q * nx)
+        self.inverse = np.linalg.inv(system)
+        self.drive = np.einsum("k,ij,kja->kia", h, ahead, self.given)
+
+    def integrate(self, last: np.ndarray, inside: np.ndarray, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Costates at the points (N q, nx) and before the start of every interval (N, nx).
+
+        Args:
+            last: Costates at the ends. Shape (N, nx).
+            inside, atoms: Pushes of the limits of the states at the points, (N, q, m), and at both ends, (N, 2, m).
+        """
+        along = self.along
+        (n, q), nx = along.shape, along.form.nx
+        slopes, node = along.stand_x[:, :, :nx].reshape(n, q, -1, nx), along.node_stand_x[:, :, :nx]
+        force = np.einsum("kjm,kjmi->kji", inside, slopes)
+        end = last + np.einsum("km,kmi->ki", atoms[:, 1], node[1:])
+        known = end[:, None] + self.drive + np.einsum("ij,kja->kia", self.ahead / along.weight, force)
+        points = np.einsum("kab,kb->ka", self.inverse, known.reshape(n, q * nx)).reshape(n, q, nx)
+        flow = np.einsum("kjab,kjb->kja", self.feed, points) + self.given
+        start = end + np.einsum("k,j,kja->ka", along.width, along.weight, flow) + force.sum(axis=1)
+        return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
+
+
+def _pushes(
+    back: _Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pushes of the limits of the states in interval k that explain its costates best: (q, m), (2, m)."""
+    along = back.along
+    q, nx, m = along.shape[1], along.form.nx, along.stand.lower.shape[1]
+    mine = slice(k * q, (k + 1) * q)
+    size, unit = along.sizes.state, along.sizes.control
+    limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
+    slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
+    columns, charges, owners = [], [], []
+    for kind, (limit, slope_x) in enumerate(zip(limits, slopes, strict=True)):
+        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower, limit.below, -1.0)):
+            for j, i in zip(*np.nonzero(side), strict=True):
+                reach = float(np.abs(slope_x[j, i]) @ size)
+                if reach > 0:
+                    columns.append((kind, j, sign * slope_x[j, i] / reach))
+                    charges.append(gap[j, i] / reach)
+                    owners.append((kind, j, i, sign / reach))
+    inside, atoms = np.zeros((q, m)), np.zeros((2, m))
+    if not columns:
+        return inside, atoms
+    # answers of the costates at the points and at the start to each push
+    answer, start = np.zeros((len(columns), q, nx)), np.zeros((len(columns), nx))
+    for c, (kind, j, push) in enumerate(columns):
+        if kind == 0:
+            answer[c] = back.ahead[:, j, None] / along.weight[j] * push
+            start[c] = push
+        elif j == 1:
+            answer[c], start[c] = push, push
+        else:
+            start[c] = push
+    answer = (answer.reshape(len(columns), -1) @ back.inverse[k].T).reshape(-1, q, nx)
+    flow = np.einsum("jab,cjb->cja", back.feed[k], answer)
+    start += along.width[k] * np.einsum("j,cja->ca", along.weight, flow)
+    known = last + back.drive[k]
+    base = (back.inverse[k] @ known.ravel()).reshape(q, nx)
+    flow0 = np.einsum("jab,jb->ja", back.feed[k], base) + back.given[k]
+    start0 = last + along.width[k] * along.weight @ flow0
+    weight = along.width[k] * along.weight
+    rate_u = along.rate_y[mine, :, nx + 1 :]
+    gradient = along.cost_y[mine, nx + 1 :] + np.einsum("jiu,ji->ju", rate_u, base)
+    held = back.projector[mine]
+    slope0 = np.einsum("j,juv,jv->ju", weight, held, unit * gradient)
+    slopes_c = np.einsum("j,juv,cjv->cju", weight, held, unit * np.einsum("jiu,cji->cju", rate_u, answer))
+    target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
+    matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
+    found = nonnegative(matrix, target, TRUSTED * np.array(charges)) * cost
+    for (kind, j, i, scale), value in zip(owners, found, strict=True):
+        (inside if kind == 0 else atoms)[j, i] += scale * value
+    return inside, atoms
+
+
+def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray) -> np.ndarray:
+    """The y >= 0 (m,) of least |matrix y - target|^2 / 2 + price . y, by active sets (Lawson, Hanson 1974, ch 23)."""
+    m = matrix.shape[1]
+    y, passive = np.zeros(m), np.zeros(m, bool)
+    normal, right = matrix.T @ matrix, matrix.T @ target - price
+    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
+    for _ in range(3 * m + 10):
+        pull = np.where(passive, -np.inf, right - normal @ y)
+        if not m or pull.max() <= small:
+            break
+        passive[int(np.argmax(pull))] = True
+        while True:
+            index = np.flatnonzero(passive)
+            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
+            if (best > 0).all():
+                y[:] = 0.0
+                y[index] = best
                 break
-        integrated = everywhere[np.searchsorted(breaks, costates.breaks - 1e-12)]
-    return Adjoint(costates.breaks * solution.horizon, integrated, plan, reason, *ends, scale)
+            falling = best <= 0
+            share = np.min(y[index][falling] / (y[index][falling] - best[falling] + np.finfo(float).tiny))
+            y[index] += min(max(share, 0.0), 1.0) * (best - y[index])
+            drop = index[(y[index] <= 1e-15 * np.abs(y).max(initial=0.0)) & falling]
+            if not drop.size:
+                drop = index[falling][:1]
+            y[drop], passive[drop] = 0.0, False
+    return y
 
 
-def immaterial(solution: Solution) -> float:
-    """Size of costates that, times the way of the states, are nothing beside the cost: they may be rounding alone."""
-    way = max((float(np.ptp(values, axis=0).max(initial=0.0)) for values in solution.states.values()), default=0.0)
-    return IMMATERIAL * abs(solution.cost) / way if way > 0 else 0.0
+def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Distance of the costates that a plan reports between the ends of its intervals, in units of cost. Shape (N,)."""
+    (n, q), nx = along.shape, along.form.nx
+    at = along.solution.t / along.solution.horizon
+    k = np.clip(np.searchsorted(along.mesh, at, side="right") - 1, 0, n - 1)
+    place = (at - along.mesh[k]) / along.width[k]
+    inner = (place > 1e-9) & (place < 1 - 1e-9)
+    nodes, values = np.append(along.places, 1.0), np.concatenate([costate.reshape(n, q, nx), last[:, None]], axis=1)
+    found = np.einsum("md,mdn->mn", lagrange(nodes, place[inner]), values[k[inner]])
+    off = np.abs(stack(along.solution.costates)[inner] - found) @ along.sizes.state
+    worst = np.zeros(n)
+    np.maximum.at(worst, k[inner], off)
+    return worst
 
 
-class CostatePieces:
-    """The costate equation along a plan, to be integrated over the pieces of the states' interpolant one by one.
-
-    Attributes:
-        count: Number of pieces.
-    """
-
-    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray) -> None:
-        states, controls = solution.state_interpolant, solution.control_interpolant
-        self.count = n = len(states.breaks) - 1
-        width = np.diff(states.breaks)
-        places = states.breaks[:-1, None] + width[:, None] * controls.nodes
-        owner = np.searchsorted(controls.breaks, states.breaks[:-1] + 0.5 * width) - 1
-        within = (places - controls.breaks[owner][:, None]) / np.diff(controls.breaks)[owner][:, None]
-        u = controls.within(np.repeat(owner, len(controls.nodes)), within.ravel())
-        shared = np.tile(np.append(solution.horizon, p), (n, 1))
-        columns = (states.values.reshape(n, -1), u.reshape(n, -1), states.breaks[:-1, None], width[:, None], shared)
-        self._data = np.hstack(columns).T
-        self._integrator = costate_integrator(form, states.nodes, controls.nodes)
-
-    def backwards(self, end: np.ndarray, pieces: range) -> np.ndarray:
-        """The costate at the start of some pieces, from that at their end; nan where the integration breaks down."""
-        lam = end
-        try:
-            with quiet():
-                for k in reversed(pieces):
-                    lam = np.asarray(self._integrator(x0=lam, p=self._data[:, k])["xf"].full()).reshape(-1)
-        except RuntimeError:
-            return np.full_like(end, np.nan)
-        return lam
-
-
-def obstacle(form: Formulation, solution: Solution, bounds: Bounds) -> str:
-    """Why the costate equation alone does not say what the costates are, or ""."""
-    x = stack(solution.states)
-    index = form.bounds.places["state"]
-    if np.any(near(x[1:-1], bounds[0][index], bounds[1][index])):
-        return "a state is at its bound"
-    return path_obstacle(form, solution, bounds)
-
-
-def path_obstacle(form: Formulation, solution: Solution, bounds: Bounds) -> str:
-    """Why the multipliers of path constraints are not known, or ""."""
-    if len(form.path) and not np.all(form.path.equality & form.path.uses_control):
-        return "there are path constraints beyond equalities with a control"
-    if len(form.path):
-        u = stack(solution.controls)
-        index = form.bounds.places["control"]
-        if np.any(near(u, bounds[0][index], bounds[1][index])):
-            return "a control is at its bound where path equalities hold"
-    return ""
-
-
-def active_sides(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where values (M, n) are at their lower, and at their upper bound. Each (M, n), bool."""
-    with np.errstate(invalid="ignore"):
-        size = np.maximum(1.0, np.where(np.isfinite(upper - lower), upper - lower, 1.0))
-    return np.asarray(values <= lower + ACTIVE_WITHIN * size), np.asarray(values >= upper - ACTIVE_WITHIN * size)
-
-
-def near(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Where values (M, n) are at a bound."""
-    at_lower, at_upper = active_sides(values, lower, upper)
-    return np.asarray(at_lower | at_upper)
-
-
-def costate_integrator(form: Formulation, nodes: np.ndarray, samples: np.ndarray) -> Any:
-    """Integrator of the costates over one interval backwards; p = [x values, u values, s, h, T, parameters].
-
-    Multipliers of path equalities are those that make H stationary: mu = -(A A')^-1 A (L_u + f_u' lambda), A = h_u.
-    """
-    sym = form.sym
-    nx, nu = form.nx, form.nu
-    lam, back = sym("lam", nx), sym("back")
-    cuts = np.cumsum([0, nx * len(nodes), nu * len(samples), 1, 1, 1, form.np])
-    q = sym("q", int(cuts[-1]))
-    xs, us, s, h, horizon, p = (q[int(a) : int(b)] for a, b in pairwise(cuts))
-    place = 1 - back
-    x = ca.mtimes(ca.reshape(xs, nx, len(nodes)), lagrange_expressions(nodes, place))
-    u = ca.mtimes(ca.reshape(us, nu, len(samples)), lagrange_expressions(samples, place))
-    value = form.running + ca.dot(lam, form.f)
-    if len(form.path):
-        gradient = ca.gradient(value, form.u)
-        rows = ca.jacobian(form.path.expression, form.u)
-        mu = -ca.solve(ca.mtimes(rows, rows.T), ca.mtimes(rows, gradient))
-        held = sym("mu", len(form.path))
-        rate = ca.gradient(value + ca.dot(held, form.path.expression), form.x)
-        rate = ca.substitute([rate], [held], [mu])[0]
-    else:
-        rate = ca.gradient(value, form.x)
-    function = ca.Function("rate", [form.x, form.u, form.t, form.T, form.p, lam], [ca.densify(rate)], {"cse": True})
-    ode = h * horizon * function(x, u, (s + h * place) * horizon, horizon, p, lam)
-    dae = {"x": lam, "t": back, "p": q, "ode": ode}
-    return integrator("costates", dae)
-
-
-def end_residuals(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> tuple[float, float]:
-    """What of the transversality conditions no multiplier explains: (of the states, of the horizon)."""
-    low, high = bounds
-    nx = form.nx
-    x0, x1, lam0, lam1 = (stack(pool)[k] for pool in (solution.states, solution.costates) for k in (0, -1))
-    controls = stack(solution.controls, 2)[[0, -1]]
+def _ends(
+    along: Linearisation, costate: np.ndarray, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray, cost: float
+) -> Ends:
+    """The conditions at the ends with the multipliers, of the right signs, that explain them best."""
+    form, solution, nx = along.form, along.solution, along.form.nx
+    low, high = along.bounds
+    places, sizes = form.bounds.places, along.sizes
+    x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
+    u0, u1 = stack(solution.controls, 2)[[0, -1]]
+    lam0, lam1 = (part[k] for part, k in zip(_ends_of_intervals(along), (0, -1), strict=True))
+    y = ca.vertcat(form.x, form.x0, form.T)
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
-    end = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
-    symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
-    # a path constraint of the states alone that is active at an end holds them there as an end condition does
-    path = form.path.select(~form.path.uses_control)
-    first = ca.substitute([path.expression], [form.x, form.t], [form.x0, 0])[0]
-    rows = ca.vertcat(begin, end[0], ca.substitute([path.expression], [form.t], [form.T])[0], first)
-    both = ca.vertcat(form.x, form.x0, form.T)
-    function = ca.Function("ends", symbols, [rows, ca.densify(ca.jacobian(rows, both)), ca.gradient(end[1], both)])
-    found = function(x1, x0, controls[1], controls[0], solution.horizon, p)
-    values, slopes, gradient = (np.asarray(v.full()) for v in found)
-    index = np.concatenate([form.start.bounds, form.end.bounds, path.bounds, path.bounds])
-    active = near(values.T, low[index], high[index])[0]
-    places = form.bounds.places
-    free = np.concatenate(
-        [~near(x[None], low[places[k]], high[places[k]])[0] for x, k in ((x1, "terminal"), (x0, "initial"))]
+    end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+    rows = ca.vertcat(end, begin)
+    function = ca.Function(
+        "ends",
+        [form.x, form.x0, form.u, form.u0, form.T, form.p],
+        [rows, ca.densify(ca.jacobian(rows, y)), ca.densify(ca.gradient(final, y))],
     )
-    # gradient of the cost at the ends + multipliers . slopes = (lambda(T), -lambda(0))
-    left = np.concatenate([lam1, -lam0]) - gradient[: 2 * nx, 0]
-    columns = slopes[active].T
-    horizon_free = (
-        form.horizon_is_free
-        and not near(np.array([[solution.horizon]]), low[places["horizon"]], high[places["horizon"]]).any()
+    value, slopes, gradient = (np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, along.p))
+    # dT H/dT along the plan, what pushes included
+    by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
+    by_horizon += np.einsum("km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu :])
+    lasting = float(along.share @ by_horizon)
+    n, q = along.shape
+    lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        lasting += float(np.sum(atoms[:, e] * along.node_stand_x[nodes, :, nx]))
+    target = np.concatenate([lam1 - gradient[:nx, 0], -lam0 - gradient[nx : 2 * nx, 0], [-lasting - gradient[-1, 0]]])
+    unit = np.concatenate([sizes.state, sizes.state, [solution.horizon]])
+
+    index = np.concatenate([form.end.bounds, form.start.bounds])
+    equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])
+    row_size = np.concatenate([sizes.end, sizes.start])
+    conditions = Limits(value.T, low[index], high[index], equal, row_size)
+    horizon = places["horizon"]
+    at_horizon = Limits(
+        np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
     )
-    explicit = ca.depends_on(ca.vertcat(form.f, form.running, form.path.expression), form.T)
-    target, matrix = left[free], columns[: 2 * nx][free]
-    if horizon_free and not explicit:
-        last = x1[None], controls[1][None], solution.horizon, solution.horizon, p
-        running, rate = form.sampled([form.running, form.f], *last)
-        final = float(running[0, 0]) + float(np.dot(rate[0], lam1))
-        target = np.append(target, -final - gradient[2 * nx, 0])
-        matrix = np.vstack([matrix, columns[2 * nx]])
-    multipliers = np.linalg.lstsq(matrix, target, rcond=None)[0] if matrix.size else np.zeros(matrix.shape[1])
-    residual = target - matrix @ multipliers
-    # a bound that holds an end free otherwise pushes one way only
-    x, index = np.concatenate([x1, x0]), np.concatenate([places["terminal"], places["initial"]])
-    below, above = (side[0] for side in _pushing(x[None], low[index], high[index]))
-    push = left - columns[: 2 * nx] @ multipliers
-    wrong = np.where(above & ~below, np.maximum(-push, 0), 0) + np.where(below & ~above, np.maximum(push, 0), 0)
-    residual = np.concatenate([wrong, residual])
-    if horizon_free and not explicit:
-        return float(np.max(np.abs(residual[:-1]), initial=0.0)), float(abs(residual[-1]))
-    return float(np.max(np.abs(residual), initial=0.0)), 0.0
-
-
-def costates_at_samples(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds
-) -> tuple[np.ndarray, np.ndarray]:
-    """Costates at the samples of the controls, (N, samples, nx), and which intervals are beside a jump, (N,) bool."""
-    interpolant = solution.control_interpolant
-    mesh, places = interpolant.breaks, interpolant.nodes
-    n = len(mesh) - 1
-    reported = stack(solution.costates)
-    at = (mesh[:-1, None] + np.diff(mesh)[:, None] * places) * solution.horizon
-    costates = np.stack([np.interp(at, solution.t, column) for column in reported.T], axis=-1)
-    jumps = np.zeros(n, dtype=bool)
-    index = form.bounds.places["state"]
-    low, high = bounds[0][index], bounds[1][index]
-    if not near(stack(solution.states), low, high).any():
-        return costates, jumps
-    if len(solution.t) == n + 1:
-        if not path_obstacle(form, solution, bounds):
-            return _between_nodes(form, solution, p, (low, high), costates)
-    elif places[-1] == 1.0:
-        costates[-1, -1] = _end(form, solution, p, bounds, reported, (low, high))
-    return costates, jumps
-
-
-def _pushing(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a state may be pushed up by its lower bound, and down by its upper one; each judged by itself."""
-    nothing = np.full_like(low, np.inf)
-    return active_sides(x, low, nothing)[0], active_sides(x, -nothing, high)[1]
-
-
-def _between_nodes(
-    form: Formulation, solution: Solution, p: np.ndarray, sides: Bounds, costates: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Costates that jump at the nodes only, and which intervals are beside a jump."""
-    before, pieces = stack(solution.costates), CostatePieces(form, solution, p)
-    each = pieces.count // (len(before) - 1)
-    behind = [pieces.backwards(lam, range(k * each, (k + 1) * each)) for k, lam in enumerate(before[1:])]
-    at_low, at_high = (side[:-1] for side in _pushing(stack(solution.states), *sides))
-    jump = behind - before[:-1]
-    # an upper bound takes from the costate, a lower one adds to it
-    allowed = np.isfinite(jump) & ((at_high & (jump < 0)) | (at_low & (jump > 0)))
-    after = np.where(allowed, behind, before[:-1])
-    jumps = allowed.any(axis=1)
-    places = solution.control_interpolant.nodes[None, :, None]
-    inside = (1 - places) * after[:, None] + places * before[1:, None]
-    beside = jumps | np.append(jumps[1:], False)
-    return np.where(beside[:, None, None], inside, costates), beside
-
-
-def _end(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, reported: np.ndarray, sides: Bounds
-) -> np.ndarray:
-    """Costates just before a free end: those that hold a bound there are continued from the points before it.
-
-    They stay between the reported value and the gradient of the final cost, for the rest is the atom of the bound.
-    """
-    x = stack(solution.states)
-    free = form.bounds.places["terminal"]
-    open_end = bounds[0][free] < bounds[1][free]
-    at_low, at_high = (side[0] & open_end for side in _pushing(x[-1:], *sides))
-    last = reported[-1]
-    if not (at_low | at_high).any():
-        return np.asarray(last)
-    final = ca.substitute([form.terminal], [form.t], [form.T])[0]
-    slope = ca.Function("slope", [form.x, form.x0, form.u0, form.T, form.p], [ca.densify(ca.gradient(final, form.x))])
-    own = np.asarray(slope(x[-1], x[0], stack(solution.controls, 1)[0], solution.horizon, p).full()).ravel()
-    t = solution.t[-3:]
-    continued = reported[-2] + (reported[-2] - reported[-3]) * (t[2] - t[1]) / (t[1] - t[0])
-    atom = last - own
-    allowed = (at_high & (atom > 0)) | (at_low & (atom < 0))
-    between = np.clip(continued, np.minimum(last, own), np.maximum(last, own))
-    return np.asarray(np.where(allowed, between, last))
+    columns, charges, owners = [], [], []
+    eye = np.eye(2 * nx + 1)
+    node = along.node_stand
+    into = [*range(nx), 2 * nx], [*range(nx, 2 * nx), 2 * nx]
+    parts = [(conditions, slopes, np.arange(len(index)))]
+    parts.append((at_horizon, eye[-1:], np.array([-1])))
+    for k, where in ((n, into[0]), (0, into[1])):
+        wide = np.zeros((along.node_stand_x.shape[1], 2 * nx + 1))
+        wide[:, where] = along.node_stand_x[k]
+        parts.append((node.at(slice(k, k + 1)), wide, np.full(len(wide), -1)))
+    for limit, slope_y, own in parts:
+        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (limit.lower[0], limit.below[0], -1.0)):
+            for i in np.flatnonzero(side):
+                reach = float(np.abs(slope_y[i]) @ unit)
+                if reach > 0:
+                    columns.append(sign * slope_y[i] / reach)
+                    charges.append(gap[i] / reach)
+                    owners.append((int(own[i]), sign / reach))
+    free = np.ones(2 * nx + 1, bool)
+    free[:nx] = low[places["terminal"]] < high[places["terminal"]]
+    free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
+    free[-1] = form.horizon_is_free
+    matrix = (np.array(columns).reshape(len(columns), 2 * nx + 1) * unit).T[free]
+    found = nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges)) * cost
+    left = np.zeros(2 * nx + 1)
+    left[free] = np.abs((target * unit)[free] - matrix @ found)
+    multipliers = np.zeros(len(index))
+    for (owner, scale), force in zip(owners, found, strict=True):
+        if owner >= 0:
+            multipliers[owner] += scale * force
+    charge = float(np.dot(charges, found)) if charges else 0.0
+    cut = len(form.end)
+    return Ends(float(left[:-1].sum()), float(left[-1]), charge, multipliers[:cut], multipliers[cut:])

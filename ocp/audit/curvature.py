@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ocp.audit.accessory import FLAT, AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
-from ocp.curves import lagrange, quadrature_weights
-from ocp.problem.formulation import Bounds, Formulation
-from ocp.solution import Solution
+from ocp.audit.accessory import AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
+from ocp.audit.principle import FLAT
+from ocp.problem.formulation import Formulation
 
 __all__ = ["Curvature", "curvature"]
 
@@ -35,8 +34,6 @@ class Curvature:
             where nothing is free to vary.
         time: Where it is found, s: for a negative one the conjugate point. None where nothing is free.
         flat: Why the sweep does not decide, or "".
-        lost: What the cost could be less by, to second order: the integral of the least of
-            H_u du + du H_uu du / 2 over the controls within their bounds. In units of cost.
         direction: For a negative curvature a variation that lowers the cost: of the controls at the points ``t``
             (M, nu) and of the states at the ends of the intervals (N + 1, nx); else None.
         t: Times of the Gauss points, s. Shape (M,).
@@ -45,7 +42,6 @@ class Curvature:
     least: float
     time: float | None
     flat: str
-    lost: float
     direction: tuple[np.ndarray, np.ndarray] | None
     t: np.ndarray
 
@@ -57,31 +53,25 @@ class Curvature:
         return bool(self.least > FLAT)
 
 
-def curvature(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Curvature:
-    """Sweep the second variation of the cost along a plan whose costates are trusted.
-
-    Args:
-        form, p, bounds: The problem, its parameters and its bounds at these.
-        solution: The plan; its costates make the Hamiltonian.
-    """
-    along = AccessoryProblem(form, solution, p, bounds)
-    if form.indifferent:
-        return Curvature(np.inf, None, "", 0.0, None, along.t)
-    if not (np.isfinite(along.rate).all() and np.isfinite(along.hessian).all()):
-        return Curvature(np.nan, None, "the Hamiltonian is not finite along the plan", np.nan, None, along.t)
-    lost = along.lost()
-    if along.obstacle:
-        return Curvature(np.nan, None, along.obstacle, lost, None, along.t)
-    found = _sweep(along, held=False)
-    if found.least <= FLAT and along.held.any():
-        # a bound of a state takes directions away; where only it keeps the cost from falling, that is not enough
-        inside = _sweep(along, held=True)
+def curvature(accessory: AccessoryProblem) -> Curvature:
+    """Sweep the second variation of the cost along a plan whose multipliers are known."""
+    along = accessory.along
+    if along.form.indifferent:
+        return Curvature(np.inf, None, "", None, along.t)
+    if not (np.isfinite(accessory.rate).all() and np.isfinite(accessory.hessian).all()):
+        return Curvature(np.nan, None, "the Hamiltonian is not finite along the plan", None, along.t)
+    if accessory.obstacle:
+        return Curvature(np.nan, None, accessory.obstacle, None, along.t)
+    found = _sweep(accessory, weak=False)
+    if found.least <= FLAT and any(len(rows) for rows in accessory.weak):
+        # a limit that is touched without a push takes away one side of a direction only
+        inside = _sweep(accessory, weak=True)
         if inside.least > FLAT:
-            why = "the cost curves upwards only because a state is held at its bound"
-            return Curvature(inside.least, inside.time, why, lost, None, along.t)
+            why = "the cost curves upwards only because of limits that are touched without a push"
+            return Curvature(inside.least, inside.time, why, None, along.t)
         found = inside
     least, time, flat, direction = found
-    return Curvature(least, time, flat, lost, direction, along.t)
+    return Curvature(least, time, flat, direction, along.t)
 
 
 class _Swept(NamedTuple):
@@ -93,19 +83,20 @@ class _Swept(NamedTuple):
     direction: tuple[np.ndarray, np.ndarray] | None
 
 
-def _sweep(along: AccessoryProblem, held: bool) -> _Swept:
+def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
     """The backward sweep over all stages.
 
     Args:
-        held: Whether states at their bounds stay there.
+        weak: Whether what is touched without a push is held too.
     """
+    along = accessory.along
     n, q = along.shape
-    nz, nu = along.nz, along.nu
-    form, mesh = along.form, along.solution.control_interpolant.breaks
-    a, b = gauss(along.places)
+    nz, nu = accessory.nz, accessory.nu
+    form, mesh = along.form, along.mesh
+    a, b = along.matrix, along.weight
     h = along.width
     # variations at the Gauss points from those at the start of the interval and those of the controls
-    rate = along.rate.reshape(n, q, nz, nz + nu)
+    rate = accessory.rate.reshape(n, q, nz, nz + nu)
     rate_z, rate_u = rate[..., :nz], rate[..., nz:]
     system = np.eye(q * nz) - np.einsum("k,ij,kjab->kiajb", h, a, rate_z).reshape(n, q * nz, q * nz)
     driven = np.zeros((n, q, nz, nz + q * nu))
@@ -121,9 +112,14 @@ def _sweep(along: AccessoryProblem, held: bool) -> _Swept:
     whole[..., nz:] /= np.repeat(metric, nu, axis=1)[:, None, None, :]
     step = np.einsum("k,j,kjab,kjbc->kac", h, b, rate, whole)
     step[:, :, :nz] += np.eye(nz)
-    stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, along.hessian.reshape(n, q, nz + nu, nz + nu), whole)
+    stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, accessory.hessian.reshape(n, q, nz + nu, nz + nu), whole)
 
-    cost, rows, start_cost, start_rows = end_conditions(along)
+    for k, i in zip(*np.nonzero(accessory.moved), strict=True):
+        area = np.zeros(nz + q * nu)
+        area[nz + i :: nu] = h[k] * b / metric[k] * accessory.range[i]
+        stage[k] += accessory.switching[k, i] * np.outer(area, area)
+
+    cost, rows, start_cost, start_rows = end_conditions(accessory)
     sweep = _Linearised(whole, step, stage, metric, cost, rows, start_cost)
     bends = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
     scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
@@ -131,9 +127,11 @@ def _sweep(along: AccessoryProblem, held: bool) -> _Swept:
     gains: list[np.ndarray] = []
     for k in reversed(range(n)):
         joined = stage[k] + step[k].T @ cost @ step[k]
-        own = [along.rows[k * q + j] @ whole[k, j] for j in range(q)]
-        if held:
-            own += [along.held_rows[k * q + j] @ whole[k, j] for j in range(q)]
+        own = [accessory.rows[k * q + j] @ whole[k, j] for j in range(q)]
+        if weak:
+            own += [accessory.weak[k * q + j] @ whole[k, j] for j in range(q)]
+        for i in np.flatnonzero(accessory.moved[k]):  # a switch moves: one variation, of the mean
+            own.append(whole[k, 1:, nz + i] - whole[k, :1, nz + i])
         stacked = rows_of_length_one(np.vstack([*own, rows @ step[k]]))
         rank, left, sizes, right = dependent(stacked[:, nz:])
         basis = right[rank:].T
@@ -150,10 +148,10 @@ def _sweep(along: AccessoryProblem, held: bool) -> _Swept:
                 least, at = float(values[0] / scale), float(mesh[k] * along.solution.horizon)
             if values[0] < -FLAT * scale:
                 worst = basis @ vectors[:, 0]
-                why = _singular(along, k, worst)
+                why = _singular(accessory, k, worst)
                 if why:
                     return _Swept(least, at, why, None)
-                return _confirmed(least, at, _variation(along, sweep, k, worst, gains), scale)
+                return _confirmed(least, at, _variation(accessory, sweep, k, worst, gains), scale)
             curved = values > FLAT * scale
             if not curved.all():
                 label = _label(form, basis @ vectors[:, 0], nu)
@@ -172,7 +170,7 @@ def _sweep(along: AccessoryProblem, held: bool) -> _Swept:
         if values[0] / scale < least:
             least, at = float(values[0] / scale), 0.0
         if values[0] < -FLAT * scale:
-            return _confirmed(least, at, _variation(along, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
+            return _confirmed(least, at, _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
         if values[0] <= FLAT * scale:
             flat = flat or "the cost does not curve along a variation of the start"
     return _Swept(least, at, flat, None)
@@ -200,7 +198,7 @@ class _Variation(NamedTuple):
 
 
 def _variation(
-    along: AccessoryProblem,
+    accessory: AccessoryProblem,
     sweep: _Linearised,
     first: int,
     controls: np.ndarray | None,
@@ -208,7 +206,8 @@ def _variation(
     start: np.ndarray | None = None,
 ) -> _Variation:
     """A variation that begins at an interval with these controls, or at the start, then follows the best feedback."""
-    (n, q), nz, nu = along.shape, along.nz, along.nu
+    along, nz, nu = accessory.along, accessory.nz, accessory.nu
+    n, q = along.shape
     z = np.zeros(nz) if start is None else start
     states, values = np.zeros((n + 1, nz)), np.zeros((n, q * nu))
     cost, slips = float(z @ sweep.start_cost @ z), [0.0]
@@ -217,7 +216,7 @@ def _variation(
         values[k] = controls if controls is not None and k == first else gains[n - 1 - k] @ z
         both = np.concatenate([z, values[k]])
         cost += float(both @ sweep.stage[k] @ both)
-        slips += [np.abs(along.rows[k * q + j] @ sweep.whole[k, j] @ both).max(initial=0.0) for j in range(q)]
+        slips += [np.abs(accessory.rows[k * q + j] @ sweep.whole[k, j] @ both).max(initial=0.0) for j in range(q)]
         z = sweep.step[k] @ both
     states[n] = z
     cost += float(z @ sweep.end_cost @ z)
@@ -225,7 +224,7 @@ def _variation(
     size = max(float(np.abs(states).max()), float(np.abs(values).max()))
     length = float(np.sum(values**2) + (0.0 if start is None else start @ start))
     values /= np.repeat(sweep.metric, nu, axis=1)
-    shown = values.reshape(n * q, nu) * along.range, states[:, : along.nx] * along.unit[: along.nx]
+    shown = values.reshape(n * q, nu) * accessory.range, states[:, : accessory.nx] * accessory.unit[: accessory.nx]
     return _Variation(*shown, cost / length, max(slips) / size)
 
 
@@ -240,17 +239,20 @@ def _confirmed(least: float, at: float | None, found: _Variation, scale: float) 
     return _Swept(least, at, f"constraints are nearly dependent at {at or 0.0:.4g} s", None)
 
 
-def _singular(along: AccessoryProblem, k: int, controls: np.ndarray) -> str:
+def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
     """Why the curvature along a stage's controls does not decide: the Hamiltonian itself does not curve along them.
 
     Where a control enters linearly, what is left is of the order of the interval's width, and the generalized condition
     of Legendre and Clebsch, not this one, tells a singular arc's minimum.
     """
-    q, nz, nu = along.shape[1], along.nz, along.nu
-    own = along.hessian[k * q : (k + 1) * q, nz:, nz:]
+    along, nz, nu = accessory.along, accessory.nz, accessory.nu
+    q = along.shape[1]
+    if accessory.moved[k].any():
+        return ""
+    own = accessory.hessian[k * q : (k + 1) * q, nz:, nz:]
     parts = controls.reshape(q, nu)
     curved = float(np.einsum("ju,juv,jv->", parts, own, parts))
-    size = float(np.abs(along.hessian[:, nz:, nz:]).max(initial=0.0))
+    size = float(np.abs(accessory.hessian[:, nz:, nz:]).max(initial=0.0))
     if abs(curved) > FLAT * size:
         return ""
     label, time = _label(along.form, controls, nu), along.t[k * q]
@@ -260,10 +262,3 @@ def _singular(along: AccessoryProblem, k: int, controls: np.ndarray) -> str:
 def _label(form: Formulation, direction: np.ndarray, nu: int) -> str:
     """The control that a direction of a stage is made of most."""
     return form.control_labels[int(np.argmax(np.abs(direction).reshape(-1, nu).max(axis=0)))]
-
-
-def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
-    at, weight = np.polynomial.legendre.leggauss(len(places))
-    matrix = [c / 2 * weight @ lagrange(places, c * (at + 1) / 2) for c in places]
-    return np.array(matrix), quadrature_weights(places)

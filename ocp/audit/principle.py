@@ -1,135 +1,180 @@
-"""The minimum principle along a plan: is the Hamiltonian stationary in the control, is it constant in time?
+"""The minimum principle along a plan: does any admissible control have a smaller Hamiltonian, and what would it win?
 
-Nothing here trusts the multipliers of path constraints: at each sample those that make the Hamiltonian most nearly
-stationary are found anew by least squares, with the signs that the minimum principle demands (Bryson, Ho 1975, ch 3).
+Nothing here trusts the multipliers of a solver: at each point those of the limits that hold the controls are found
+anew, by least squares with the signs that the minimum principle demands (Bryson, Ho 1975, chapter 3). What is left of
+the Hamiltonian's slope is judged by what it loses: the least of H_u du + du H_uu du / 2 over the controls within their
+limits, integrated over the plan, in units of cost.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
-from ocp.audit.costates import active_sides, costates_at_samples
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.audit.linearisation import Linearisation
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, stack
 
-__all__ = ["Optimality", "balance", "minimum_principle"]
+__all__ = ["FLAT", "Hamiltonian", "balance", "groups", "hamiltonian", "holders", "lost", "reduced_slope", "slope"]
+
+DEPENDENT = 1e-9
+"""Singular values below this share of the largest are none."""
+FLAT = 1e-7
+"""Curvature, relative to the largest of the plan, below which the cost counts as not curved."""
 
 
 @dataclass(frozen=True)
-class Optimality:
-    """How well a plan meets the minimum principle.
+class Hamiltonian:
+    """The Hamiltonian along a plan.
 
     Attributes:
-        t: Times of the control samples, s. Shape (K,).
-        stationarity: Largest entry of the Hamiltonian's reduced gradient at each sample. Shape (K,).
-        gradient_scale: What it is judged against: the largest sum of the sizes of its parts, L_u and each
-            f_u lambda.
-        hamiltonian: At the reported times of the plan. Shape (M,).
-        hamiltonian_scale: Largest of |L| + sum |lambda_i f_i|.
+        t: Reported times of the plan, s. values: L + costate . f there, in cost per second. Both (M,).
+        scale: Largest of |L| + sum |costate_i f_i|.
     """
 
     t: np.ndarray
-    stationarity: np.ndarray
-    gradient_scale: float
-    hamiltonian: np.ndarray
-    hamiltonian_scale: float
+    values: np.ndarray
+    scale: float
 
     @property
     def drift(self) -> float:
-        """Largest minus smallest Hamiltonian."""
-        return float(np.ptp(self.hamiltonian))
+        """Largest minus smallest value."""
+        return float(np.ptp(self.values))
 
 
-def minimum_principle(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Optimality:
-    """Evaluate the minimum principle along a plan at its own control samples and reported points."""
-    horizon = solution.horizon
+def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamiltonian:
+    """The Hamiltonian at the reported times of a plan."""
     pools = (solution.states, solution.controls, solution.costates)
     x, u, costate = (stack(pool, len(solution.t)) for pool in pools)
     lam = form.sym("lam", form.nx)
-    parts = [form.running, lam * form.f]
-    running, products = form.sampled(parts, x, u, solution.t, horizon, p, (lam, costate))
-    hamiltonian = running[:, 0] + products.sum(axis=1)
-    least = 1.0 if form.indifferent else 0.0  # without a cost all parts are rounding, and nothing to judge by
-    scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=least))
-    if form.nu == 0:
-        return Optimality(np.zeros(0), np.zeros(0), 1.0, hamiltonian, scale or 1.0)
-
-    interpolant = solution.control_interpolant
-    widths = np.diff(interpolant.breaks)
-    s = (interpolant.breaks[:-1, None] + widths[:, None] * interpolant.nodes).ravel()
-    t = s * horizon
-    controls = interpolant.values.reshape(len(s), form.nu)
-    states = solution.state_interpolant(s)
-    sampled, beside = costates_at_samples(form, solution, p, bounds)
-    costates = sampled.reshape(len(s), form.nx)
-    rows = form.path.select(form.path.uses_control)
-    held_by = [rows.expression, ca.jacobian(rows.expression, form.u)]
-    slopes = [ca.jacobian(form.running, form.u), ca.jacobian(form.f, form.u)]
-    direct, f_u, *here = form.sampled([*slopes, *held_by], states, controls, t, horizon, p)
-    around = [here]
-    if len(interpolant.nodes) == 1:  # a held control answers for its whole interval: constraints at both ends hold it
-        for end in (interpolant.breaks[:-1], interpolant.breaks[1:]):
-            x_end = solution.state_interpolant(end)
-            around.append(form.sampled(held_by, x_end, controls, end * horizon, horizon, p))
-    g, g_u = (np.hstack([place[i] for place in around]) for i in (0, 1))
-    products = f_u.reshape(len(t), form.nu, form.nx) * costates[:, None, :]
-    gradient = direct + products.sum(axis=2)
-    if beside.any() and interpolant.nodes.tolist() == [0.0, 1.0]:
-        gradient = over_hats(gradient, widths, beside)
-
-    low, high = bounds
-    control, path = form.bounds.places["control"], np.tile(rows.bounds, len(around))
-    level = np.hstack([controls, g])
-    lower, upper = np.concatenate([low[control], low[path]]), np.concatenate([high[control], high[path]])
-    equal = lower == upper  # active everywhere, even where the plan misses it
-    at_lower, at_upper = (side | equal for side in active_sides(level, lower, upper))
-    reduced = np.abs(gradient).max(axis=1)
-    for k in np.flatnonzero((at_lower | at_upper).any(axis=1)):
-        normals = g_u[k].reshape(len(around), form.nu, -1).transpose(0, 2, 1).reshape(-1, form.nu)
-        directions = np.vstack([np.eye(form.nu), normals])
-        left = gradient[k] + directions.T @ balance(gradient[k], directions, at_lower[k], at_upper[k])
-        reduced[k] = np.abs(left).max()
-    size = float(np.max(np.abs(direct) + np.abs(products).sum(axis=2), initial=least))
-    return Optimality(t, reduced, size or 1.0, hamiltonian, scale or 1.0)
+    parts = form.sampled([form.running, lam * form.f], x, u, solution.t, solution.horizon, p, (lam, costate))
+    running, products = parts
+    scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
+    return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
 
 
-def over_hats(gradient: np.ndarray, widths: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Means of the gradient, linear in every interval, over the hats of the node values of a linear control.
+def holders(along: Linearisation, costate: np.ndarray) -> np.ndarray:
+    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points. Shape (M, nu + r).
 
-    A linear control answers for the hat of each of its node values. Only for nodes of the intervals ``beside`` (N,) a
-    jump of the costate; elsewhere the value at the node stands. Shape (2 N, nu), as given.
+    Those that make T H most nearly stationary, controls in units of their sizes.
     """
-    sides = gradient.reshape(len(widths), 2, -1)
-    first, last = sides[:, 0], sides[:, 1]
-    total, weight = np.zeros((len(widths) + 1, gradient.shape[1])), np.zeros((len(widths) + 1, 1))
-    total[:-1] += widths[:, None] * (first / 3 + last / 6)
-    total[1:] += widths[:, None] * (first / 6 + last / 3)
-    weight[:-1] += widths[:, None] / 2
-    weight[1:] += widths[:, None] / 2
-    mean = total / weight
-    at_node = np.append(beside, False) | np.append(False, beside)
-    chosen = np.where(at_node[:-1, None], mean[:-1], first), np.where(at_node[1:, None], mean[1:], last)
-    return np.stack(chosen, axis=1).reshape(gradient.shape)
+    unit = along.sizes.control
+    hold = along.hold
+    return balance(slope(along, costate) * unit, along.hold_u * unit, hold.lower, hold.upper)
 
 
-def balance(gradient: np.ndarray, directions: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray) -> np.ndarray:
-    """Multipliers (m,) of active constraints that make gradient (n,) + directions (m, n)' multipliers least.
+def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
+    """Derivative of T (L + costate . f) in the controls at the points. Shape (M, nu)."""
+    of = along.form.nx + 1
+    return np.asarray(along.cost_y[:, of:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, of:], costate))
 
-    At least zero at an upper bound, at most zero at a lower one, free at an equality. Wrongly signed ones are dropped
-    one by one, the worst first.
+
+def balance(gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Multipliers (M, m) of limits that make gradient (M, n) + directions (M, m, n)' multipliers least at each point.
+
+    At least zero where only ``upper`` (M, m) may push, at most zero where only ``lower`` may, free where both may.
+    Wrongly signed ones are dropped one by one, the worst first.
     """
-    found = np.zeros(len(directions))
-    active = list(np.flatnonzero(at_lower | at_upper))
-    while active:
-        multiplier = np.linalg.lstsq(directions[active].T, -gradient, rcond=None)[0]
-        both = (at_lower & at_upper)[active]
-        wrong = np.where(both, 0.0, np.where(at_upper[active], -multiplier, multiplier))
-        worst = int(np.argmax(wrong))
-        if wrong[worst] <= 1e-12 * (1.0 + np.abs(multiplier).max()):
-            found[active] = multiplier
-            return found
-        del active[worst]
+    found = np.zeros(lower.shape)
+    active, both = lower | upper, lower & upper
+    left = np.flatnonzero(active.any(axis=1))
+    while left.size:
+        wrong = []
+        for pattern, members in groups(active[left]):
+            mine = left[members]
+            columns = directions[mine][:, pattern].transpose(0, 2, 1)
+            multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[mine])
+            against = np.where(both[mine][:, pattern], 0.0, multipliers)
+            against = np.where(upper[mine][:, pattern], -against, against)
+            worst = np.argmax(against, axis=1)
+            rows = np.arange(len(mine))
+            bad = against[rows, worst] > 1e-12 * (1.0 + np.abs(multipliers).max(axis=1))
+            good = mine[~bad]
+            found[np.ix_(good, np.flatnonzero(pattern))] = multipliers[~bad]
+            active[mine[bad], np.flatnonzero(pattern)[worst[bad]]] = False
+            wrong.append(mine[bad])
+        left = np.concatenate(wrong)
+        left = left[active[left].any(axis=1)]
     return found
+
+
+def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+    """Largest entry of the Hamiltonian's slope that no multiplier explains, relative to the parts of it. (M,)."""
+    form = along.form
+    if not form.nu:
+        return np.zeros(len(along.s))
+    unit, of = along.sizes.control, form.nx + 1
+    left = (slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)) * unit
+    parts = np.abs(along.cost_y[:, of:]) + np.einsum("kiu,ki->ku", np.abs(along.rate_y[:, :, of:]), np.abs(costate))
+    size = float((parts * unit).max(initial=0.0)) or 1.0
+    return np.asarray(np.abs(left).max(axis=1, initial=0.0) / size)
+
+
+def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Distinct rows of patterns (M, m), bool, each with the indices of its members."""
+    if not len(patterns):
+        return []
+    distinct, member = np.unique(patterns, axis=0, return_inverse=True)
+    order = np.argsort(member.ravel(), kind="stable")
+    cuts = np.searchsorted(member.ravel()[order], np.arange(1, len(distinct)))
+    return list(zip(distinct, np.split(order, cuts), strict=True))
+
+
+def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
+    """What the controls at each point could win within their limits, to second order, in cost per unit of s. (M,).
+
+    Args:
+        along: The plan. costate: (M, nx).
+        multipliers: Of the limits of the controls, (M, nu + r); what these win over the gaps to their limits counts.
+        curved: T H_uu. Shape (M, nu, nu).
+
+    A control moves within its limits, and by its size at most where the Hamiltonian does not curve along it. Rows that
+    push stay where they are.
+    """
+    nu = along.form.nu
+    if not nu:
+        return np.zeros(len(along.s))
+    unit = along.sizes.control
+    won = along.hold.charge(multipliers).sum(axis=1)
+    gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
+    gradient, curved = gradient * unit, curved * (unit * unit[:, None])
+    low, high = (np.clip((side - along.u) / unit, -1e3, 1e3) for side in (along.low, along.high))
+    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+    scale = float(np.abs(curved).max(initial=0.0)) or 1.0
+    size = np.abs(along.hold_u * unit).max(axis=2)
+    pushes = (np.abs(multipliers) * size > FLAT * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
+    fixed = pushes.copy()
+    best = np.zeros(len(won))
+    while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
+        blocked = fixed.copy()
+        for pattern, members in groups(fixed):
+            step = _step(gradient[members], curved[members], along.hold_u[members][:, pattern] * unit, scale)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.where(step > 0, high[members] / step, np.where(step < 0, low[members] / step, np.inf))
+            step = np.clip(room.min(axis=1, initial=1.0), 0.0, 1.0)[:, None] * step
+            change = np.einsum("ku,ku->k", gradient[members], step)
+            change += np.einsum("ku,kuv,kv->k", step, curved[members], step) / 2
+            best[members] = np.maximum(best[members], -change)
+            blocked[members, :nu] |= room <= DEPENDENT
+        if (blocked == fixed).all():
+            return np.asarray(won + best)
+        fixed = blocked
+
+
+def _step(gradient: np.ndarray, curved: np.ndarray, rows: np.ndarray, scale: float) -> np.ndarray:
+    """The least of gradient . d + d curved d / 2 over rows d = 0 at each point, |d| about 1 where it does not curve."""
+    k, nu = gradient.shape
+    if rows.shape[1]:
+        projector = np.eye(nu) - np.einsum("kun,knv->kuv", np.linalg.pinv(rows, rcond=DEPENDENT), rows)
+    else:
+        projector = np.broadcast_to(np.eye(nu), (k, nu, nu))
+    pull = np.einsum("kuv,kv->ku", projector, gradient)
+    inside = projector @ curved @ projector
+    values, vectors = np.linalg.eigh((inside + inside.transpose(0, 2, 1)) / 2)
+    along = np.einsum("kuv,ku->kv", vectors, pull)
+    solid = values > FLAT * scale
+    step = np.where(solid, -along / np.where(solid, values, 1.0), -np.sign(along))
+    # the projector's own null directions have no pull
+    step = np.where(np.abs(along) > 1e-14 * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
+    return np.asarray(np.einsum("kuv,kv->ku", vectors, step))

@@ -1,0 +1,181 @@
+"""A plan and the first derivatives of its problem at Gauss points of its intervals, whatever method made it.
+
+What looks for the plan's multipliers (:mod:`ocp.audit.principle`, :mod:`ocp.audit.costates`) and at its second
+variation (:mod:`ocp.audit.accessory`) reads the problem here. Everything runs over the fraction s of the horizon, so
+that dx/ds = T f, and a change of the horizon T is a change of the integrands.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.audit.sizes import Sizes
+from ocp.curves import lagrange, quadrature_weights
+from ocp.problem.formulation import Bounds, Formulation
+from ocp.solution import Solution
+
+__all__ = ["NEAR", "Limits", "Linearisation", "gauss"]
+
+POINTS = (3, 5)
+"""Least and largest number of Gauss points of an interval."""
+NEAR = 1e-2
+"""A limit nearer than this share of the size of what it limits may push; what it pushes over the gap is charged."""
+
+
+class Limits:
+    """What may hold a plan at some points: limits on either side of some quantities, and how near they are.
+
+    Attributes:
+        below, above: Distance to the lower and upper limit, at least 0. Shape (M, m).
+        lower, upper: Which may push. Shape (M, m), bool. Both at equalities.
+        equal: Which are equalities. Shape (m,).
+    """
+
+    def __init__(self, value: np.ndarray, low: np.ndarray, high: np.ndarray, equal: np.ndarray, size: np.ndarray):
+        self.equal = equal
+        self.below = np.where(equal, 0.0, np.maximum(value - low, 0.0))
+        self.above = np.where(equal, 0.0, np.maximum(high - value, 0.0))
+        self.lower = equal | (self.below <= NEAR * size)
+        self.upper = equal | (self.above <= NEAR * size)
+
+    def at(self, points: slice) -> Limits:
+        """The same at some of the points."""
+        part = copy(self)
+        part.below, part.above = self.below[points], self.above[points]
+        part.lower, part.upper = self.lower[points], self.upper[points]
+        return part
+
+    @property
+    def near(self) -> np.ndarray:
+        """Which may push on either side. Shape (M, m), bool."""
+        return np.asarray(self.lower | self.upper)
+
+    def charge(self, multipliers: np.ndarray) -> np.ndarray:
+        """What multipliers (M, m) win over the gaps to their limits: at least zero. Shape (M, m)."""
+        gap = np.where(multipliers > 0, self.above, self.below)
+        return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
+
+
+class Linearisation:
+    """First derivatives along a plan.
+
+    Attributes:
+        width, weight, places: Of the N intervals (N,) and of the Gauss points in one, (q,) each. matrix: Runge-Kutta
+            matrix of these. shape: (N, q).
+        s, t: Fractions of the horizon and times of the M = N q points, s. Shape (M,).
+        x, u, costate: The plan at the points, as it reports them. Shape (M, n).
+        cost, cost_y: T L, and its derivatives in y = (x, T, u). Shapes (M,), (M, ny).
+        rate, rate_y: T f, (M, nx), and its derivatives, (M, nx, ny).
+        row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
+        sizes: Of all named things along the plan.
+        hold: Limits of the controls and of path rows with a control (``mixed``), in this order. Shape (M, nu + r).
+        hold_u: Their derivatives in the controls. Shape (M, nu + r, nu).
+        stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
+            derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
+        low, high: Limits of the controls at the points. Shape (M, nu).
+    """
+
+    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, sizes: Sizes) -> None:
+        self.form, self.solution, self.p, self.bounds, self.sizes = form, solution, p, bounds, sizes
+        mesh = solution.control_interpolant.breaks
+        self.mesh, self.width = mesh, np.diff(mesh)
+        n = len(self.width)
+        pieces = (len(solution.state_interpolant.breaks) - 1) / n
+        degree = max(len(solution.control_interpolant.nodes), solution.state_interpolant.values.shape[1] - 1)
+        q = POINTS[1] if pieces > 1 else int(np.clip(degree, *POINTS))
+        self.shape = n, q
+        self.places = np.array(ca.collocation_points(q, "legendre"))
+        self.matrix, self.weight = gauss(self.places)
+        self.s = (mesh[:-1, None] + self.width[:, None] * self.places).ravel()
+        self.t = self.s * solution.horizon
+        self.x = solution.state_interpolant(self.s)
+        self.u = solution.control_interpolant.within(np.repeat(np.arange(n), q), np.tile(self.places, n))
+        self.costate = solution.costate_interpolant(self.s)
+        self._differentiate()
+        self._limits()
+
+    def _differentiate(self) -> None:
+        form, m = self.form, len(self.s)
+        self.fraction = form.sym("s")
+        self.y = ca.vertcat(form.x, form.T, form.u)
+        self.scaled = ca.substitute(
+            [form.T * form.running, form.T * form.f, form.path.expression], [form.t], [self.fraction * form.T]
+        )
+        outputs = [*self.scaled, *(ca.jacobian(part, self.y) for part in self.scaled)]
+        cost, self.rate, self.row, cost_y, rate_y, row_y = form.sampled(outputs, *self.here)
+        ny = form.nx + 1 + form.nu
+        self.cost, self.cost_y = cost[:, 0], cost_y
+        self.rate_y = rate_y.reshape(m, ny, form.nx).transpose(0, 2, 1)
+        self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
+
+    @property
+    def here(self) -> tuple[Any, ...]:
+        """The arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
+        fraction = (self.fraction, self.s[:, None])
+        return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
+
+    @property
+    def finite(self) -> bool:
+        """Whether the plan and the derivatives along it are numbers."""
+        parts = self.x, self.u, self.costate, self.cost_y, self.rate_y, self.row, self.row_y, self.node_stand_x
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
+    @property
+    def slope_size(self) -> float:
+        """What the running cost changes by over the sizes of states and controls, to first order, in units of cost."""
+        unit = np.concatenate([self.sizes.state, [0.0], self.sizes.control])
+        return float(self.share @ (np.abs(self.cost_y) @ unit))
+
+    @property
+    def share(self) -> np.ndarray:
+        """Weight of every point in an integral over s. Shape (M,)."""
+        return np.asarray((self.width[:, None] * self.weight).ravel())
+
+    def _limits(self) -> None:
+        form, sizes, (n, q) = self.form, self.sizes, self.shape
+        nx, nu = form.nx, form.nu
+        self.mixed = np.flatnonzero(form.path.uses_control)
+        self.still = np.flatnonzero(~form.path.uses_control)
+        kinds = ("state", "control", "path")
+        index = np.concatenate([form.bounds.places[kind] for kind in kinds])
+        drawn = np.zeros((2, n, len(index))) if self.solution.drawn_in is None else self.solution.drawn_in
+        low, high = self.bounds[0][index] + drawn[0], self.bounds[1][index] - drawn[1]
+        equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
+        equal |= self.bounds[0][index] == self.bounds[1][index]
+        size = np.concatenate([sizes.state, sizes.control, sizes.path])
+        hold = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
+        stand = np.concatenate([np.arange(nx), nx + nu + self.still])
+        value = np.hstack([self.x, self.u, self.row])
+        by_point = np.repeat(low, q, axis=0), np.repeat(high, q, axis=0)
+        self.hold, self.stand = (
+            Limits(value[:, k], by_point[0][:, k], by_point[1][:, k], equal[k], size[k]) for k in (hold, stand)
+        )
+        self.low, self.high = (side[:, nx : nx + nu] for side in by_point)
+        eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
+        self.hold_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
+        self.stand_x = np.zeros((n * q, len(stand), nx + 1))
+        self.stand_x[:, :nx, :nx] = np.eye(nx)
+        self.stand_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
+
+        at = self.mesh
+        rows = self.scaled[2][self.still.tolist()] if self.still.size else self.scaled[2][:0, :]
+        outputs = [rows, ca.jacobian(rows, ca.vertcat(form.x, form.T))]
+        x, u, horizon = self.solution.state_interpolant(at), np.zeros((n + 1, nu)), self.solution.horizon
+        row, row_y = form.sampled(outputs, x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None]))
+        before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
+        ends = np.maximum(low[before], low[after])[:, stand], np.minimum(high[before], high[after])[:, stand]
+        self.node_stand = Limits(np.hstack([x, row]), *ends, equal[stand], size[stand])
+        self.node_stand_x = np.zeros((n + 1, len(stand), nx + 1))
+        self.node_stand_x[:, :nx, :nx] = np.eye(nx)
+        self.node_stand_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
+
+
+def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
+    at, weight = np.polynomial.legendre.leggauss(len(places))
+    matrix = [c / 2 * weight @ lagrange(places, c * (at + 1) / 2) for c in places]
+    return np.array(matrix), quadrature_weights(places)

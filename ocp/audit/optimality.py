@@ -1,0 +1,97 @@
+"""Whether a plan is a local minimum: its costates and multipliers found anew, what it loses, how the cost curves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ocp.audit.accessory import AccessoryProblem
+from ocp.audit.costates import Adjoint, Ends, adjoint
+from ocp.audit.curvature import Curvature, curvature
+from ocp.audit.linearisation import Linearisation
+from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope
+from ocp.audit.sizes import sizes
+from ocp.problem.formulation import Bounds, Formulation
+from ocp.solution import Solution
+
+__all__ = ["Optimality", "optimality"]
+
+CONTROLS_KNOWN = 1e-3
+"""Share of their sizes up to which controls are told apart, where the cost itself is nearly nothing."""
+
+
+ROUNDING = 1e-12
+"""Share of what the controls themselves would cost, below which costates are rounding."""
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """First and second order conditions along a plan.
+
+    Attributes:
+        lost: What the plan could cost less, to second order, in each interval; those at its ends in the first. (N,)
+        cost_size: What it is judged against, in units of cost: the cost, or where that is next to nothing what
+            changes of the controls that are just told apart would cost.
+        error_size: What errors of the costates are judged against, in units of cost. They cost by their square.
+        stationarity: Largest slope of the Hamiltonian that nothing holds at the Gauss points, relative to the sizes
+            of its parts. t: their times, s. Both (N q,).
+        adjoint: Costates and multipliers. hamiltonian: Along the plan. curvature: The second variation.
+    """
+
+    lost: np.ndarray
+    cost_size: float
+    error_size: float
+    t: np.ndarray
+    stationarity: np.ndarray
+    adjoint: Adjoint
+    hamiltonian: Hamiltonian
+    curvature: Curvature
+
+
+def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Optimality:
+    """Look for the multipliers of a plan, for what it loses and for how the cost curves."""
+    along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
+    if not along.finite:
+        return undefined(along, hamiltonian(form, solution, p))
+    size = abs(solution.cost) or along.slope_size or 1.0
+    first = adjoint(along, size)
+    accessory = AccessoryProblem(along, first)
+    spread = accessory.spread
+    cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
+    cost = cost if cost > 0 else 1.0
+    by_point = lost(along, first.costate, first.holding, accessory.curved) * along.share
+    total = by_point.reshape(along.shape).sum(axis=1) + first.charge
+    total[0] += first.ends.charge
+    second = curvature(accessory)
+    return Optimality(
+        total,
+        cost,
+        max(float(np.sqrt(cost * max(cost, spread))), ROUNDING * accessory.magnitude),
+        along.t,
+        reduced_slope(along, first.costate, first.holding),
+        first,
+        hamiltonian(form, solution, p),
+        second,
+    )
+
+
+def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
+    """What is found where the problem is not a number along the plan: nothing that would pass."""
+    (n, _), m = along.shape, len(along.s)
+    nothing, form = np.full(n, np.inf), along.form
+    ends = Ends(np.inf, np.inf, np.inf, np.zeros(len(form.end)), np.zeros(len(form.start)))
+    t = along.mesh * along.solution.horizon
+    shapes = form.nx, along.hold_u.shape[1], along.stand_x.shape[1]
+    costate, holding, standing = (np.full((m, k), np.nan) for k in shapes)
+    curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
+    return Optimality(
+        nothing,
+        1.0,
+        1.0,
+        along.t,
+        np.full(m, np.inf),
+        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, ends),
+        values,
+        curved,
+    )
