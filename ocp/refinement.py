@@ -6,11 +6,10 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from inspect import Parameter, signature
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ocp.audit.accessory import AccessoryProblem, _won
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
 from ocp.direct.prepared import DirectMethod, check_meshed
@@ -66,8 +65,7 @@ def refine(
         max_intervals: Cap on the number of intervals.
 
     Returns:
-        The last solution; its ``refinement`` says how the mesh came about and whether all rows are within their limits.
-        Whether the plan is an optimum may still be undecided.
+        The last solution; its ``refinement`` says how the mesh came about, and whether the audit passes in the end.
 
     Raises:
         ProblemError: tolerance not positive, a limit that the audit does not have, breaks outside the horizon or of a
@@ -75,8 +73,8 @@ def refine(
         SolveError: A round failed.
 
     Warns:
-        RefinementWarning: It stopped with a row beyond its limit, at the cap or where finer intervals do not help;
-            names the worst.
+        RefinementWarning: It stopped with a row beyond its limit, at the cap or where finer intervals do not help, and
+            names the worst; or with all rows within theirs where the audit does not decide whether it is an optimum.
     """
     check_meshed("refine", method, tolerance)
     settings = checked_mapping("refine: limits", limits)
@@ -100,7 +98,8 @@ def refine(
     idle = 0
     while True:
         solution = solve(problem, method, parameters=parameters, solver=solver, options=options, guess=guess)
-        rows = _rows(form, p, solution, judge(problem, solution, **settings), tolerance, method)
+        audit = judge(problem, solution, **settings)
+        rows = _rows(form, p, solution, audit, tolerance, method)
         beyond = [row for row in rows if not row.value <= 1.0]
         intervals.append(method.intervals)
         for kind, values in errors.items():
@@ -113,22 +112,25 @@ def refine(
             break
         method = method.with_mesh(finer)
         guess = solution
+    stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "raise max_intervals"
         if idle == PATIENCE:
             hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
-        words = (
-            f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals with "
-            f"{worst.name!r} at {worst.value:.2e} of its limit; {hint}"
-        )
+        words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
         warnings.warn(RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0), stacklevel=2)
+    elif not audit.passed:
+        words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
+        warnings.warn(RefinementWarning(words, name="undecided", value=audit.undecided), stacklevel=2)
     told = {kind: tuple(values) for kind, values in errors.items()}
-    return dataclasses.replace(solution, refinement=Refinement(tuple(intervals), told, tolerance, not beyond))
+    return dataclasses.replace(
+        solution, refinement=Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
+    )
 
 
 class _Row(NamedTuple):
-    """A row of the audit: its value and what each interval adds to it (N,), both as shares of its limit.
+    """A row of the audit: its value, and what each interval adds to it (N,), both as shares of its limit.
 
     ``order`` is the power of the width with which it falls; ``errors`` is None where no interval answers for it.
     """
@@ -140,52 +142,48 @@ class _Row(NamedTuple):
     order: int = 1
 
 
+class _Parts(NamedTuple):
+    """What each interval adds to a row (N,), in any unit; the row is their sum, or the largest of them."""
+
+    kind: str
+    values: np.ndarray
+    order: int
+    summed: bool = False
+
+    def shares(self, total: float) -> np.ndarray:
+        """Of a row that is so large, where an interval may have the same part of a sum as any other. Shape (N,)."""
+        values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
+        whole = values.mean() if self.summed else values.max()
+        return np.where(values > 0, total * (values / (whole or 1.0)), 0.0)
+
+
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """What an audit says of a plan, row by row. A sum over intervals is shared out among them evenly."""
-    missed = _missed(form, p, solution, audit)
-    lost, of_cost = _lost(form, p, solution)
+    """What an audit says of a plan, row by row, and which intervals answer for it."""
     # over the whole horizon an unstable motion runs away; what feedback would have to mend is the sum
     slip = min(audit.integration_error, float(audit.local_errors.sum()))
     asked = Finding(f"integration error, {tolerance:.0e} asked", slip, tolerance)
+    order = method.control_order
+    parts = {
+        name: _Parts("integration", audit.local_errors, method.order)
+        for name in (asked.name, "integration error, relative", "integration error of one interval")
+    }
+    parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
+    for name, (equal, misses) in _missed(form, p, solution, audit).items():
+        parts[name] = _Parts("equalities" if equal else "limits", misses, order)
     rows = []
-    for finding in (asked, lost, *audit.findings):
-        name, limit = finding.name, finding.limit
-        if limit is None:
+    for finding in (asked, *audit.findings):
+        if finding.limit is None:
             continue
-        share = _shares(finding.value, limit)
-        if name.startswith("integration error"):
-            rows.append(_Row(name, "integration", share.item(), _shares(audit.local_errors, limit), method.order))
-        elif name == lost.name:  # a sum: an interval may have the same part of it as any other
-            part = _shares(len(of_cost) * of_cost, of_cost.sum())
-            rows.append(_Row(name, "cost", share.item(), share * part, 2 * method.control_order))
-        elif name in missed:
-            equal, misses = missed[name]
-            kind = "equalities" if equal else "limits"
-            rows.append(_Row(name, kind, share.item(), _shares(misses, limit), method.control_order))
+        value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
+        value = np.inf if np.isnan(value) else float(value)
+        part = parts.get(finding.name)
+        if part is None or not part.values.any():
+            rows.append(_Row(finding.name, "other", value))
         else:
-            rows.append(_Row(name, "other", share.item()))
+            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order))
     return rows
-
-
-def _shares(values: Any, limit: float) -> np.ndarray:
-    """Values as shares of a limit: 0 stays 0, whatever the limit; what is no number is inf."""
-    given = np.asarray(values, dtype=float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(given == 0.0, 0.0, given / limit)
-    return np.where(np.isnan(shares), np.inf, shares)
-
-
-def _lost(form: Formulation, p: np.ndarray, solution: Solution) -> tuple[Finding, np.ndarray]:
-    """The row of the cost that the controls lose, and what of it each interval does (N,)."""
-    along = AccessoryProblem(form, solution, p, form.bound_values(p))
-    won = np.zeros(len(along.t))
-    for k, (slope, curved) in enumerate(zip(along.slope, along.curved, strict=True)):
-        rows = along.rows[k][:, along.nz :] / along.range
-        won[k] = _won(slope, curved, along.low - along.u[k], along.high - along.u[k], rows)
-    lost = won.reshape(along.shape) @ along.weight * along.width * solution.horizon
-    return Finding("cost lost, relative", float(lost.sum()) / (abs(solution.cost) or 1.0), 1e-3), lost
 
 
 def _missed(form: Formulation, p: np.ndarray, solution: Solution, audit: Audit) -> dict[str, tuple[bool, np.ndarray]]:
@@ -214,15 +212,11 @@ def _pieces(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.
     n = len(mesh) - 1
     pieces, bad = np.ones(n, int), np.zeros(n)
     for row in beyond:
-        if row.errors is None or not row.errors.any():
-            continue
-        most = row.errors.max()
-        # where all together are too much and none is by itself, each answers for its part
-        errors = row.errors * max(1.0, row.value / most) if most < np.inf else row.errors
-        with np.errstate(over="ignore"):
-            wanted = np.ceil((errors / TARGET_SHARE) ** (1.0 / row.order))
-        pieces = np.maximum(pieces, np.clip(wanted, 1, MOST_PIECES).astype(int))
-        bad = np.maximum(bad, errors)
+        if row.errors is not None:
+            with np.errstate(over="ignore"):
+                wanted = np.ceil((row.errors / TARGET_SHARE) ** (1.0 / row.order))
+            pieces = np.maximum(pieces, np.clip(wanted, 1, MOST_PIECES).astype(int))
+            bad = np.maximum(bad, row.errors)
     if np.all(pieces == 1):  # no interval answers for what is beyond its limit
         for row in rows:
             bad = bad if row.errors is None else np.maximum(bad, row.errors)

@@ -55,7 +55,7 @@ class Refinement:
         errors: Of every round the worst error of each kind, as a share of its limit, so that 1 is what may be:
             "integration", "equalities" and "limits" (bounds and inequalities) between the points, "cost" that is lost,
             "other" rows of the audit.
-        tolerance: Of the integration, as asked. reached: Whether no error was beyond its limit in the end.
+        tolerance: Of the integration, as asked. reached: Whether no error is beyond its limit and the audit passes.
     """
 
     intervals: tuple[int, ...]
