@@ -51,12 +51,15 @@ class Refinement:
     """How a mesh was refined.
 
     Attributes:
-        intervals, errors: Number of intervals and relative integration error of every round.
-        tolerance: What was asked. reached: Whether it was reached before the cap.
+        intervals: Number of intervals of every round.
+        errors: Of every round the worst error of each kind, as a share of its limit, so that 1 is what may be:
+            "integration", "equalities" and "limits" (bounds and inequalities) between the points, "cost" that is lost,
+            "other" rows of the audit.
+        tolerance: Of the integration, as asked. reached: Whether no error is beyond its limit and the audit passes.
     """
 
     intervals: tuple[int, ...]
-    errors: tuple[float, ...]
+    errors: dict[str, tuple[float, ...]]
     tolerance: float
     reached: bool
 
@@ -227,7 +230,7 @@ class Solution:
             }
             past = head.pop("refinement", None)
             if past is not None:
-                rounds = tuple(past["intervals"]), tuple(past["errors"])
+                rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in past["errors"].items()}
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
             fields["drawn_in"] = arrays.get("drawn_in")
             solution = cls(**head, **fields, **{name: arrays[name] for name in PLAIN})

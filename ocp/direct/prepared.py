@@ -18,12 +18,15 @@ from ocp.direct.diagnosis import diagnosis
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point
 from ocp.direct.nlp import Outcome, build_solver, call_solver
-from ocp.errors import ProblemError, checked_count, checked_mapping, checked_positive
+from ocp.errors import ProblemError, about, checked_count, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
+from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
+
+SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
 
 
 class DirectMethod(ABC):
@@ -44,6 +47,11 @@ class DirectMethod(ABC):
     def order(self) -> int:
         """Power of the width with which the integration error of one interval falls."""
 
+    @property
+    @abstractmethod
+    def control_order(self) -> int:
+        """Power of the width with which a smooth control is missed between its points."""
+
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
@@ -62,6 +70,32 @@ class DirectMethod(ABC):
     def with_mesh(self, mesh: np.ndarray) -> Self:
         """The same method on another mesh (N + 1,)."""
         return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
+
+    def with_nodes_at(self, fractions: Any) -> Self:
+        """The same method with nodes at some fractions 0..1 of the horizon too, where something jumps or bends.
+
+        A mesh that was given keeps its nodes. Without one the intervals between the fractions are equal, as many as
+        make none wider than it was.
+
+        Raises:
+            ProblemError: Fractions that are no numbers from 0 to 1.
+        """
+        told: dict[str, Any] = {"name": "fractions", "value": fractions}
+        with about("fractions"):
+            asked = numeric("with_nodes_at: fractions", fractions)
+        if not np.all((asked >= 0.0) & (asked <= 1.0)):
+            raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **told)
+        if not asked.size:
+            return self
+        nodes = np.array([0.0, 1.0]) if self.mesh is None else self.fractions
+        own = np.abs(asked[:, None] - nodes).min(axis=1) < SAME_NODE
+        asked = np.unique(asked[~own])
+        nodes = np.union1d(nodes, asked[np.diff(asked, prepend=-1.0) >= SAME_NODE])
+        if self.mesh is None:
+            counts = np.maximum(np.ceil(np.diff(nodes) * self.intervals - SAME_NODE), 1).astype(int)
+            pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], counts, strict=True)]
+            nodes = np.concatenate([*pieces, [1.0]])
+        return self.with_mesh(nodes)
 
     def _settle(self, count: str, most: int | None = None) -> None:
         """Check the mesh and the whole number by the name ``count``; turn them into plain Python, as is saved.
