@@ -23,14 +23,26 @@ class Method(Protocol):
     """What solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
-        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: ByName = None,
+        compiled: bool = False,
+        scaling: bool = True,
     ) -> PreparedProblem:
         """Build a problem once, to be solved many times; see :func:`prepare`."""
         ...
 
 
 def prepare(
-    problem: Problem, method: Method, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+    problem: Problem,
+    method: Method,
+    *,
+    solver: str = "ipopt",
+    options: ByName = None,
+    compiled: bool = False,
+    scaling: bool = True,
 ) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
@@ -40,6 +52,8 @@ def prepare(
             indirect method, of the direct solution that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
+        scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where
+            these are far from 1; all that is reported stays in the units of the problem.
 
     Raises:
         ProblemError: The problem is not complete, or the method or solver cannot take it.
@@ -49,7 +63,7 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    return method.prepare(problem, solver=solver, options=options, compiled=compiled)
+    return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
 def solve(

@@ -79,6 +79,10 @@ class Solution:
         variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
+        start: Where the solver started from when it found this: ``guess``, ``zeros``, ``roll-out`` (of the dynamics,
+            with the controls of the guess), ``elastic plan`` (that misses the constraints least) or ``downhill``
+            (beside a stationary plan that is no minimum).
+        regularised: Whether the solver saw the cost not curve upwards where it ended: the plan may be no minimum.
     """
 
     name: str
@@ -103,6 +107,8 @@ class Solution:
     seconds: dict[str, float]
     problem: Any = field(default=None, compare=False, repr=False)
     refinement: Refinement | None = None
+    start: str = "guess"
+    regularised: bool = False
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
@@ -178,7 +184,7 @@ class Solution:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
             arrays |= {f"{kind}/{part}": getattr(getattr(self, kind), part) for part in PARTS}
-        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
+        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds", "start")
         head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:

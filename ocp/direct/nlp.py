@@ -14,7 +14,7 @@ from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, checked_choice
 
-__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
+__all__ = ["ADVICE", "ROUNDING", "SOLVERS", "Outcome", "build_solver", "call_solver", "largest_number_of_iterations"]
 
 IPOPT = {
     "tol": 1e-10,
@@ -54,7 +54,11 @@ SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word."""
+    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word.
+
+    ``regularised``: whether the cost did not curve upwards where it ended, as far as the solver saw: its last step was
+    made with a Hessian that it had changed, or it made none.
+    """
 
     variables: np.ndarray
     cost: float
@@ -64,6 +68,7 @@ class Outcome:
     status: str
     iterations: int
     seconds: float
+    regularised: bool = False
 
 
 def build_solver(
@@ -103,6 +108,11 @@ def build_solver(
     except RuntimeError as error:
         words = f"{solver} does not take these options {options!r}: {last_line(error)}"
         raise ProblemError(words, name="options", value=options) from error
+
+
+def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
+    """After how many iterations a solver gives up, by its options."""
+    return int({**(IPOPT if solver == "ipopt" else FATROP), **options}["max_iter"])
 
 
 def fatrop_functions(program: Program) -> dict[str, Any]:
@@ -177,7 +187,14 @@ def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.
         f"{word}: {advice}" if advice else word,
         int(stats.get("iter_count", 0)),
         time.monotonic() - began,
+        regularised(stats),
     )
+
+
+def regularised(stats: dict[str, Any]) -> bool:
+    """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
+    sizes = stats.get("iterations", {}).get("regularization_size", ())
+    return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:
