@@ -111,8 +111,9 @@ def build_solver(
 
 
 def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
-    """After how many iterations a solver gives up, by its options."""
-    return int({**(IPOPT if solver == "ipopt" else FATROP), **options}["max_iter"])
+    """After how many iterations a solver gives up, by its options; 0 where these make no sense."""
+    most = {**(IPOPT if solver == "ipopt" else FATROP), **options}["max_iter"]
+    return int(most) if isinstance(most, int | float | np.number) else 0
 
 
 def fatrop_functions(program: Program) -> dict[str, Any]:

@@ -272,7 +272,8 @@ class Prepared:
         inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
         jacobian = self.program.jacobian(outcome.variables, p)[1]
         rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
-        terms = np.array(jacobian.nonzeros()) * inner[rows]
+        with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
+            terms = np.array(jacobian.nonzeros()) * inner[rows]
         running = np.asarray(self.program.inside(outcome.variables, p).full()).reshape(-1)
 
         node_of = np.full(fragment.size, -2)

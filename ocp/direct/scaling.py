@@ -203,7 +203,8 @@ def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np
     jacobian = _second_output(program.jacobian, point, p)
     if jacobian is not None:
         at, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
-        entries = np.abs(np.array(jacobian.nonzeros())) * by[columns]
+        with np.errstate(invalid="ignore"):
+            entries = np.abs(np.array(jacobian.nonzeros())) * by[columns]
         np.maximum.at(rows, at, np.where(np.isfinite(entries), entries, 0.0))
     _, label = np.unique(fragment.row_labels, return_inverse=True)  # the same at all times
     largest = np.zeros(len(rows))
@@ -212,7 +213,8 @@ def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np
     for place in (point, point + by):  # where a start rests on the least of the cost, beside it
         slope = _second_output(program.gradient, place, p)
         if slope is not None:
-            moves.append(float(np.abs(np.asarray(slope.full()).ravel() * by).sum()))
+            with np.errstate(invalid="ignore"):
+                moves.append(float(np.abs(np.asarray(slope.full()).ravel() * by).sum()))
     usual = [move for move in moves if np.isfinite(move) and move > 0]
     cost = min(usual, default=1.0)
     cost /= float(np.clip(cost, 1 / USUAL, USUAL))  # no more than to the edge of what is usual
