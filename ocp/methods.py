@@ -59,8 +59,9 @@ def prepare(
 
     Args:
         problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end). For the
-            indirect method, of the direct solution that seeds it.
+        solver: ``ipopt``, ``fatrop`` (faster on long horizons; takes no coupling of controls at the end) or ``sleqp``
+            (an active-set method, to confirm a plan, started there). For the indirect method, of the direct solution
+            that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
         scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where

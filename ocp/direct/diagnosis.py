@@ -18,7 +18,7 @@ import numpy as np
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
-from ocp.direct.scaling import Scales
+from ocp.direct.scaling import USUAL, Scales
 from ocp.errors import SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -64,7 +64,7 @@ def diagnosis(
     """
     labels, at, value, miss = residuals(built, outcome.variables, arguments)
     status = outcome.status
-    found = () if elastic is None else elastic.conflicts
+    found = () if elastic is None or badly_scaled else elastic.conflicts
     if badly_scaled:
         status = f"{status.partition(':')[0]}: badly scaled: {badly_scaled}; {REMEDY}"
     elif elastic is not None and not found:  # it is not the constraints
@@ -221,7 +221,7 @@ def elastic_plan(
     rows, columns = soft.picks(n, m, k)
     with np.errstate(all="ignore"):
         size = float(program.values(own["x0"], own["p"])[0])
-    share = COST_SHARE / max(1.0, abs(size)) if np.isfinite(size) else 0.0
+    share = COST_SHARE / max(1.0 if scales.cost <= 1 else USUAL, abs(size)) if np.isfinite(size) else 0.0
     lam, sigma = ca.MX.sym("lam", rows.shape[0]), ca.MX.sym("sigma")
     cost, slope = program.gradient(v, p)
     values, jacobian = program.jacobian(v, p)

@@ -69,7 +69,7 @@ def self_running(form: Formulation) -> np.ndarray:
 
     def uses(symbol: ca.SX | ca.MX) -> np.ndarray:
         pattern = np.asarray(ca.DM(ca.jacobian_sparsity(form.f, symbol), 1).full()) != 0
-        return pattern.reshape(form.nx, -1)
+        return np.asarray(pattern.reshape(form.nx, -1))
 
     alone = form.initial_is_fixed & ~uses(form.u).any(axis=1)
     states = uses(form.x)

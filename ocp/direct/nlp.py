@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ocp.console import Interrupt, Progress, interruptible
+from ocp.console import Interrupt, Progress, interruptible, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, checked_choice
@@ -31,7 +32,9 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-SOLVERS = ("ipopt", "fatrop")
+SLEQP = {"print_level": 0, "max_iter": 1000}
+DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp": SLEQP}
+SOLVERS = tuple(DEFAULTS)
 
 ADVICE = {
     "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
@@ -82,15 +85,18 @@ def build_solver(
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-    defaults = IPOPT if solver == "ipopt" else FATROP
-    own = {**defaults, **options}
-    if not own["print_level"] and "max_iter" in own:
+    own = {**DEFAULTS[solver], **options}
+    if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
     progress, nlp = None, program.nlp
     if solver == "ipopt":
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
+    elif solver == "sleqp":
+        # like fatrop's, its interface looks for ready-made derivatives in its cache
+        settings["cache"] = {"nlp_grad_f": program.gradient, "nlp_jac_g": program.jacobian}
+        settings |= {key: own.pop(key) for key in SLEQP if key in own}  # its interface asks for these outside
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
@@ -112,7 +118,7 @@ def build_solver(
 
 def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
     """After how many iterations a solver gives up, by its options; 0 where these make no sense."""
-    most = {**(IPOPT if solver == "ipopt" else FATROP), **options}["max_iter"]
+    most = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
     return int(most) if isinstance(most, int | float | np.number) else 0
 
 
@@ -154,8 +160,9 @@ def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.
     if progress is not None:
         progress.open(arguments["lbg"], arguments["ubg"])
     try:
-        with interruptible(asked):
-            result = solver(**(arguments if progress is not None else tightened(arguments)))
+        # SLEQP tells of each subproblem that it gives up
+        with interruptible(asked), nullcontext() if progress is not None else quiet():
+            result = solver(**(tightened(arguments) if solver.class_name() == "FatropInterface" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now

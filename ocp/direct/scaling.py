@@ -24,7 +24,7 @@ from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
 from ocp.problem.formulation import Bounds, Formulation
 
-__all__ = ["Scales", "Sizes", "badness", "fitting_scales", "scaled_program", "sizes_along", "unscaled"]
+__all__ = ["USUAL", "Scales", "Sizes", "badness", "fitting_scales", "scaled_program", "sizes_along", "unscaled"]
 
 USUAL = 1e3
 """Sizes from 1/USUAL to USUAL are left alone: the tolerances of 1e-10 leave seven digits there."""
@@ -217,7 +217,8 @@ def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np
                 moves.append(float(np.abs(np.asarray(slope.full()).ravel() * by).sum()))
     usual = [move for move in moves if np.isfinite(move) and move > 0]
     cost = min(usual, default=1.0)
-    cost /= float(np.clip(cost, 1 / USUAL, USUAL))  # no more than to the edge of what is usual
+    # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
+    cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
     return Scales(_powers(by), _powers(largest[label]), float(2.0 ** np.round(np.log2(cost))))
 
 
