@@ -88,6 +88,10 @@ class Solution:
             controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
             jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
             was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
+        start: Where the solver started from when it found this: ``guess``, ``zeros``, ``roll-out`` (of the dynamics,
+            with the controls of the guess), ``elastic plan`` (that misses the constraints least) or ``downhill``
+            (beside a stationary plan that is no minimum).
+        regularised: Whether the solver saw the cost not curve upwards where it ended: the plan may be no minimum.
     """
 
     name: str
@@ -113,6 +117,8 @@ class Solution:
     problem: Any = field(default=None, compare=False, repr=False)
     refinement: Refinement | None = None
     drawn_in: np.ndarray | None = None
+    start: str = "guess"
+    regularised: bool = False
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
@@ -188,7 +194,7 @@ class Solution:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
             arrays |= {f"{kind}/{part}": getattr(getattr(self, kind), part) for part in PARTS}
-        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds")
+        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds", "start")
         head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
