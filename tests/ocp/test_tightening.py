@@ -226,9 +226,7 @@ PANEL_METHODS = [
 def test_a_tightened_plan_with_an_active_limit_does_what_is_asked(name: str, method: Any) -> None:
     tight = tighten(PANEL[name](), method)
     audit = tight.audit()
-    asked = ("solver", "integration", "cost, relative", "reported", "horizon", "bounds", "start", "end", "state jump")
-    rows = [f for f in audit.findings if f.name.startswith(asked) or f.name in audit.constraints]
-    assert not [f for f in rows if not f.passed]
+    assert audit.feasible, str(audit)
     assert max(audit.constraints.values()) < 2e-6 + 10 * audit.integration_error
 
 
