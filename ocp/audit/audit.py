@@ -142,7 +142,9 @@ class Audit:
                     limit = "" if f.limit is None else f"{f.limit:.2e}"
                     time = "" if f.time is None else f"{f.time:.4f}"
                     ok = "" if f.limit is None else "ok" if f.passed else "FAILED"
-                    line = f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
+                    line = (
+                        f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
+                    )
                     lines.append(line.rstrip())
         return "\n".join([*lines, f"The plan {self.sentence}."])
 
@@ -257,12 +259,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 
 
 def optimality_findings(
-    form: Formulation,
-    found: Optimality,
-    lost: float,
-    costates: float,
-    stationarity: float | None,
-    drift: float | None,
+    form: Formulation, found: Optimality, lost: float, costates: float, stationarity: float | None, drift: float | None
 ) -> list[Finding]:
     """First and second order."""
     cost, errors = found.cost_size, found.error_size
