@@ -15,6 +15,7 @@ import numpy as np
 __all__ = [
     "AuditError",
     "Detailed",
+    "Interrupted",
     "ProblemError",
     "RefinementWarning",
     "SolveError",
@@ -65,6 +66,18 @@ class SolveError(Detailed, RuntimeError):
         """Pickled without the problem of the solution: expressions cannot be pickled, as they cannot be saved."""
         loose = None if self.solution is None else self.solution.with_problem(None)
         return type(self), self.args, {**self.__dict__, "solution": loose}
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, where something had been found before.
+
+    Attributes:
+        solution: The last iterate as an unsuccessful solution.
+    """
+
+    def __init__(self, message: str = "", solution: Any = None) -> None:
+        super().__init__(message)
+        self.solution = solution
 
 
 class AuditError(Detailed, RuntimeError):

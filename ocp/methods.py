@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from ocp.console import interruptible, limited
 from ocp.errors import ProblemError
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
@@ -14,7 +15,9 @@ __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
 class PreparedProblem(Protocol):
     """A problem that a method has made ready to be solved many times."""
 
-    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
+    def solve(
+        self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
+    ) -> Solution:
         """Solve with these parameters from this guess; see :func:`solve`."""
         ...
 
@@ -29,6 +32,7 @@ class Method(Protocol):
         ...
 
 
+@interruptible
 def prepare(
     problem: Problem, method: Method, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
 ) -> PreparedProblem:
@@ -52,6 +56,7 @@ def prepare(
     return method.prepare(problem, solver=solver, options=options, compiled=compiled)
 
 
+@interruptible
 def solve(
     problem: Problem,
     method: Method,
@@ -61,6 +66,7 @@ def solve(
     options: ByName = None,
     guess: Guess = None,
     check: bool = True,
+    time_limit: float | None = None,
 ) -> Solution:
     """Solve a problem by a method.
 
@@ -72,10 +78,14 @@ def solve(
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
         check: Raise where the solver fails, after a second solve that finds what would have to give way; False returns
             the unsuccessful solution with its status.
+        time_limit: After so many seconds, the build included, the solver is stopped between two iterations, which
+            counts as a failure. None for no limit.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.
+        KeyboardInterrupt: Ctrl-C; the exception's ``solution``, where it has one, is the last iterate.
         SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
             worst residuals by constraint, state and time.
     """
-    return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)
+    with limited(time_limit):
+        return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

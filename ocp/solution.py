@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
+from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
 
@@ -157,6 +158,7 @@ class Solution:
             values |= unstack(pool, interpolant(flat))
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
 
+    @interruptible
     def audit(self, problem: Any = None, **settings: Any) -> Any:
         """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit.audit`.
 

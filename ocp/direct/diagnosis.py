@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
+from ocp.console import time_left
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
@@ -26,6 +27,7 @@ __all__ = ["Conflict", "conflicts", "diagnosis"]
 WORST = 6  # lines of one kind
 MISSED = 1e-6  # residual from which a plan counts as not feasible
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
+LONGEST = 1e6  # s, in place of no time limit
 COST_SHARE = 1e-3  # of the problem's own cost, which makes the elastic plan unique
 EQUALITY_PRICE = 10.0  # how much dearer it is to miss an equality, which is what is asked for, than a limit
 HELD = 1e-5  # amount below which a constraint holds, relative to its size
@@ -48,7 +50,7 @@ def diagnosis(
     labels, at, value, miss = residuals(built, outcome.variables, arguments)
     lines = [f"problem {built.problem.name!r}: {built.solver_name} ended with {outcome.status}"]
     found: list[Conflict] | None = None
-    if "User_Requested_Stop" not in outcome.status and np.all(np.isfinite(value)) and np.any(miss > MISSED):
+    if time_left() > 0 and np.all(np.isfinite(value)) and np.any(miss > MISSED):
         found = conflicts(built.formulation, built.fragment, built.program, arguments, horizon)
     if found:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
@@ -197,7 +199,7 @@ def conflicts(
         "print_time": False,
         "error_on_fail": False,
         "show_eval_warnings": False,
-        "ipopt": ELASTIC_IPOPT,
+        "ipopt": {**ELASTIC_IPOPT, "max_wall_time": min(time_left(), LONGEST)},
     }
     lower, upper = soft.limits(arguments)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -12,13 +13,14 @@ from typing import Any, Self
 
 import numpy as np
 
+from ocp.console import INTERRUPTED, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import assemble
 from ocp.direct.diagnosis import diagnosis
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point
 from ocp.direct.nlp import Outcome, build_solver, call_solver
-from ocp.errors import ProblemError, checked_count, checked_mapping, checked_positive
+from ocp.errors import Interrupted, ProblemError, checked_count, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
@@ -48,6 +50,7 @@ class DirectMethod(ABC):
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
 
+    @interruptible
     def prepare(
         self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
     ) -> Prepared:
@@ -97,7 +100,7 @@ def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
 
 
 class Prepared:
-    """A problem built once for a method and a solver, to be solved many times.
+    """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
         formulation, fragment, program: What was built. seconds: Wall time of the build.
@@ -111,19 +114,28 @@ class Prepared:
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         own = checked_mapping("options", options)
         self._solver, self._progress = build_solver(self.program, solver, own, self.fragment.stages, problem.name)
+        self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
+    @interruptible
     def solve(
         self,
         parameters: ByName = None,
         guess: Guess = None,
         check: bool = True,
         tighter: Mapping[str, np.ndarray] | None = None,
+        time_limit: float | None = None,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`solve`.
+        """Solve with these parameters from this guess; see :func:`solve`. Another thread's solve is waited for.
 
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
+        with limited(time_limit), self._lock:
+            return self._solve(parameters, guess, check, tighter)
+
+    def _solve(
+        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None
+    ) -> Solution:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -143,7 +155,12 @@ class Prepared:
         try:
             solution = self._solution(outcome, p)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
+            if outcome.status.startswith(INTERRUPTED):
+                raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
             raise diagnosis(self, outcome, arguments, self._horizon(outcome, p)) from error
+        if outcome.status.startswith(INTERRUPTED):
+            words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
+            raise Interrupted(words, solution)
         if check and not outcome.success:
             raise diagnosis(self, outcome, arguments, solution.horizon, solution)
         return solution
