@@ -23,8 +23,6 @@ import casadi as ca
 import numpy as np
 from tqdm import tqdm
 
-from ocp.errors import checked_positive
-
 __all__ = [
     "INTERRUPTED",
     "LOG",
@@ -165,13 +163,7 @@ def reason_to_stop() -> str:
 
 @contextmanager
 def limited(seconds: float | None) -> Iterator[None]:
-    """Solves inside end after so many seconds in all, or after what an outer limit leaves; None for no limit.
-
-    Raises:
-        ProblemError: seconds not positive and finite.
-    """
-    if seconds is not None:
-        checked_positive("time_limit", seconds)
+    """Solves inside end after so many seconds in all, or after what an outer limit leaves; None for no limit."""
     before = _DEADLINE.get()
     token = _DEADLINE.set(before if seconds is None else min(before, time.monotonic() + seconds))
     try:

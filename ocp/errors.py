@@ -26,6 +26,7 @@ __all__ = [
     "checked_nonnegative",
     "checked_positive",
     "checked_text",
+    "checked_time_limit",
     "unknown_name",
 ]
 
@@ -151,6 +152,11 @@ def checked_text(what: str, value: Any) -> str:
     if not isinstance(value, str):
         raise ProblemError(f"{what} must be a string, not {value!r}", name=_last(what), value=value)
     return value
+
+
+def checked_time_limit(seconds: Any) -> float | None:
+    """A time limit, or ProblemError unless it is a positive number of seconds, or None for no limit."""
+    return None if seconds is None else checked_positive("time_limit", seconds)
 
 
 def checked_mapping(what: str, values: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from ocp.console import interruptible, limited
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_time_limit
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
 
@@ -87,5 +87,5 @@ def solve(
         SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
             worst residuals by constraint, state and time.
     """
-    with limited(time_limit):
+    with limited(checked_time_limit(time_limit)):
         return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

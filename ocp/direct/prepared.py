@@ -20,7 +20,7 @@ from ocp.direct.diagnosis import diagnosis
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point
 from ocp.direct.nlp import Outcome, build_solver, call_solver
-from ocp.errors import Interrupted, ProblemError, checked_count, checked_mapping, checked_positive
+from ocp.errors import Interrupted, ProblemError, checked_count, checked_mapping, checked_positive, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
@@ -130,7 +130,7 @@ class Prepared:
 
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
-        with limited(time_limit), self._lock:
+        with limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check, tighter)
 
     def _solve(

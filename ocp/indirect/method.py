@@ -28,6 +28,7 @@ from ocp.errors import (
     checked_count,
     checked_mapping,
     checked_positive,
+    checked_time_limit,
 )
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem
 from ocp.indirect.hamiltonian import Hamiltonian
@@ -115,7 +116,7 @@ class PreparedIndirect:
         Raises:
             ProblemError: Wrong parameters or guess. SolveError: Newton failed, or a control has a singular arc.
         """
-        with limited(time_limit), self._lock:
+        with limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check)
 
     def _solve(self, parameters: ByName, guess: Guess, check: bool) -> Solution:
