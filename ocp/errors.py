@@ -5,6 +5,7 @@ Each message names the offending thing, its value and what to do; the exception 
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -46,6 +47,10 @@ class Detailed(Exception):
         super().__init__(message)
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
+    def __reduce__(self) -> Any:
+        """Pickled with all that it carries; of what cannot be pickled, such as an expression, with how it is shown."""
+        return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
+
 
 class ProblemError(Detailed, ValueError):
     """A problem, a method or an argument that cannot be right, found before anything is solved."""
@@ -62,11 +67,6 @@ class SolveError(Detailed, RuntimeError):
     def __init__(self, message: str = "", solution: Any = None, conflicts: Sequence[Any] = (), **details: Any) -> None:
         super().__init__(message, **details)
         self.solution, self.conflicts = solution, tuple(conflicts)
-
-    def __reduce__(self) -> Any:
-        """Pickled without the problem of the solution: expressions cannot be pickled, as they cannot be saved."""
-        loose = None if self.solution is None else self.solution.with_problem(None)
-        return type(self), self.args, {**self.__dict__, "solution": loose}
 
 
 class Interrupted(KeyboardInterrupt):
@@ -169,3 +169,11 @@ def checked_mapping(what: str, values: Any) -> dict[str, Any]:
 def _last(what: str) -> str:
     """The name of an argument at the end of ``Collocation: scheme``."""
     return what.rpartition(" ")[2].strip("'")
+
+
+def _pickled(value: Any) -> Any:
+    try:
+        pickle.dumps(value)
+    except Exception:  # of any kind
+        return repr(value)
+    return value

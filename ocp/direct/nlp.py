@@ -13,7 +13,7 @@ import numpy as np
 from ocp.console import LOG, Progress, Watch, listening
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
-from ocp.errors import ProblemError, checked_choice
+from ocp.errors import ProblemError, SolveError, checked_choice
 
 __all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
 
@@ -75,6 +75,7 @@ def build_solver(
 
     Raises:
         ProblemError: An unknown solver, or an option that it does not take.
+        SolveError: The solver's library cannot be loaded, for want of file handles, say.
     """
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
@@ -102,11 +103,23 @@ def build_solver(
             "ng": list(stages.rows),
             "N": len(stages.states) - 1,
         }
+    check_loaded(solver)
     try:
         return ca.nlpsol("solver", solver, nlp, {**settings, solver: own}), progress
     except RuntimeError as error:
         words = f"{solver} does not take these options {options!r}: {last_line(error)}"
         raise ProblemError(words, name="options", value=options) from error
+
+
+def check_loaded(solver: str) -> None:
+    """Raise SolveError, with the system's reason, where the library of a solver cannot be loaded."""
+    if ca.has_nlpsol(solver):
+        return
+    try:
+        ca.load_nlpsol(solver)
+    except RuntimeError as error:
+        why = str(error).partition("Error code: ")[2].partition("\n")[0] or last_line(error)
+        raise SolveError(f"{solver} cannot be loaded: {why}", name="solver", value=solver) from error
 
 
 def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:

@@ -114,8 +114,13 @@ class Prepared:
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         own = checked_mapping("options", options)
         self._solver, self._progress = build_solver(self.program, solver, own, self.fragment.stages, problem.name)
+        self._made_of = problem, method, solver, own, compiled
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
+
+    def __reduce__(self) -> Any:
+        """Pickled and copied as what it was prepared of, to be prepared again."""
+        return type(self), self._made_of
 
     @interruptible
     def solve(

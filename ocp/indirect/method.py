@@ -107,6 +107,10 @@ class PreparedIndirect:
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
+    def __reduce__(self) -> Any:
+        """Pickled and copied as what it was prepared of, to be prepared again."""
+        return type(self), (self.problem, self.method, self._seeding)
+
     @interruptible
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
