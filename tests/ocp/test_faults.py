@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Indirect, ProblemError, SolveError, prepare, solve
-from ocp.console import interruptible, limited, time_left
+from ocp.console import interruptible, limited, quiet, time_left
 from ocp.errors import Interrupted
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
 
@@ -315,3 +316,45 @@ def test_threads_that_share_something_get_what_one_alone_gets(what: str) -> None
     done = run(f"{THREADS}\n{SHARED[what]}\n{TOLD}")
     assert done.returncode == 0, (done.returncode, done.stderr)
     assert done.stdout.split() == ["4", "1"]
+
+
+# ---- words -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_without_a_terminal_a_solve_logs_its_start_and_its_end(solver: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "ocp"):
+        plan = solve(energy(), Collocation(4), solver=solver)
+    start, end = (record.getMessage() for record in caplog.records)
+    assert all(record.name == "ocp" for record in caplog.records)
+    assert start == f"solving 'energy': {plan.variables.size} variables, {plan.multipliers.size} rows"
+    assert end.startswith(f"solved 'energy': {plan.status}, cost {plan.cost:.6g}, {plan.iterations} iterations, ")
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "ocp"):
+        solve(van_der_pol(horizon=20.0), Collocation(100), solver=solver, time_limit=1e-3, check=False)
+    assert "Maximum_WallTime_Exceeded" in caplog.records[-1].getMessage()
+
+
+def test_what_one_thread_keeps_quiet_does_not_silence_another(capsys: pytest.CaptureFixture[str]) -> None:
+    real = sys.stderr
+    inside, leave = threading.Event(), threading.Event()
+
+    def hushed() -> None:
+        with quiet():
+            print("of the thread", file=sys.stderr)
+            inside.set()
+            leave.wait(10.0)
+
+    thread = threading.Thread(target=hushed)
+    thread.start()
+    inside.wait(10.0)
+    with quiet():
+        print("of the main thread, hushed", file=sys.stderr)
+        with quiet():
+            pass
+        print("still hushed", file=sys.stderr)
+    print("of the main thread", file=sys.stderr)
+    leave.set()
+    thread.join()
+    assert sys.stderr is real
+    assert capsys.readouterr().err == "of the main thread\n"
