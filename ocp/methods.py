@@ -9,8 +9,9 @@ import numpy as np
 
 from ocp.audit.accessory import FLAT
 from ocp.audit.curvature import Curvature, curvature
+from ocp.console import interruptible, limited
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError, checked_time_limit
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
@@ -25,7 +26,9 @@ VISIBLE = 0.1
 class PreparedProblem(Protocol):
     """A problem that a method has made ready to be solved many times."""
 
-    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
+    def solve(
+        self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
+    ) -> Solution:
         """Solve with these parameters from this guess; see :func:`solve`."""
         ...
 
@@ -46,6 +49,7 @@ class Method(Protocol):
         ...
 
 
+@interruptible
 def prepare(
     problem: Problem,
     method: Method,
@@ -78,6 +82,7 @@ def prepare(
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
+@interruptible
 def solve(
     problem: Problem,
     method: Method,
@@ -88,6 +93,7 @@ def solve(
     guess: Guess = None,
     check: bool = True,
     scaling: bool = True,
+    time_limit: float | None = None,
 ) -> Solution:
     """Solve a problem by a method.
 
@@ -105,16 +111,20 @@ def solve(
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
         check: Raise where the solver fails, after a second solve that finds what would have to give way; False runs it
             once, from the guess, and returns the unsuccessful solution with its status.
+        time_limit: After so many seconds, the build and all starts included, the solver is stopped between two
+            iterations, which counts as a failure. None for no limit.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.
+        KeyboardInterrupt: Ctrl-C; the exception's ``solution``, where it has one, is the last iterate.
         SolveError: The solver failed from every start; names the constraints that cannot hold together, by how much and
             when, and the worst residuals by constraint, state and time. Or what it found is no minimum, and beside it
             there is none either.
     """
-    prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
-    solution = prepared.solve(parameters, guess, check)
-    return lowered(prepared, solution) if check and solution.regularised else solution
+    with limited(checked_time_limit(time_limit)):
+        prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
+        solution = prepared.solve(parameters, guess, check)
+        return lowered(prepared, solution) if check and solution.regularised else solution
 
 
 def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
