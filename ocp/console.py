@@ -182,7 +182,7 @@ def time_left() -> float:
 
 
 class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate where it did."""
+    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate."""
 
     def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
@@ -223,9 +223,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
             self.stopped = reason_to_stop()
         except KeyboardInterrupt:  # CasADi would make another error of it
             self.stopped = INTERRUPTED
-        self.iterations += 1
-        if self.stopped:
-            self.iterate = np.asarray(arguments[0].full()).reshape(-1)
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
         return [int(bool(self.stopped))]
 
     def close(self) -> None:
@@ -234,7 +232,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
 
 
 class Watch(ca.Callback):  # type: ignore[misc]
-    """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps that iterate.
+    """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
 
     For a solver that has no iteration callback.
     """
@@ -266,9 +264,7 @@ class Watch(ca.Callback):  # type: ignore[misc]
             self.stopped = self.stopped or reason_to_stop()
         except KeyboardInterrupt:
             self.stopped = INTERRUPTED
-        self.iterations += 1
-        if self.stopped:
-            self.iterate = np.asarray(arguments[0].full()).reshape(-1)
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
         return [float(not self.stopped)]
 
 

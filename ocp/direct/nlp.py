@@ -178,6 +178,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     began = time.monotonic()
     kind = solver.class_name()
     progress.open(arguments["lbg"], arguments["ubg"])
+    progress.iterate = np.asarray(arguments["x0"])
     tell(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
         # SLEQP tells of each subproblem that it gives up
@@ -185,7 +186,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
             result = solver(**(tightened(arguments) if kind == "FatropInterface" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
-        if progress.stopped:  # the interfaces of fatrop and SLEQP know no other end
+        if progress.stopped or kind == "SLEQPInterface":  # SLEQP's interface raises wherever it fails
             return stopped(solver, progress, arguments, began)
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
@@ -213,11 +214,12 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
 
 
 def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
-    """The iterate at which a solver was stopped that returned nothing; its multipliers are not known."""
+    """The iterate at which a solver stopped, or was stopped, that returned nothing; its multipliers are not known."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(at.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
-    tell(f"stopped {at.title!r}: {at.stopped}, {at.iterations} iterations, {seconds:.3g} s")
-    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(at.stopped), at.iterations, seconds)
+    word = at.stopped or "Error_In_Step_Computation"
+    tell(f"stopped {at.title!r}: {word}, {at.iterations} iterations, {seconds:.3g} s")
+    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(word), at.iterations, seconds)
 
 
 def advised(word: str) -> str:

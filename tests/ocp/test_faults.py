@@ -13,10 +13,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Collocation, Indirect, ProblemError, SolveError, prepare, solve
+from ocp import Collocation, Indirect, Problem, ProblemError, SolveError, prepare, solve
 from ocp.console import interruptible, limited, quiet, time_left
 from ocp.errors import Interrupted
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
@@ -48,6 +49,7 @@ from models import papers
 from models.paths import segments
 from ocp import *
 from tests.ocp.problems import van_der_pol
+from tests.ocp.test_faults import solved_from_zeros
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs with Ctrl-C ignored
 NEVER = {"tol": 1e-300, "acceptable_iter": 0, "max_iter": 1000000}  # keeps ipopt at work
@@ -80,8 +82,15 @@ long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
 ipopt = prepare(long, Collocation(300, 4), options=NEVER)
 interrupted("ipopt", ipopt.solve)
 interrupted("ipopt without check", lambda: ipopt.solve(check=False))
-fatrop = prepare(long, Collocation(500, 4), solver="fatrop", options={"max_iter": 1000000})
-interrupted("fatrop", fatrop.solve, 0.1)
+fatrop = prepare(long, Collocation(1000, 4), solver="fatrop", options={"max_iter": 1000000})
+interrupted("fatrop", fatrop.solve, 0.5)
+again = prepare(solved_from_zeros(), Collocation(1000, 4))
+interrupted("second start", again.solve)
+stuck = van_der_pol(horizon=20.0, terminal=[9.0, 9.0], upper=0.1)
+conflicts = prepare(stuck, Collocation(1000, 4), options={"max_iter": 1})
+interrupted("what conflicts", conflicts.solve, 2.0)
+sleqp = prepare(long, Collocation(60, 4), solver="sleqp")
+interrupted("sleqp", sleqp.solve, 1.0)
 interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
 interrupted("refine", lambda: refine(van_der_pol(), Collocation(50), options=NEVER))
 interrupted("tighten", lambda: tighten(long, Collocation(200), options=NEVER))
@@ -120,13 +129,10 @@ def lines(code: str) -> list[list[str]]:
 
 def test_ctrl_c_ends_a_solve_at_once_with_its_iterate() -> None:
     *found, afterwards = lines(DIRECT)
-    assert found[:4] == [
-        ["ipopt", "KeyboardInterrupt with a plan", "at once"],
-        ["ipopt without check", "KeyboardInterrupt with a plan", "at once"],
-        ["fatrop", "KeyboardInterrupt with a plan", "at once"],
-        ["prepare", "KeyboardInterrupt", "at once"],
-    ]
-    assert [name for name, _, _ in found[4:]] == ["refine", "tighten"]
+    with_a_plan = ["ipopt", "ipopt without check", "fatrop"]
+    others = ["second start", "what conflicts", "sleqp", "prepare", "refine", "tighten"]
+    assert [name for name, _, _ in found] == with_a_plan + others
+    assert {word for name, word, _ in found if name in with_a_plan} == {"KeyboardInterrupt with a plan"}
     assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}
     assert {late for _, _, late in found} == {"at once"}
     assert afterwards == ["True False"]
@@ -216,6 +222,48 @@ def test_a_solve_ends_at_its_time_limit_and_says_so(solver: str) -> None:
         assert plan["x"].shape == (1201, 2)
         assert np.all(np.isfinite(plan["x"]))
         assert np.isfinite(plan.cost)
+
+
+def test_sleqp_ends_at_its_time_limit_and_works_again() -> None:
+    prepared = prepare(van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0), Collocation(60), solver="sleqp")
+    stopped = prepared.solve(check=False, time_limit=0.05)
+    assert not stopped.success
+    assert stopped.status.startswith("Maximum_WallTime_Exceeded")
+    assert np.all(np.isfinite(stopped["x"]))
+    assert np.isfinite(stopped.cost)
+    assert prepared.solve(check=False).success
+
+
+def test_where_sleqp_fails_is_no_foreign_exception() -> None:
+    """Its interface raises where it gives up."""
+    problem = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+    plan = prepare(problem, Collocation(100, 4), solver="sleqp").solve(check=False)
+    assert plan.success or plan.status.startswith("Error_In_Step_Computation")
+    assert np.all(np.isfinite(plan["x"]))
+
+
+def solved_from_zeros() -> Problem:
+    """No number at the guess, so that the solver fails there at once; solved from zeros."""
+    problem = Problem("solved from zeros")
+    x = problem.state("x", 2, initial=[1.0, 0.0])
+    u = problem.control("u", guess=-2.0)
+    problem.dynamics(x, ca.vertcat(x[1], (1 - x[0] ** 2) * x[1] - x[0] + u))
+    problem.horizon(20.0)
+    problem.minimize(running=ca.sumsqr(x) + u**2 + 1e-3 * ca.log(1 + u) ** 2)
+    return problem
+
+
+def test_one_time_limit_covers_all_starts() -> None:
+    """What ran out of time is told of, whichever start it was at; behind it there is no other."""
+    assert solve(solved_from_zeros(), Collocation(20)).start == "zeros"
+    prepared = prepare(solved_from_zeros(), Collocation(1000, 4))
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        prepared.solve(time_limit=0.3)
+    told = str(caught.value).splitlines()
+    assert next(line for line in told if line.startswith("from the ")).startswith("from the guess: Invalid_Number")
+    assert "from the roll-out" not in str(caught.value)
+    assert caught.value.solution.start == "zeros"
+    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
 
 
 def test_the_time_limit_holds_for_all_of_a_solve() -> None:

@@ -52,6 +52,7 @@ def mapped() -> Problem:
     horizon = problem.horizon(lower=0.5, upper=2.0, guess=1.0)
     problem.dynamics(x, damped(x.T).T + u)
     problem.start("third", x[2] - x[1], 0, 0, unit="rad")
+    problem.watch("drift", x - problem.at_start(x), lower=-9.0, integral=True, way=u, unit="rad s")
     problem.minimize(running=ca.sumsqr(x) + ca.sumsqr(u), terminal=horizon + ca.sumsqr(x - problem.at_start(x)))
     return problem
 
@@ -207,12 +208,15 @@ def test_a_record_that_was_changed_is_refused(part: str) -> None:
             Problem.restored(wrong)
 
 
-def test_units_drawn_in_bounds_and_refinement_survive_the_file(tmp_path: Path) -> None:
+def test_units_watches_drawn_in_bounds_and_starts_survive_the_file(tmp_path: Path) -> None:
     plan = solve(mapped(), Collocation(5))
-    drawn = replace(plan, drawn_in=np.full((2, 5, 6), 0.25))
+    drawn = replace(plan, drawn_in=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
     drawn.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
+    assert (loaded.start, loaded.regularised) == ("zeros", True)
     np.testing.assert_array_equal(loaded.drawn_in, drawn.drawn_in)
     assert loaded.problem.declared.states["x"].unit == "rad"
     assert loaded.problem.declared.start["third"].unit == "rad"
+    watched = loaded.problem.declared.watch["drift"]
+    assert (watched.integral, watched.way.numel(), watched.unit) == (True, 3, "rad s")
     np.testing.assert_array_equal(loaded.problem.declared.states["x"].guess, [1.0, 1.0, 1.0])
