@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from ocp.audit import certificate as comparison
 from ocp.audit.certificate import Certificate
+from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError
@@ -24,6 +25,7 @@ SECOND = "sleqp"
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 
 
+@interruptible
 def certificate(
     problem: Problem,
     solutions: Mapping[str, Solution] | Sequence[Solution],

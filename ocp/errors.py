@@ -5,6 +5,7 @@ Each message names the offending thing, its value and what to do; the exception 
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -15,6 +16,7 @@ import numpy as np
 __all__ = [
     "AuditError",
     "Detailed",
+    "Interrupted",
     "ProblemError",
     "RefinementWarning",
     "SolveError",
@@ -25,6 +27,7 @@ __all__ = [
     "checked_nonnegative",
     "checked_positive",
     "checked_text",
+    "checked_time_limit",
     "unknown_name",
 ]
 
@@ -44,6 +47,10 @@ class Detailed(Exception):
         super().__init__(message)
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
+    def __reduce__(self) -> Any:
+        """Pickled with all that it carries; of what cannot be pickled, such as an expression, with how it is shown."""
+        return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
+
 
 class ProblemError(Detailed, ValueError):
     """A problem, a method or an argument that cannot be right, found before anything is solved."""
@@ -61,10 +68,17 @@ class SolveError(Detailed, RuntimeError):
         super().__init__(message, **details)
         self.solution, self.conflicts = solution, tuple(conflicts)
 
-    def __reduce__(self) -> Any:
-        """Pickled without the problem of the solution: expressions cannot be pickled, as they cannot be saved."""
-        loose = None if self.solution is None else self.solution.with_problem(None)
-        return type(self), self.args, {**self.__dict__, "solution": loose}
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, where something had been found before.
+
+    Attributes:
+        solution: The last iterate as an unsuccessful solution.
+    """
+
+    def __init__(self, message: str = "", solution: Any = None) -> None:
+        super().__init__(message)
+        self.solution = solution
 
 
 class AuditError(Detailed, RuntimeError):
@@ -140,6 +154,11 @@ def checked_text(what: str, value: Any) -> str:
     return value
 
 
+def checked_time_limit(seconds: Any) -> float | None:
+    """A time limit, or ProblemError unless it is a positive number of seconds, or None for no limit."""
+    return None if seconds is None else checked_positive("time_limit", seconds)
+
+
 def checked_mapping(what: str, values: Any) -> dict[str, Any]:
     """A dictionary by name, or nothing, as a dictionary of its own; ProblemError for anything else."""
     if not isinstance(values, Mapping | None):
@@ -150,3 +169,11 @@ def checked_mapping(what: str, values: Any) -> dict[str, Any]:
 def _last(what: str) -> str:
     """The name of an argument at the end of ``Collocation: scheme``."""
     return what.rpartition(" ")[2].strip("'")
+
+
+def _pickled(value: Any) -> Any:
+    try:
+        pickle.dumps(value)
+    except Exception:  # of any kind
+        return repr(value)
+    return value

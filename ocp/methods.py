@@ -10,8 +10,9 @@ import numpy as np
 from ocp.audit.curvature import Curvature
 from ocp.audit.optimality import optimality
 from ocp.audit.principle import FLAT
+from ocp.console import interruptible, limited
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError, checked_time_limit
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
@@ -26,7 +27,9 @@ VISIBLE = 0.1
 class PreparedProblem(Protocol):
     """A problem that a method has made ready to be solved many times."""
 
-    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
+    def solve(
+        self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
+    ) -> Solution:
         """Solve with these parameters from this guess; see :func:`solve`."""
         ...
 
@@ -47,6 +50,7 @@ class Method(Protocol):
         ...
 
 
+@interruptible
 def prepare(
     problem: Problem,
     method: Method,
@@ -79,6 +83,7 @@ def prepare(
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
+@interruptible
 def solve(
     problem: Problem,
     method: Method,
@@ -89,6 +94,7 @@ def solve(
     guess: Guess = None,
     check: bool = True,
     scaling: bool = True,
+    time_limit: float | None = None,
 ) -> Solution:
     """Solve a problem by a method.
 
@@ -106,16 +112,20 @@ def solve(
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
         check: Raise where the solver fails, after a second solve that finds what would have to give way; False runs it
             once, from the guess, and returns the unsuccessful solution with its status.
+        time_limit: After so many seconds, the build and all starts included, the solver is stopped between two
+            iterations, which counts as a failure. None for no limit.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.
+        KeyboardInterrupt: Ctrl-C; the exception's ``solution``, where it has one, is the last iterate.
         SolveError: The solver failed from every start; names the constraints that cannot hold together, by how much and
             when, and the worst residuals by constraint, state and time. Or what it found is no minimum, and beside it
             there is none either.
     """
-    prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
-    solution = prepared.solve(parameters, guess, check)
-    return lowered(prepared, solution) if check and solution.regularised else solution
+    with limited(checked_time_limit(time_limit)):
+        prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
+        solution = prepared.solve(parameters, guess, check)
+        return lowered(prepared, solution) if check and solution.regularised else solution
 
 
 def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:

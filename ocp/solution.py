@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import fields as dataclass_fields
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
+from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, unknown_name
+from ocp.problem.problem import Problem
+from ocp.storage import read_arrays, write_arrays
 
 __all__ = [
     "ByName",
@@ -31,7 +34,20 @@ __all__ = [
 
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
-VERSION = 1
+VERSION = 2
+HEAD = {
+    "name": str,
+    "method": dict,
+    "solver": str,
+    "success": bool,
+    "status": str,
+    "cost": float,
+    "iterations": int,
+    "horizon": float,
+    "seconds": dict,
+    "start": str,
+    "regularised": bool,
+}
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
 PLAIN = ("t", "variables", "multipliers")
@@ -83,7 +99,8 @@ class Solution:
             (controls, costates) stacked.
         variables, multipliers: Of the nonlinear program (its variables; its rows), for warm starts.
         seconds: Wall time of ``build`` and ``solve``.
-        problem: The problem, or None after :meth:`load`. refinement: How the mesh came about, or None.
+        problem: The problem, or None where it could not be written to a file. problem_lost: Why, or "".
+        refinement: How the mesh came about, or None.
         drawn_in: By how much the lower and the upper bounds were drawn in, interval by interval, in the order states,
             controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
             jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
@@ -115,6 +132,7 @@ class Solution:
     multipliers: np.ndarray
     seconds: dict[str, float]
     problem: Any = field(default=None, compare=False, repr=False)
+    problem_lost: str = field(default="", compare=False, repr=False)
     refinement: Refinement | None = None
     drawn_in: np.ndarray | None = None
     start: str = "guess"
@@ -166,86 +184,138 @@ class Solution:
             values |= unstack(pool, interpolant(flat))
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
 
+    @interruptible
     def audit(self, problem: Any = None, **settings: Any) -> Any:
         """Check the plan independently of the solver that made it; see :func:`ocp.audit.audit.audit`.
 
         Raises:
-            AuditError: The solution was loaded from a file and no problem is given.
+            AuditError: The solution comes without its problem, and none is given; says why.
         """
         from ocp.audit.audit import audit
 
         known = problem if problem is not None else self.problem
         if known is None:
-            words = f"plan {self.name!r} was loaded without its problem; call audit(problem)"
+            why = f" ({self.problem_lost})" if self.problem_lost else ""
+            words = f"plan {self.name!r} comes without its problem{why}; call audit(problem)"
             raise AuditError(words, name=self.name)
         return audit(known, self, **settings)
 
     def with_problem(self, problem: Any) -> Solution:
         """The same solution tied to a problem, after :meth:`load`, or to None."""
-        return replace(self, problem=problem)
+        return replace(self, problem=problem, problem_lost="")
 
     # ---- files -----------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write arrays and JSON (no pickle) to one ``.npz`` file, whole or not at all."""
-        target = Path(path)
+        """Write the plan and its problem as arrays, JSON and CasADi's text (no pickle) to one ``.npz`` file.
+
+        The file is whole or as it was before, on the disk when this returns, of the mode that it had; a link is
+        followed. What a killed save of the same file left behind is removed.
+
+        A problem whose expressions CasADi cannot write, such as one that calls a function of Python, is left out.
+
+        Raises:
+            ProblemError: path is a folder, a pipe or a device, or the plan is larger than :meth:`load` reads.
+            OSError: The file cannot be written.
+        """
         arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in PLAIN}
         for kind in POOLS:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
             arrays |= {f"{kind}/{part}": getattr(getattr(self, kind), part) for part in PARTS}
-        simple = ("name", "method", "solver", "success", "status", "cost", "iterations", "horizon", "seconds", "start")
-        head = {"version": VERSION, **{key: getattr(self, key) for key in simple}}
+        head = {"version": VERSION, **{key: getattr(self, key) for key in HEAD}}
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
         if self.drawn_in is not None:
             arrays["drawn_in"] = self.drawn_in
+        head["problem"], head["problem_lost"] = self._written_problem()
+        if head["problem"] is not None:
+            function = head["problem"].pop("function")  # long, and apart from what a reader of the head looks for
+            arrays["problem"] = np.frombuffer(function.encode(), dtype=np.uint8)
         arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
-        temporary = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
-        try:
-            with open(temporary, "xb") as stream:
-                np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-            os.replace(temporary, target)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Read a file written by :meth:`save`.
+        """Read a file written by :meth:`save`, with its problem, whose guesses by functions are left out.
+
+        Files of the first version of the format hold no problem. Open files of people you trust only: the expressions
+        of a problem are CasADi's to read.
 
         Raises:
-            ProblemError: The file is not such a file, or of an unknown version.
+            FileNotFoundError: There is no such file.
+            ProblemError: The file cannot be read, is none, is larger than any plan, is of an unknown version or is not
+                whole; names the part.
         """
+        arrays = read_arrays(path)
         try:
-            # opened here, because numpy leaves a broken archive open
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                arrays = {key: archive[key] for key in archive.files}
             head = json.loads(arrays.pop("head").tobytes().decode())
             version = head.pop("version")
-            if version != VERSION:
+            if isinstance(version, bool) or version not in (1, VERSION):
                 words = f"{path}: written by another version of the format ({version}, not {VERSION})"
                 raise ProblemError(words, name="version", value=version, limit=VERSION)
             order = head.pop("order")
+            if set(order) != set(POOLS):
+                raise ValueError(f"it has {', '.join(order)}, not {', '.join(POOLS)}")
             fields: dict[str, Any] = {
-                kind: {name: arrays[f"{kind}/{name}"] for name in names} for kind, names in order.items()
+                kind: {name: arrays.pop(f"{kind}/{name}") for name in names} for kind, names in order.items()
             }
             fields |= {
-                kind: PiecewisePolynomial(*(arrays[f"{kind}/{part}"] for part in PARTS)) for kind in INTERPOLANTS
+                kind: PiecewisePolynomial(*(arrays.pop(f"{kind}/{part}") for part in PARTS)) for kind in INTERPOLANTS
             }
             past = head.pop("refinement", None)
             if past is not None:
                 rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in past["errors"].items()}
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
-            fields["drawn_in"] = arrays.get("drawn_in")
-            solution = cls(**head, **fields, **{name: arrays[name] for name in PLAIN})
+            fields["drawn_in"] = arrays.pop("drawn_in", None)
+            fields |= {name: arrays.pop(name) for name in PLAIN}
+            problem = head.pop("problem", None)
+            if problem is not None:
+                function = arrays.pop("problem").tobytes().decode()
+                fields["problem"] = Problem.restored({**problem, "function": function})
+            elif version == 1:
+                fields["problem_lost"] = "the file is of the first version, which holds none"
+            if arrays:
+                words = f"{path} holds {', '.join(arrays)}, which no plan has"
+                raise ProblemError(words, name=next(iter(arrays)), value=str(path))
+            solution = cls(**head, **fields)
             check_structure(solution)
+            check_finite(solution)
             return solution
-        except (FileNotFoundError, ProblemError):
+        except ProblemError:
             raise
-        except Exception as error:  # what zip, zlib, numpy and JSON say of broken bytes is of many kinds
+        except Exception as error:  # what JSON and wrong types say is of many kinds
             raise ProblemError(f"{path} is not a saved solution: {error}", name="path", value=str(path)) from error
+
+    # ---- with and without its problem ------------------------------------------------------------------------
+
+    def _written_problem(self) -> tuple[dict[str, Any] | None, str]:
+        """The problem as numbers and text, and ""; or None, and why there is none."""
+        if self.problem is None:
+            return None, self.problem_lost
+        try:
+            return self.problem.__getstate__(), ""
+        except ProblemError as error:
+            return None, str(error)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled with its problem where that can be written, else without it, with the reason."""
+        written, why = self._written_problem()
+        return {**self.__dict__, "problem": written, "problem_lost": why}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The same of what :meth:`__getstate__` gave."""
+        problem = state["problem"]
+        self.__dict__.update({**state, "problem": None if problem is None else Problem.restored(problem)})
+
+    def __copy__(self) -> Solution:
+        """A solution of the same arrays and the same problem."""
+        return replace(self)
+
+    def __deepcopy__(self, memo: Any) -> Solution:
+        """A solution of arrays of its own, of a copy of the problem."""
+        return replace(self, **{f.name: deepcopy(getattr(self, f.name), memo) for f in dataclass_fields(self)})
 
 
 def plain(value: Any) -> Any:
@@ -337,13 +407,24 @@ def check_structure(solution: Solution) -> None:
     if set(solution.costates) != set(solution.states):
         words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
         raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
-    for name, number in (("horizon", solution.horizon), ("cost", solution.cost)):
-        if isinstance(number, bool) or not isinstance(number, int | float | np.number):
-            raise refuse(name, f"is no number: {number!r}")
-    if not isinstance(solution.success, bool | np.bool_):
-        raise refuse("success", f"is neither True nor False: {solution.success!r}")
+    for name, kind in HEAD.items():
+        value = getattr(solution, name)
+        kinds: Any = {bool: bool | np.bool_, int: int | np.integer, float: int | float | np.number}.get(kind, kind)
+        if not isinstance(value, kinds) or (kind is not bool and isinstance(value, bool)):
+            no = {bool: "is neither True nor False", str: "is no text", dict: "is no dictionary"}
+            raise refuse(name, f"{no.get(kind, 'is no number')}: {value!r}")
+    if not isinstance(solution.method.get("type"), str):
+        raise refuse("method", f"has no type: {solution.method!r}")
+    for pool in POOLS:
+        if not isinstance(getattr(solution, pool), dict):
+            raise refuse(pool, "are no dictionary by name")
     if not 0 < solution.horizon < np.inf:
         raise refuse("horizon", f"{solution.horizon!r} s is not positive and finite")
+    for pool in ("parameters", "cost_gradients"):
+        for name, values in getattr(solution, pool).items():
+            real(f"{pool[:-1].replace('_', ' ')} {name!r}", values, 1)
+    for name in ("variables", "multipliers"):
+        real(name, getattr(solution, name), 1)
     t, slack = real("t", solution.t, 1), 1e-9 * solution.horizon
     if t.size < 2 or not (np.diff(t) >= -slack).all() or abs(t[0]) > slack:
         raise refuse("t", "does not increase from 0")
@@ -370,3 +451,20 @@ def check_structure(solution: Solution) -> None:
         if drawn.shape[:2] != shape[:2] or drawn.shape[2] < entries or not (drawn >= 0).all() or np.isinf(drawn).any():
             words = f"is no array of finite numbers, zero or above, of shape {shape} or with path rows behind"
             raise refuse("drawn_in", words)
+
+
+def check_finite(solution: Solution) -> None:
+    """Raise ProblemError, which names the part, where a plan that counts as a success holds what is not finite."""
+    if not solution.success:
+        return
+    parts: dict[str, Any] = {
+        "cost": solution.cost,
+        "variables": solution.variables,
+        "multipliers": solution.multipliers,
+    }
+    for pool in ("states", "controls", "costates", "parameters"):
+        parts |= {f"{pool[:-1]} {name!r}": values for name, values in getattr(solution, pool).items()}
+    parts |= {kind: getattr(solution, kind).values for kind in INTERPOLANTS}
+    for name, values in parts.items():
+        if not np.all(np.isfinite(values)):
+            raise ProblemError(f"plan {solution.name!r}: {name} is not finite", name=name)

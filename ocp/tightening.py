@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ocp.console import interruptible
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError
@@ -25,6 +26,7 @@ FOLLOWED = 0.8  # share of a bound's move that the plan is taken to follow, unti
 LEAST_SHARE = 0.1  # of a bound's move: a plan that follows it less is not moved by it
 
 
+@interruptible
 def tighten(
     problem: Any,
     method: DirectMethod,

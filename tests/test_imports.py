@@ -24,7 +24,9 @@ FLOORS = {
     "models": [["errors"], ["arrays"], ["spatial"], ["robot", "paths", "shapes"], ["machines", "cts"], ["papers"]],
     "ocp": [
         ["errors", "curves", "console"],
-        ["solution", "problem", "schedule", "tasks"],
+        ["storage"],
+        ["problem", "schedule", "tasks"],
+        ["solution"],
         ["direct", "audit", "local"],
         ["indirect"],
         ["methods"],

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.audit import Audit, audit
+from ocp.console import interruptible
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -96,6 +97,7 @@ class Certificate:
         return "\n".join(lines)
 
 
+@interruptible
 def certificate(
     problem: Problem, solutions: Mapping[str, Solution] | Sequence[Solution], *, tolerance: float = 1e-3
 ) -> Certificate:

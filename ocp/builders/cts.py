@@ -27,6 +27,7 @@ from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.capsules import soft_minimum
 from models.spatial import FULL_TURN
+from ocp.console import interruptible
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, checked_positive
 from ocp.problem.problem import Problem
@@ -45,6 +46,7 @@ LARGEST_WAY = 2 * FULL_TURN  # how far from its start a roll with limits is look
 STEPS_BY_RATE = 2.0  # grid steps that the rate limit should allow from one time to the next
 
 
+@interruptible
 def spline_targets(times: Any, targets: Any) -> Targets:
     """Cubic spline through a table of targets, as a function of time for a problem with MX symbols.
 
@@ -67,6 +69,7 @@ def spline_targets(times: Any, targets: Any) -> Targets:
     return lambda time: curve(time)
 
 
+@interruptible
 def roll_problem(
     rig: Rig,
     tunnel: Tunnel,

@@ -19,6 +19,7 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from ocp.audit.audit import Audit
+from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_choice, checked_positive
@@ -59,6 +60,7 @@ DEARER = 1e-6
 """Share by which a plan may cost more than the pseudo-inverse without another guess being tried."""
 
 
+@interruptible
 def minimum_velocity_problem(
     machine: Machine,
     tip_velocity: Velocity | None = None,
@@ -282,6 +284,7 @@ class _Outcome:
         return None if self.failure else self.solution
 
 
+@interruptible
 def plan_minimum_velocity(
     machine: Machine,
     tip_velocity: Velocity | None = None,

@@ -30,6 +30,7 @@ from ocp.builders.timing_tables import (
     reference_motion,
     table,
 )
+from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_count
 from ocp.methods import solve
@@ -131,6 +132,7 @@ class Fastest:
         return self.schedule.duration
 
 
+@interruptible
 def plan_minimum_time(
     path: PathLike,
     limits: LineLimits,
@@ -172,6 +174,7 @@ def plan_minimum_time(
     return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
 
 
+@interruptible
 def minimum_time_problem(
     path: PathLike,
     limits: LineLimits,

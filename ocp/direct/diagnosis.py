@@ -15,11 +15,12 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
+from ocp.console import INTERRUPTED, Progress, listening, time_left
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import USUAL, Scales
-from ocp.errors import SolveError
+from ocp.errors import Interrupted, SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 
@@ -58,7 +59,7 @@ def diagnosis(
     """The error that says what cannot hold together, and the worst residuals by constraint, state and time.
 
     Args:
-        outcome, arguments, horizon, solution: Of the first attempt.
+        outcome, arguments, horizon, solution: Of the first attempt, or of the one in which the time ran out.
         elastic: The plan that misses the constraints least, or None where there is none.
         attempts: What became of every start, one line each. badly_scaled: What is, or "".
     """
@@ -202,15 +203,18 @@ def elastic_plan(
     """The plan with the dynamics and the given ends held that misses the constraints least.
 
     None where the last iterate misses nothing or is not finite, so that it is not the constraints that are in the way,
-    and where no plan is found.
+    and where no plan is found in the time that is left.
 
     Args:
         outcome: Of the solver that failed.
         arguments: Of the solver: x0, p and the bounds lbx, ubx, lbg, ubg. scales: What the program is scaled by.
         horizon: The fixed final time, s; not used where it is free.
+
+    Raises:
+        Interrupted: Ctrl-C.
     """
     _, _, value, miss = residuals(built, outcome.variables, arguments)
-    if not (np.all(np.isfinite(value)) and np.any(miss > MISSED)):
+    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > MISSED)):
         return None
     form, fragment, program = built.formulation, built.fragment, built.scaled
     own = scales.inside(arguments)
@@ -229,6 +233,8 @@ def elastic_plan(
     g = ca.mtimes(rows, values) + ca.mtimes(columns, x)
     jac = ca.horzcat(ca.mtimes(rows, jacobian), ca.DM(rows.shape[0], k)) + columns
     curved = program.hessian(v, p, share * sigma, ca.mtimes(rows.T, lam))
+    title = f"what is in conflict in {built.problem.name}"
+    progress = Progress(n + k, rows.shape[0], p.numel(), title, show=True)
     options = {
         "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(share * slope, soft.prices)], ["x", "p"], ["f", "g"]),
         "jac_g": ca.Function("j", [x, p], [g, jac], ["x", "p"], ["g", "j"]),
@@ -237,20 +243,27 @@ def elastic_plan(
         "error_on_fail": False,
         "show_eval_warnings": False,
         "ipopt": ELASTIC_IPOPT,
+        "iteration_callback": progress,
     }
     lower, upper = soft.limits(own)
+    progress.open(lower, upper)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
-        result = solver(
-            x0=np.concatenate([own["x0"], np.zeros(k)]),
-            p=own["p"],
-            lbx=np.concatenate([soft.low, np.zeros(k)]),
-            ubx=np.concatenate([soft.high, np.full(k, np.inf)]),
-            lbg=lower,
-            ubg=upper,
-        )
+        with listening():
+            result = solver(
+                x0=np.concatenate([own["x0"], np.zeros(k)]),
+                p=own["p"],
+                lbx=np.concatenate([soft.low, np.zeros(k)]),
+                ubx=np.concatenate([soft.high, np.full(k, np.inf)]),
+                lbg=lower,
+                ubg=upper,
+            )
     except RuntimeError:  # an integrator breaks down
         return None
+    finally:
+        progress.close()
+    if progress.stopped == INTERRUPTED:
+        raise Interrupted(f"problem {built.problem.name!r}: interrupted while looking for what is in conflict")
     if not solver.stats()["success"]:
         return None
     plan = np.asarray(result["x"].full()).ravel()[:n]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -10,10 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import Interrupt, Progress, interruptible, quiet
+from ocp.console import LOG, Progress, Watch, listening, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
-from ocp.errors import ProblemError, checked_choice
+from ocp.errors import ProblemError, SolveError, checked_choice
 
 __all__ = ["ADVICE", "ROUNDING", "SOLVERS", "Outcome", "build_solver", "call_solver", "largest_number_of_iterations"]
 
@@ -45,7 +46,8 @@ ADVICE = {
     "Invalid_Number_Detected": "a function is not finite at an iterate; keep the states away from where it is singular",
     "Search_Direction_Becomes_Too_Small": "the problem may be badly scaled or its constraints redundant",
     "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns; drop redundant constraints",
-    "User_Requested_Stop": "interrupted; the last iterate is returned",
+    "User_Requested_Stop": "interrupted",
+    "Maximum_WallTime_Exceeded": "raise time_limit, or start from a better guess",
     "Error_In_Step_Computation": "constraints may be redundant or a function not smooth",
 }
 FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
@@ -76,11 +78,12 @@ class Outcome:
 
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
-) -> tuple[Any, Progress | None]:
-    """The casadi solver of a program.
+) -> tuple[Any, Progress | Watch]:
+    """The casadi solver of a program, and what ends it where it must end.
 
     Raises:
         ProblemError: An unknown solver, or an option that it does not take.
+        SolveError: The solver's library cannot be loaded, for want of file handles, say.
     """
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
@@ -88,11 +91,13 @@ def build_solver(
     own = {**DEFAULTS[solver], **options}
     if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
-    progress, nlp = None, program.nlp
-    if solver == "ipopt":
-        settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
+    nlp = program.nlp
+    progress: Progress | Watch
+    if solver in ("ipopt", "sleqp"):
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
+    if solver == "ipopt":
+        settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
     elif solver == "sleqp":
         # like fatrop's, its interface looks for ready-made derivatives in its cache
         settings["cache"] = {"nlp_grad_f": program.gradient, "nlp_jac_g": program.jacobian}
@@ -100,15 +105,17 @@ def build_solver(
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
+        progress = Watch(n, title)
         # this interface has no options for ready-made derivatives; it looks for them in its cache under these names
         settings |= {
-            "cache": fatrop_functions(program),
+            "cache": fatrop_functions(program, progress),
             "structure_detection": "manual",
             "nx": list(stages.states),
             "nu": list(stages.controls),
             "ng": list(stages.rows),
             "N": len(stages.states) - 1,
         }
+    check_loaded(solver)
     try:
         return ca.nlpsol("solver", solver, nlp, {**settings, solver: own}), progress
     except RuntimeError as error:
@@ -122,18 +129,34 @@ def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
     return int(most) if isinstance(most, int | float | np.number) else 0
 
 
-def fatrop_functions(program: Program) -> dict[str, Any]:
-    """The derivatives of a program with the signatures that casadi's fatrop interface uses."""
+def check_loaded(solver: str) -> None:
+    """Raise SolveError, with the system's reason, where the library of a solver cannot be loaded."""
+    if ca.has_nlpsol(solver):
+        return
+    try:
+        ca.load_nlpsol(solver)
+    except RuntimeError as error:
+        why = str(error).partition("Error code: ")[2].partition("\n")[0] or last_line(error)
+        raise SolveError(f"{solver} cannot be loaded: {why}", name="solver", value=solver) from error
+
+
+def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
+    """The derivatives of a program with the signatures that casadi's fatrop interface uses.
+
+    The interface raises where the next state does not stand with factor 1 in the rows that close gaps: so a Jacobian of
+    zeros ends the solver, which has no other way to be stopped.
+    """
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     x, p = ca.MX.sym("x", n), ca.MX.sym("p", n_p)
     sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
     # fatrop loops for ever on what is not a number; from what is huge it steps back
     gradient, (rows, jacobian) = finite(program.gradient(x, p)[1]), map(finite, program.jacobian(x, p))
+    watched = ca.MX(jacobian.sparsity(), jacobian.nz[:] * watch(x))
     lagrangian = sigma * gradient + ca.mtimes(jacobian.T, lam)
     hessian = ca.triu2symm(finite(program.hessian(x, p, sigma, lam)))
     functions = (
         ca.Function("nlp_grad_f", [x, p], [gradient], ["x", "p"], ["grad_f_x"]),
-        ca.Function("nlp_jac_g", [x, p], [rows, jacobian], ["x", "p"], ["g", "jac_g_x"]),
+        ca.Function("nlp_jac_g", [x, p], [rows, watched], ["x", "p"], ["g", "jac_g_x"]),
         ca.Function(
             "nlp_hess_l",
             [x, p, sigma, lam],
@@ -150,53 +173,65 @@ def finite(expression: Any) -> Any:
     return ca.MX(expression.sparsity(), ca.fmin(expression.nz[:], HUGE))
 
 
-def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.ndarray]) -> Outcome:
-    """Run a solver; Ctrl-C stops it between two iterations and the last iterate is returned.
-
-    fatrop has no way to be stopped; what it ends with counts as interrupted.
-    """
+def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
+    """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
-    asked = progress if progress is not None else Interrupt()
-    if progress is not None:
-        progress.open(arguments["lbg"], arguments["ubg"])
+    kind = solver.class_name()
+    progress.open(arguments["lbg"], arguments["ubg"])
+    progress.iterate = np.asarray(arguments["x0"])
+    tell(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
         # SLEQP tells of each subproblem that it gives up
-        with interruptible(asked), nullcontext() if progress is not None else quiet():
-            result = solver(**(tightened(arguments) if solver.class_name() == "FatropInterface" else arguments))
+        with listening(), quiet() if kind == "SLEQPInterface" else nullcontext():
+            result = solver(**(tightened(arguments) if kind == "FatropInterface" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
+        if progress.stopped or kind == "SLEQPInterface":  # SLEQP's interface raises wherever it fails
+            return stopped(solver, progress, arguments, began)
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
         raise
     finally:
-        if progress is not None:
-            progress.close()
+        progress.close()
     stats = solver.stats()
     word = str(stats.get("return_status", ""))
     if "fatrop" in stats:
         word = FATROP_WORDS.get(int(stats["fatrop"]["return_flag"]), "Error_In_Step_Computation")
     if word == "Search_Direction_Becomes_Too_Small" and as_good_as_rounding_allows(stats, result):
         word = "Solved_To_Acceptable_Level"
-    if asked.stop:
-        word = "User_Requested_Stop"
-    success = not asked.stop and (bool(stats["success"]) or word in SUCCESSES)
+    word = progress.stopped or word
+    success = not progress.stopped and (bool(stats["success"]) or word in SUCCESSES)
     values = {key: np.asarray(result[key].full()).reshape(-1) for key in ("x", "f", "g", "lam_g")}
     if success and not all(np.all(np.isfinite(v)) for v in values.values()):
         success, word = False, "Invalid_Number_Detected"
     if word == "Solved_To_Acceptable_Level" and missed(values, arguments) > ROUNDING:
         success, word = False, "Error_In_Step_Computation"
-    advice = "" if success else ADVICE.get(word, "")
-    return Outcome(
-        values["x"],
-        float(values["f"][0]),
-        values["g"],
-        values["lam_g"],
-        success,
-        f"{word}: {advice}" if advice else word,
-        int(stats.get("iter_count", 0)),
-        time.monotonic() - began,
-        regularised(stats),
-    )
+    iterations, seconds = int(stats.get("iter_count", 0)), time.monotonic() - began
+    cost, status = float(values["f"][0]), word if success else advised(word)
+    tell(f"solved {progress.title!r}: {word}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
+    found = values["x"], cost, values["g"], values["lam_g"]
+    return Outcome(*found, success, status, iterations, seconds, regularised(stats))
+
+
+def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
+    """The iterate at which a solver stopped, or was stopped, that returned nothing; its multipliers are not known."""
+    cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(at.iterate, arguments["p"]))
+    unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
+    word = at.stopped or "Error_In_Step_Computation"
+    tell(f"stopped {at.title!r}: {word}, {at.iterations} iterations, {seconds:.3g} s")
+    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(word), at.iterations, seconds)
+
+
+def advised(word: str) -> str:
+    """A solver's word with what to try."""
+    advice = ADVICE.get(word, "")
+    return f"{word}: {advice}" if advice else word
+
+
+def tell(words: str) -> None:
+    """One line for a log, where there is no terminal that shows progress."""
+    if not sys.stderr.isatty():
+        LOG.info(words)
 
 
 def regularised(stats: dict[str, Any]) -> bool:

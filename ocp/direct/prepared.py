@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from ocp.console import INTERRUPTED, OUT_OF_TIME, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import assemble
 from ocp.direct.diagnosis import diagnosis, elastic_plan
@@ -22,7 +24,15 @@ from ocp.direct.known import Known
 from ocp.direct.nlp import Outcome, build_solver, call_solver, largest_number_of_iterations
 from ocp.direct.scaling import Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.direct.starts import ELASTIC, GUESS, other_starts
-from ocp.errors import ProblemError, about, checked_count, checked_mapping, checked_positive
+from ocp.errors import (
+    Interrupted,
+    ProblemError,
+    about,
+    checked_count,
+    checked_mapping,
+    checked_positive,
+    checked_time_limit,
+)
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
@@ -31,7 +41,6 @@ from ocp.solution import ByName, Guess, Solution
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
-STOPPED = ("User_Requested_Stop", "Maximum_WallTime_Exceeded")  # words of a solver that did not fail
 
 
 class DirectMethod(ABC):
@@ -61,6 +70,7 @@ class DirectMethod(ABC):
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
 
+    @interruptible
     def prepare(
         self,
         problem: Problem,
@@ -142,7 +152,7 @@ def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
 
 
 class Prepared:
-    """A problem built once for a method and a solver, to be solved many times.
+    """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
         formulation, fragment, program: What was built. scaled: The program as it is solved, see
@@ -163,21 +173,36 @@ class Prepared:
         self._solver, self._progress = build_solver(self.scaled, solver, own, self.fragment.stages, problem.name)
         self._scaling, self._known = scaling, Known(self.formulation, self.fragment, self.program)
         self._most = largest_number_of_iterations(solver, own)
+        self._made_of = problem, method, solver, own, compiled, scaling
+        self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
+    def __reduce__(self) -> Any:
+        """Pickled and copied as what it was prepared of, to be prepared again."""
+        return type(self), self._made_of
+
+    @interruptible
     def solve(
         self,
         parameters: ByName = None,
         guess: Guess = None,
         check: bool = True,
         tighter: Mapping[str, np.ndarray] | None = None,
+        time_limit: float | None = None,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`ocp.methods.solve`.
+        """Solve with these parameters from this guess; see :func:`ocp.methods.solve`. Another thread's solve is
+        waited for.
 
         With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
         and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
+        with limited(checked_time_limit(time_limit)), self._lock:
+            return self._solve(parameters, guess, check, tighter)
+
+    def _solve(
+        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None
+    ) -> Solution:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -210,22 +235,27 @@ class Prepared:
                 return attempts[-1].found
         found = None
         if not attempts[-1].is_final:
-            found = elastic_plan(self, first.outcome, first.arguments, first.scales, self._horizon(first.outcome, p))
+            try:
+                horizon = self._horizon(first.outcome, p)
+                found = elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
+            except Interrupted as error:
+                raise Interrupted(str(error), first.solution) from error
         if found is not None and check and left > 0:
             names = {*form.states, *form.controls, "horizon"}
             attempts.append(self._attempt(ELASTIC, found.plan, names, arguments, bounds))
             if attempts[-1].found is not None:
                 return attempts[-1].found
+        told_of = attempts[-1] if attempts[-1].is_final else first
         raise diagnosis(
             self,
-            first.outcome,
-            first.arguments,
-            self._horizon(first.outcome, p),
-            first.solution,
+            told_of.outcome,
+            told_of.arguments,
+            self._horizon(told_of.outcome, p),
+            told_of.solution,
             found,
             [str(attempt) for attempt in attempts],
-            self._badness(first, bounds),
-        ) from first.error
+            self._badness(told_of, bounds),
+        ) from told_of.error
 
     def _attempt(
         self, start: str, point: np.ndarray, told: set[str], limits: dict[str, np.ndarray], bounds: Bounds
@@ -241,9 +271,15 @@ class Prepared:
         outcome = scales.outside(call_solver(self._solver, self._progress, scales.inside(relaxed)))
         outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
         try:
-            return Attempt(start, arguments, told, scales, outcome, self._solution(outcome, p, start))
+            solution = self._solution(outcome, p, start)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
+            if outcome.status.startswith(INTERRUPTED):
+                raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
             return Attempt(start, arguments, told, scales, outcome, None, error)
+        if outcome.status.startswith(INTERRUPTED):
+            words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
+            raise Interrupted(words, solution)
+        return Attempt(start, arguments, told, scales, outcome, solution)
 
     def _badness(self, attempt: Attempt, bounds: Bounds) -> str:
         """What was badly scaled to the solver, in words; "" where nothing was."""
@@ -359,8 +395,8 @@ class Attempt:
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start is to be tried: it succeeded, or it was stopped from outside."""
-        return self.found is not None or self.outcome.status.startswith(STOPPED)
+        """Whether no other start is to be tried: it succeeded, or there is no time left."""
+        return self.found is not None or self.outcome.status.startswith(OUT_OF_TIME)
 
     def __str__(self) -> str:
         word = self.outcome.status.partition(":")[0]

@@ -32,6 +32,8 @@ BAD = 1e6
 """From which factor on between sizes, or between a state and what drives it, a program counts as badly scaled."""
 WEAK = 1e-3
 """Weight of the bounds against the dynamics where a size is sought, and of the size 1 against the bounds."""
+LEAST = float(np.sqrt(np.finfo(float).tiny))
+"""Size below which squares are no numbers any more, so that a cost has no size to fit; it counts as none."""
 SIDES = ("lbx", "ubx", "lbg", "ubg")
 
 
@@ -199,6 +201,7 @@ def couplings(form: Formulation, fragment: Fragment, program: Program, point: np
 def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
     """Scales of a program for variables of these sizes; rows and cost by how far they move from a start."""
     by = sizes.of_variables(fragment)
+    by = np.where(by > LEAST, by, 1.0)
     rows = np.zeros(fragment.n_rows)
     jacobian = _second_output(program.jacobian, point, p)
     if jacobian is not None:

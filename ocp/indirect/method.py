@@ -7,6 +7,7 @@ conditions at the ends and at the switches hold. It converges from near: a direc
 from __future__ import annotations
 
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,10 +16,20 @@ from typing import Any
 
 import numpy as np
 
+from ocp.console import INTERRUPTED, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
-from ocp.errors import ProblemError, SolveError, checked_choice, checked_count, checked_mapping, checked_positive
+from ocp.errors import (
+    Interrupted,
+    ProblemError,
+    SolveError,
+    checked_choice,
+    checked_count,
+    checked_mapping,
+    checked_positive,
+    checked_time_limit,
+)
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.minimality import not_least
@@ -63,6 +74,7 @@ class Indirect:
                 f"Indirect: seed must be a Collocation(...), not {self.seed!r}", name="seed", value=self.seed
             )
 
+    @interruptible
     def prepare(
         self,
         problem: Problem,
@@ -103,14 +115,26 @@ class PreparedIndirect:
         self.hamiltonian = Hamiltonian.of(self.formulation)
         backward = method.shooting == "backward"
         self.boundary = BoundaryProblem(self.hamiltonian, backward=backward, tolerance=method.tolerance)
+        self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
-    def solve(self, parameters: ByName = None, guess: Guess = None, check: bool = True) -> Solution:
+    def __reduce__(self) -> Any:
+        """Pickled and copied as what it was prepared of, to be prepared again."""
+        return type(self), (self.problem, self.method, self._seeding)
+
+    @interruptible
+    def solve(
+        self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
+    ) -> Solution:
         """Solve with these parameters; a solution as ``guess`` seeds states and costates, anything else its own seed.
 
         Raises:
             ProblemError: Wrong parameters or guess. SolveError: Newton failed, or a control has a singular arc.
         """
+        with limited(checked_time_limit(time_limit)), self._lock:
+            return self._solve(parameters, guess, check)
+
+    def _solve(self, parameters: ByName, guess: Guess, check: bool) -> Solution:
         form = self.formulation
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -141,6 +165,9 @@ class PreparedIndirect:
         found = newton(system, start, data, float(max(1.0, np.max(np.abs(start)))), self.method.residual)
         found = self._check_order(found, arcs, bounds)
         solution = self._solution(found, arcs, data, p, bounds, note, time.monotonic() - began)
+        if found.status == INTERRUPTED:
+            words = f"problem {self.problem.name!r}: interrupted after {found.steps} Newton steps"
+            raise Interrupted(words, solution)
         if check and not solution.success:
             raise SolveError(
                 f"problem {self.problem.name!r}: the indirect method failed: {solution.status} after {found.steps} "

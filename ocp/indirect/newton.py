@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import Interrupt, interruptible, quiet
+from ocp.console import listening, quiet, reason_to_stop
 from ocp.errors import ProblemError
 
 __all__ = ["Found", "newton"]
@@ -43,9 +43,8 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
     if value.size != start.size:
         words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
-    interrupt = Interrupt()
-    polished = False
-    with interruptible(interrupt):
+    polished, stopped = False, ""
+    with listening():
         for steps in range(MOST_STEPS + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
@@ -53,7 +52,8 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
             if size <= tolerance * scale and polished:
                 return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step: it costs little and gains digits
-            if interrupt.stop or steps == MOST_STEPS:
+            stopped = reason_to_stop()
+            if stopped or steps == MOST_STEPS:
                 break
             try:
                 with quiet():
@@ -80,6 +80,4 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
             if polished and np.max(np.abs(new)) > size:
                 return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
             z, value = trial, new
-    return Found(
-        z, size, steps, False, "interrupted" if interrupt.stop else f"not converged in {MOST_STEPS} Newton steps"
-    )
+    return Found(z, size, steps, False, stopped or f"not converged in {MOST_STEPS} Newton steps")

@@ -18,6 +18,7 @@ import numpy as np
 from models.arrays import Array
 from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
+from ocp.console import interruptible
 from ocp.curves import rk4_step
 from ocp.errors import ProblemError, checked_choice, checked_positive
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
@@ -95,6 +96,7 @@ class AccelerationSolution:
         return f"law {self.law}: {end} ({verdict})\n{self.motion}"
 
 
+@interruptible
 def resolve_accelerations(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],

@@ -15,6 +15,7 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
+from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_count, checked_positive
 from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
@@ -70,6 +71,7 @@ class Unreachable(ProblemError):
         return type(self), (*self.args, self.joints, self.misfit), self.__dict__
 
 
+@interruptible
 def inverse_kinematics(
     machine: Machine,
     task: TipTask | Sequence[TipTask],

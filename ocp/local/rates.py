@@ -16,6 +16,7 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from models.spatial import solve_spd
+from ocp.console import interruptible
 from ocp.curves import integrator
 from ocp.errors import ProblemError, checked_nonnegative, checked_positive
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
@@ -78,6 +79,7 @@ class LocalSolution:
         return {"base": base, "joints": joints, "joint_rates": rates}
 
 
+@interruptible
 def resolve(
     machine: Machine,
     tip_velocity: Velocity | None = None,

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Any, TypeVar, cast
@@ -14,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
+from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
     check_finite,
     check_horizon,
@@ -166,6 +168,44 @@ class Problem:
         self.symbols = symbols
         self.time = symbols.sym("time")
         self.declared = Declarations()
+
+    # ---- copies and files ------------------------------------------------------------------------------------
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Expressions as CasADi writes them, so that a problem can be pickled; guesses that are functions are left.
+
+        Raises:
+            ProblemError: CasADi cannot write an expression, such as one that calls a function of Python.
+        """
+        return stored(self.name, self.symbols, self.time, self.declared)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The same of what :meth:`__getstate__` gave, with symbols of its own.
+
+        Raises:
+            ProblemError: It is something else.
+        """
+        kinds = (Variable, Constraint, Horizon, Declarations)
+        self.name, self.symbols, self.time, self.declared = restored(state, kinds)
+
+    @classmethod
+    def restored(cls, state: dict[str, Any]) -> Problem:
+        """A problem of what :meth:`__getstate__` gave."""
+        problem = cls.__new__(cls)
+        problem.__setstate__(state)
+        return problem
+
+    def __copy__(self) -> Problem:
+        """A problem of the same symbols, to which more can be declared."""
+        again = Problem(self.name, self.symbols)
+        again.time = self.time
+        for name, value in vars(self.declared).items():
+            setattr(again.declared, name, copy(value) if isinstance(value, dict | Horizon) else value)
+        return again
+
+    def __deepcopy__(self, memo: Any) -> Problem:
+        """As a copy: symbols never change."""
+        return self.__copy__()
 
     # ---- variables -------------------------------------------------------------------------------------------
 

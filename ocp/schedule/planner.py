@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_positive
 from ocp.schedule.grid import make_grid
 from ocp.schedule.joints import KEPT, Attempt, search
@@ -92,6 +93,7 @@ class Schedule:
         return self.profile.function()
 
 
+@interruptible
 def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
     """Plan the line speed along a path from rest to rest.
 

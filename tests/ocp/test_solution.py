@@ -160,7 +160,7 @@ def test_a_solution_cannot_be_changed_by_accident() -> None:
 def assert_identical(a: Solution, b: Solution) -> None:
     """Every field the same, arrays bit by bit."""
     for field in dataclasses.fields(Solution):
-        if field.name == "problem":
+        if field.name in ("problem", "problem_lost"):
             continue
         one, two = getattr(a, field.name), getattr(b, field.name)
         if field.name in POOLS:
@@ -187,7 +187,7 @@ def test_a_plan_comes_back_from_its_file_bit_by_bit(method: str, tmp_path: Path)
     solution.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
     assert_identical(solution, loaded)
-    assert loaded.problem is None
+    assert str(loaded.problem) == str(solution.problem)
     t = np.linspace(0, solution.horizon, 50)
     assert loaded.at(t)["x"].tobytes() == solution.at(t)["x"].tobytes()
 
@@ -264,7 +264,7 @@ def test_files_hold_plain_arrays_and_json(tmp_path: Path) -> None:
         arrays = {name: archive[name] for name in archive.files}
     assert all(array.dtype.kind in "fu" for array in arrays.values())
     head = json.loads(arrays["head"].tobytes())
-    assert head["version"] == 1
+    assert head["version"] == 2
     assert head["name"] == "swing"
 
 
@@ -374,7 +374,7 @@ def edited(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], A
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda h, a: h.update(version=2), "another version of the format .2, not 1."),
+        (lambda h, a: h.update(version=3), "another version of the format .3, not 2."),
         (lambda h, a: h.update(version="1"), "another version"),
         (lambda h, a: h.update(version=None), "another version"),
         (lambda h, a: h.pop("version"), "is not a saved solution"),
@@ -410,11 +410,89 @@ def test_a_refused_file_is_closed_again(tmp_path: Path) -> None:
 # ---- audits of loaded plans --------------------------------------------------------------------------------------
 
 
-def test_a_loaded_plan_is_audited_with_its_problem(tmp_path: Path) -> None:
+def test_a_plan_that_lost_its_problem_is_audited_with_it(tmp_path: Path) -> None:
     solution = solve(van_der_pol(), Collocation(10))
-    solution.save(tmp_path / "plan.npz")
+    solution.with_problem(None).save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
-    with pytest.raises(AuditError, match=r"'van der Pol' was loaded without its problem; call audit\(problem\)"):
+    with pytest.raises(AuditError, match=r"'van der Pol' comes without its problem; call audit\(problem\)"):
         loaded.audit()
     assert str(loaded.audit(van_der_pol())) == str(solution.audit())
     assert loaded.with_problem(van_der_pol()).audit().passed
+
+
+def test_files_of_the_first_version_are_read_without_a_problem(tmp_path: Path) -> None:
+    solution = solve(van_der_pol(), Collocation(10))
+    solution.save(tmp_path / "plan.npz")
+
+    def first(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        head.update(version=1)
+        del head["problem"], head["problem_lost"], arrays["problem"]
+
+    edited(tmp_path / "plan.npz", first)
+    loaded = Solution.load(tmp_path / "plan.npz")
+    assert_identical(solution, loaded)
+    with pytest.raises(AuditError, match="the file is of the first version, which holds none"):
+        loaded.audit()
+    assert loaded.audit(van_der_pol()).passed
+
+
+WRONG: list[tuple[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]]] = [
+    ("name", lambda h, a: h.update(name=3)),
+    ("method", lambda h, a: h.update(method="radau")),
+    ("method", lambda h, a: h["method"].pop("type")),
+    ("solver", lambda h, a: h.update(solver=None)),
+    ("success", lambda h, a: h.update(success="no")),
+    ("success", lambda h, a: h.update(success=1)),
+    ("status", lambda h, a: h.update(status=[])),
+    ("cost", lambda h, a: h.update(cost="6")),
+    ("cost", lambda h, a: h.update(cost=float("nan"))),
+    ("iterations", lambda h, a: h.update(iterations=1.5)),
+    ("iterations", lambda h, a: h.update(iterations=True)),
+    ("start", lambda h, a: h.update(start=0)),
+    ("regularised", lambda h, a: h.update(regularised=1)),
+    ("drawn_in", lambda h, a: a.update(drawn_in=np.ones(3))),
+    ("drawn_in", lambda h, a: a.update(drawn_in=np.full((2, len(a["control_interpolant/breaks"]) - 1, 9), -1.0))),
+    ("horizon", lambda h, a: h.update(horizon=float("inf"))),
+    ("horizon", lambda h, a: h.update(horizon=[1.0])),
+    ("seconds", lambda h, a: h.update(seconds=1.0)),
+    ("t", lambda h, a: a.update(t=a["t"][::-1])),
+    ("t", lambda h, a: a.update(t=a["t"][:0])),
+    ("t", lambda h, a: a.update(t=np.full_like(a["t"], np.nan))),
+    ("state 'x'", lambda h, a: a.update({"states/x": a["states/x"][:-1]})),
+    ("state 'x'", lambda h, a: a.update({"states/x": a["states/x"].ravel()})),
+    ("state 'x'", lambda h, a: a.update({"states/x": a["states/x"] * np.nan})),
+    ("control 'u'", lambda h, a: a.update({"controls/u": a["controls/u"] * np.inf})),
+    ("costate 'w'", lambda h, a: a.update({"costates/w": a["costates/w"] * np.nan})),
+    ("parameter 'k'", lambda h, a: a.update({"parameters/k": np.ones((2, 2))})),
+    ("cost gradient 'k'", lambda h, a: a.update({"cost_gradients/k": np.ones((2, 2))})),
+    ("variables", lambda h, a: a.update(variables=a["variables"][None])),
+    ("multipliers", lambda h, a: a.update(multipliers=a["multipliers"] * np.nan)),
+    ("state_interpolant.breaks", lambda h, a: a.update({"state_interpolant/breaks": np.zeros(2)})),
+    ("state_interpolant.nodes", lambda h, a: a.update({"state_interpolant/nodes": np.array([])})),
+    ("control_interpolant.values", lambda h, a: a.update({"control_interpolant/values": np.zeros((1, 1, 1))})),
+    (
+        "costate_interpolant",
+        lambda h, a: a.update({"costate_interpolant/values": a["costate_interpolant/values"] * np.inf}),
+    ),
+    ("problem", lambda h, a: h["problem"].update(digest="0")),
+    ("problem", lambda h, a: h["problem"].pop("declared")),
+    ("problem", lambda h, a: h["problem"].update(name="another")),
+    ("problem", lambda h, a: a.update(problem=a["problem"][:-3])),
+    ("extra", lambda h, a: a.update(extra=np.zeros(3))),
+    ("states/y", lambda h, a: a.update({"states/y": np.zeros(3)})),
+]
+
+
+@pytest.mark.parametrize(("name", "edit"), WRONG)
+def test_what_is_wrong_in_a_file_is_named(name: str, edit: Any, tmp_path: Path) -> None:
+    plan("radau").save(tmp_path / "plan.npz")
+    edited(tmp_path / "plan.npz", edit)
+    with pytest.raises(ProblemError) as caught:
+        Solution.load(tmp_path / "plan.npz")
+    assert caught.value.name == name
+
+
+def test_what_an_unsuccessful_plan_lacks_may_be_no_number(tmp_path: Path) -> None:
+    failed = dataclasses.replace(plan("radau"), success=False, cost=np.nan)
+    failed.save(tmp_path / "plan.npz")
+    assert np.isnan(Solution.load(tmp_path / "plan.npz").cost)

@@ -12,6 +12,7 @@ import numpy as np
 
 from models.machines.standing import External, Standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError
 from ocp.methods import solve
@@ -70,6 +71,7 @@ class Attempt:
     exceeded: bool = False
 
 
+@interruptible
 def plan_standing(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],

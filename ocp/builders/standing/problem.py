@@ -41,6 +41,7 @@ from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
 from models.robot.robot import Robot
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
+from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
@@ -100,6 +101,7 @@ class FreeTime:
             raise ProblemError(message, name="FreeTime", value=given)
 
 
+@interruptible
 def standing_problem(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],

@@ -260,7 +260,7 @@ def run(code: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
 INTERRUPTED = """
 import os, signal, threading, time
 import casadi as ca
-from ocp import Collocation, Problem, SolveError, prepare
+from ocp import Collocation, Problem, prepare
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs with Ctrl-C ignored
 problem = Problem("long")
@@ -278,13 +278,11 @@ for check in (False, True):
     stop.start()
     began = time.monotonic()
     try:
-        solution = prepared.solve(check=check)
-        print("returned", solution.success, solution.status.split(":")[0], solution["x"].shape)
-    except SolveError as error:
-        print("raised", "User_Requested_Stop" in str(error), error.solution.success, error.solution["x"].shape)
-    except KeyboardInterrupt:
-        print("KeyboardInterrupt")
-    assert time.monotonic() - began < 10
+        prepared.solve(check=check)
+        print("returned")
+    except KeyboardInterrupt as error:
+        print(error.solution.success, error.solution.status, error.solution["x"].shape)
+    assert time.monotonic() - began < 2
     stop.join()
     print("restored", signal.getsignal(signal.SIGINT) is before)
 again = prepare(problem, Collocation(20), solver=SOLVER).solve()
@@ -298,12 +296,12 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_ctrl_c_stops_a_solve_and_returns_the_last_iterate(solver: str) -> None:
+def test_ctrl_c_stops_a_solve_and_carries_the_last_iterate(solver: str) -> None:
     done = run(f"SOLVER = {solver!r}\n{INTERRUPTED}")
     assert done.stdout.splitlines() == [
-        "returned False User_Requested_Stop (2401, 2)",
+        "False User_Requested_Stop: interrupted (2401, 2)",
         "restored True",
-        "raised True False (2401, 2)",
+        "False User_Requested_Stop: interrupted (2401, 2)",
         "restored True",
         "afterwards True",
         "Ctrl-C works as before",

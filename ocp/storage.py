@@ -1,0 +1,176 @@
+"""Files of named arrays: written whole or not at all, and looked at before anything of them is unpacked."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import re
+import secrets
+import stat
+import zipfile
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from ocp.errors import ProblemError
+
+__all__ = ["MOST_BYTES", "read_arrays", "write_arrays"]
+
+MOST_BYTES = 2**28  # of all arrays of a file, unpacked: 30 million numbers
+MOST_ENTRIES = 2**20  # bytes of an archive's table of contents
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+END = b"PK\x05\x06"  # of an archive, in its last 22 bytes; before it, of a longer one, stands LONG
+LONG = b"PK\x06\x07"
+
+
+# ---- writing -----------------------------------------------------------------------------------------------------
+
+
+def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write one compressed ``.npz`` file, whole or not at all, and see it on the disk.
+
+    A link is followed, the mode of a file that is there kept. Until it is whole the file bears a name of its own,
+    ``NAME.xxxxxxxx.part``, and is locked; one that is not locked any more, because who wrote it was killed, is removed.
+
+    Raises:
+        ProblemError: path is no file but a folder, a pipe or a device, or the arrays are larger than is read again.
+        OSError: The file cannot be written.
+    """
+    size = sum(array.nbytes for array in arrays.values())
+    if size > MOST_BYTES:
+        words = f"{path}: {size:.3g} bytes of arrays, at most {MOST_BYTES:.3g} are written"
+        raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+    target = Path(os.path.realpath(path))
+    mode = None
+    with suppress(FileNotFoundError):
+        status = target.stat()
+        check_regular(path, status)
+        mode = stat.S_IMODE(status.st_mode)
+    remove_left(target)
+    stream = new_part(target)
+    try:
+        with stream:
+            if mode is not None:
+                os.fchmod(stream.fileno(), mode)
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+            stream.flush()
+            os.fsync(stream.fileno())
+            os.replace(stream.name, target)
+    except BaseException:
+        Path(stream.name).unlink(missing_ok=True)
+        raise
+    with suppress(PermissionError):  # a folder that may be written, not read
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def new_part(target: Path) -> IO[bytes]:
+    """A new file beside the target, locked."""
+    while True:
+        stream = open(target.with_name(f"{target.name}.{secrets.token_hex(4)}.part"), "xb")  # noqa: SIM115
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.stat(stream.name), os.fstat(stream.fileno())):
+                return stream
+        stream.close()  # removed as one that was left, before it was locked
+
+
+def remove_left(target: Path) -> None:
+    """Remove what killed writers of the target have left."""
+    part = re.compile(re.escape(target.name) + r"\.[0-9a-f]{8}\.part")
+    with suppress(OSError):
+        for name in os.listdir(target.parent):
+            if part.fullmatch(name):
+                left = target.with_name(name)
+                with suppress(OSError), open(left, "rb") as stream:
+                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                    left.unlink()
+
+
+# ---- reading -----------------------------------------------------------------------------------------------------
+
+
+def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file by name, of real numbers each.
+
+    Sizes are looked at before anything is unpacked, so that memory is bounded by twice ``MOST_BYTES``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ProblemError: It cannot be read, is no such file, or is larger than ``MOST_BYTES``.
+    """
+    told: dict[str, Any] = {"name": "path", "value": str(path)}
+    try:
+        check_regular(path, os.stat(os.fspath(path)))  # a pipe would be waited for
+        with open(path, "rb") as stream:
+            check_contents(path, stream, os.fstat(stream.fileno()).st_size)
+            with zipfile.ZipFile(stream) as archive:
+                members = archive.infolist()
+                size = sum(member.file_size for member in members)
+                if size > MOST_BYTES:
+                    words = f"{path} is not a saved solution: it unpacks to {size:.3g} bytes, {MOST_BYTES:.3g} at most"
+                    raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+                if len({member.filename for member in members}) < len(members):
+                    raise ValueError("a name stands in it twice")
+                return {name_of(member): array_of(archive, member) for member in members}
+    except (FileNotFoundError, ProblemError):
+        raise
+    except OSError as error:
+        raise ProblemError(f"{path} cannot be read: {error.strerror or error}", **told) from error
+    except Exception as error:  # what zip, zlib and numpy say of broken bytes is of many kinds
+        raise ProblemError(f"{path} is not a saved solution: {error}", **told) from error
+
+
+def check_regular(path: Any, status: os.stat_result) -> None:
+    """Raise ProblemError where something is no file but a folder, a pipe or a device."""
+    if not stat.S_ISREG(status.st_mode):
+        raise ProblemError(f"{path} is no file, but a folder, a pipe or a device", name="path", value=str(path))
+
+
+def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
+    """Raise where an archive or its table of contents is too large, or it does not end as one that was saved."""
+    if size > MOST_BYTES:
+        words = f"{path} is not a saved solution: {size:.3g} bytes, {MOST_BYTES:.3g} at most"
+        raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+    stream.seek(max(0, size - 42))
+    tail = stream.read(42)
+    if tail[-22:-18] != END or tail.startswith(LONG):
+        raise ValueError("it is no archive, or not whole")
+    if int.from_bytes(tail[-10:-6], "little") > MOST_ENTRIES:
+        raise ValueError("its table of contents is too long")
+
+
+def name_of(member: zipfile.ZipInfo) -> str:
+    name, dot, kind = member.filename.rpartition(".")
+    if not dot or kind != "npy":
+        raise ValueError(f"{member.filename!r} is no array")
+    return name
+
+
+def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """An array of real numbers, whose size is looked at before it is made."""
+    if member.compress_type not in PACKED:
+        raise ValueError(f"{member.filename!r} is packed in another way than is written")
+    with archive.open(member) as packed:
+        data = packed.read(member.file_size + 1)  # never more than was told
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+    shape, by_columns, kind = read_header(stream)
+    if kind.kind not in "fiu" or kind.itemsize > 8:
+        raise ValueError(f"{member.filename!r} holds {kind}, no real numbers")
+    count, left = 1, len(data) - stream.tell()
+    for length in shape:
+        count *= length
+    if min(shape, default=0) < 0 or count * kind.itemsize != left:
+        raise ValueError(f"{member.filename!r} has {left} bytes for shape {shape} of {kind}")
+    array = np.frombuffer(data, kind, count, stream.tell()).reshape(shape, order="F" if by_columns else "C")
+    return array.astype(kind.newbyteorder("="), order="C")

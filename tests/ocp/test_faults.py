@@ -1,0 +1,408 @@
+"""Faults from outside: Ctrl-C, time limits, several threads, no file handles. They lose nothing, and are no verdict."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, Indirect, Problem, ProblemError, SolveError, prepare, solve
+from ocp.console import interruptible, limited, quiet, time_left
+from ocp.errors import Interrupted
+from tests.ocp.problems import SOLVERS, energy, van_der_pol
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(code: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """Python code in a process of its own, from the root of the repository."""
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+# ---- Ctrl-C ------------------------------------------------------------------------------------------------------
+
+INTERRUPTED = """
+import os, signal, sys, threading, time
+import casadi as ca
+import numpy as np
+import ocp
+from models import papers
+from models.paths import segments
+from ocp import *
+from tests.ocp.problems import van_der_pol
+from tests.ocp.test_faults import solved_from_zeros
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs with Ctrl-C ignored
+NEVER = {"tol": 1e-300, "acceptable_iter": 0, "max_iter": 1000000}  # keeps ipopt at work
+
+
+def interrupted(name, call, after=0.3):
+    sent = []
+    def kill():
+        sent.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+    timer = threading.Timer(after, kill)
+    timer.start()
+    try:
+        call()
+        word = "returned"
+    except KeyboardInterrupt as error:
+        word = "KeyboardInterrupt" + (" with a plan" if getattr(error, "solution", None) is not None else "")
+    except BaseException as error:
+        word = type(error).__name__
+    late = time.monotonic() - sent[0] if sent else 0.0
+    timer.join()
+    print(name, "|", word, "|", "at once" if late < 1.0 else f"{late:.1f} s late", flush=True)
+    for thread in threading.enumerate():  # what was left alone comes to its end
+        if thread.name == "ocp":
+            thread.join()
+"""
+
+DIRECT = """
+long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+ipopt = prepare(long, Collocation(300, 4), options=NEVER)
+interrupted("ipopt", ipopt.solve)
+interrupted("ipopt without check", lambda: ipopt.solve(check=False))
+fatrop = prepare(long, Collocation(1000, 4), solver="fatrop", options={"max_iter": 1000000})
+interrupted("fatrop", fatrop.solve, 0.5)
+again = prepare(solved_from_zeros(), Collocation(1000, 4))
+interrupted("second start", again.solve)
+stuck = van_der_pol(horizon=20.0, terminal=[9.0, 9.0], upper=0.1)
+conflicts = prepare(stuck, Collocation(1000, 4), options={"max_iter": 1})
+interrupted("what conflicts", conflicts.solve, 2.0)
+sleqp = prepare(long, Collocation(60, 4), solver="sleqp")
+interrupted("sleqp", sleqp.solve, 1.0)
+interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
+interrupted("refine", lambda: refine(van_der_pol(), Collocation(50), options=NEVER))
+interrupted("tighten", lambda: tighten(long, Collocation(200), options=NEVER))
+plan = solve(long, Collocation(300))
+print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success)
+"""
+
+CHECKS = """
+long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+plan = solve(long, Collocation(300))
+interrupted("audit", lambda: plan.audit())
+interrupted("audit again", lambda: plan.audit(), 0.6)
+interrupted("certificate", lambda: certificate(long, [plan, plan]))
+indirect = prepare(van_der_pol(horizon=6.0), Indirect(segments=40))
+seed = solve(van_der_pol(horizon=6.0), Collocation(20))
+interrupted("indirect", lambda: indirect.solve(guess=seed), 0.2)
+interrupted("indirect with its own seed", lambda: Indirect(seed=Collocation(300)).prepare(long).solve())
+"""
+
+MACHINES = """
+arm, start = papers.paper_example(), [0.7, 0.6, 0.9]
+interrupted("local", lambda: ocp.resolve(arm, (-1.0, -1.0), (3, 4), start, 1.0, tolerance=1e-12, samples=30000), 0.1)
+pose = TipTask(position=[1.0, 1.0, 0.0], rows=(3, 4))
+base = arm.base_home()
+interrupted("inverse kinematics", lambda: inverse_kinematics(arm, pose, starts=300000))
+interrupted("plan", lambda: plan_minimum_velocity(arm, (-1.0, -1.0), (3, 4), start, 1.0, method=Collocation(2000)))
+"""
+
+
+def lines(code: str) -> list[list[str]]:
+    done = run(f"{INTERRUPTED}\n{code}")
+    assert done.returncode == 0, done.stderr
+    assert "Exception" not in done.stderr
+    return [line.split(" | ") for line in done.stdout.splitlines()]
+
+
+def test_ctrl_c_ends_a_solve_at_once_with_its_iterate() -> None:
+    *found, afterwards = lines(DIRECT)
+    with_a_plan = ["ipopt", "ipopt without check", "fatrop"]
+    others = ["second start", "what conflicts", "sleqp", "prepare", "refine", "tighten"]
+    assert [name for name, _, _ in found] == with_a_plan + others
+    assert {word for name, word, _ in found if name in with_a_plan} == {"KeyboardInterrupt with a plan"}
+    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}
+    assert {late for _, _, late in found} == {"at once"}
+    assert afterwards == ["True False"]
+
+
+def test_ctrl_c_during_a_check_is_no_verdict() -> None:
+    found = lines(CHECKS)
+    assert [name for name, _, _ in found] == [
+        "audit", "audit again", "certificate", "indirect", "indirect with its own seed"
+    ]  # fmt: skip
+    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}
+    assert {late for _, _, late in found} == {"at once"}
+
+
+def test_ctrl_c_ends_what_is_done_with_machines() -> None:
+    found = lines(MACHINES)
+    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}, found
+    assert {late for _, _, late in found} == {"at once"}, found
+
+
+def test_what_a_handler_of_signals_raises_ends_a_call_too() -> None:
+    """An alarm, say: it is raised where the call was made, and the handler stays as it was."""
+
+    class Alarm(Exception):
+        pass
+
+    def ring(number: int, frame: Any) -> None:
+        raise Alarm
+
+    @interruptible
+    def waits() -> None:
+        while True:
+            time.sleep(0.01)
+
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(Alarm):
+            waits()
+        assert signal.getsignal(signal.SIGALRM) is ring
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    deadline = time.monotonic() + 5.0
+    while any(thread.name == "ocp" for thread in threading.enumerate()):
+        assert time.monotonic() < deadline, "what was at work goes on"
+        time.sleep(0.01)
+
+
+def test_a_call_returns_raises_and_warns_as_without_its_thread() -> None:
+    @interruptible
+    def half(value: float) -> float:
+        """The half."""
+        if value < 0:
+            raise ProblemError("negative", name="value")
+        with np.errstate():
+            return float(np.sqrt(value) ** 2 / 2)
+
+    assert half(3.0) == pytest.approx(1.5)
+    assert half.__doc__ == "The half."
+    with pytest.raises(ProblemError, match="negative") as caught:
+        half(-1.0)
+    assert caught.value.name == "value"
+    with np.errstate(invalid="raise"), pytest.raises(FloatingPointError):  # the caller's own settings hold inside
+        interruptible(lambda: np.sqrt(np.float64(-1.0)))()
+    assert Interrupted("x").solution is None
+
+
+# ---- time limits -------------------------------------------------------------------------------------------------
+
+NEVER = {"tol": 1e-300, "acceptable_iter": 0, "max_iter": 1000000}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_solve_ends_at_its_time_limit_and_says_so(solver: str) -> None:
+    problem = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+    options = NEVER if solver == "ipopt" else {"max_iter": 1000000}
+    prepared = prepare(problem, Collocation(300, 4), solver=solver, options=options)
+    began = time.monotonic()
+    solution = prepared.solve(check=False, time_limit=0.1)
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        prepared.solve(time_limit=0.1)
+    assert time.monotonic() - began < 2.0
+    for plan in (solution, caught.value.solution):
+        assert not plan.success
+        assert plan.status.startswith("Maximum_WallTime_Exceeded")
+        assert plan["x"].shape == (1201, 2)
+        assert np.all(np.isfinite(plan["x"]))
+        assert np.isfinite(plan.cost)
+
+
+def test_sleqp_ends_at_its_time_limit_and_works_again() -> None:
+    prepared = prepare(van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0), Collocation(60), solver="sleqp")
+    stopped = prepared.solve(check=False, time_limit=0.05)
+    assert not stopped.success
+    assert stopped.status.startswith("Maximum_WallTime_Exceeded")
+    assert np.all(np.isfinite(stopped["x"]))
+    assert np.isfinite(stopped.cost)
+    assert prepared.solve(check=False).success
+
+
+def test_where_sleqp_fails_is_no_foreign_exception() -> None:
+    """Its interface raises where it gives up."""
+    problem = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+    plan = prepare(problem, Collocation(100, 4), solver="sleqp").solve(check=False)
+    assert plan.success or plan.status.startswith("Error_In_Step_Computation")
+    assert np.all(np.isfinite(plan["x"]))
+
+
+def solved_from_zeros() -> Problem:
+    """No number at the guess, so that the solver fails there at once; solved from zeros."""
+    problem = Problem("solved from zeros")
+    x = problem.state("x", 2, initial=[1.0, 0.0])
+    u = problem.control("u", guess=-2.0)
+    problem.dynamics(x, ca.vertcat(x[1], (1 - x[0] ** 2) * x[1] - x[0] + u))
+    problem.horizon(20.0)
+    problem.minimize(running=ca.sumsqr(x) + u**2 + 1e-3 * ca.log(1 + u) ** 2)
+    return problem
+
+
+def test_one_time_limit_covers_all_starts() -> None:
+    """What ran out of time is told of, whichever start it was at; behind it there is no other."""
+    assert solve(solved_from_zeros(), Collocation(20)).start == "zeros"
+    prepared = prepare(solved_from_zeros(), Collocation(1000, 4))
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        prepared.solve(time_limit=0.3)
+    told = str(caught.value).splitlines()
+    assert next(line for line in told if line.startswith("from the ")).startswith("from the guess: Invalid_Number")
+    assert "from the roll-out" not in str(caught.value)
+    assert caught.value.solution.start == "zeros"
+    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+
+
+def test_the_time_limit_holds_for_all_of_a_solve() -> None:
+    """The build counts, and so does the search for what conflicts behind a solve that fails."""
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded"):
+        solve(van_der_pol(horizon=20.0), Collocation(200), time_limit=1e-6)
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded"):
+        prepare(van_der_pol(), Indirect()).solve(time_limit=1e-6)
+    seed = solve(van_der_pol(), Collocation(10))
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded"):
+        prepare(van_der_pol(), Indirect()).solve(guess=seed, time_limit=1e-6)
+    assert solve(energy(), Collocation(3), time_limit=100.0).success
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf, "soon", True])
+def test_a_time_limit_that_cannot_be_right_is_named(limit: Any) -> None:
+    with pytest.raises(ProblemError, match="time_limit must be positive and finite"):
+        solve(energy(), Collocation(3), time_limit=limit)
+
+
+def test_an_outer_time_limit_holds_inside() -> None:
+    assert time_left() == np.inf
+    with limited(5.0):
+        with limited(100.0):
+            assert time_left() <= 5.0
+        with limited(None):
+            assert time_left() <= 5.0
+        with limited(1.0):
+            assert time_left() <= 1.0
+    assert time_left() == np.inf
+
+
+# ---- threads -----------------------------------------------------------------------------------------------------
+
+THREADS = """
+import sys, threading
+import casadi as ca
+import numpy as np
+from ocp import *
+from ocp.problem.formulation import Formulation
+from tests.ocp.problems import van_der_pol
+
+started = threading.Barrier(4)
+results, errors = [], []
+
+
+def together(call):
+    def work():
+        started.wait()
+        try:
+            results.append(call())
+        except BaseException as error:
+            errors.append(error)
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads: thread.start()
+    for thread in threads: thread.join()
+"""
+
+TOLD = """
+assert not errors, errors
+if isinstance(results[0][0], float):
+    results = np.round(results, 9).tolist()
+print(len(results), len({str(result) for result in results}))
+"""
+
+SHARED = {
+    "ipopt": """
+prepared = prepare(van_der_pol(), Collocation(40))
+together(lambda: [prepared.solve().cost for _ in range(5)])
+""",
+    "fatrop": """
+prepared = prepare(van_der_pol(), Collocation(40), solver="fatrop")
+together(lambda: [prepared.solve().cost for _ in range(5)])
+""",
+    "indirect": """
+prepared, seed = prepare(van_der_pol(), Indirect()), solve(van_der_pol(), Collocation(40))
+together(lambda: [prepared.solve(guess=seed).cost for _ in range(2)])
+""",
+    "problem": """
+problem = van_der_pol()
+together(lambda: [solve(problem, Collocation(40)).cost for _ in range(3)])
+""",
+    "audit": """
+plan = solve(van_der_pol(), Collocation(40))
+together(lambda: [str(plan.audit()) for _ in range(3)])
+""",
+    "formulation": """
+form = Formulation(van_der_pol())
+x, u, t = np.ones((50, 2)), np.ones((50, 1)), np.ones(50)
+p = np.zeros(0)
+together(lambda: [float(form.sampled([form.f, form.running], x, u, t, 1.0, p)[0].sum()) for _ in range(40)])
+""",
+}
+
+
+@pytest.mark.parametrize("what", SHARED)
+def test_threads_that_share_something_get_what_one_alone_gets(what: str) -> None:
+    done = run(f"{THREADS}\n{SHARED[what]}\n{TOLD}")
+    assert done.returncode == 0, (done.returncode, done.stderr)
+    assert done.stdout.split() == ["4", "1"]
+
+
+# ---- words -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_without_a_terminal_a_solve_logs_its_start_and_its_end(solver: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "ocp"):
+        plan = solve(energy(), Collocation(4), solver=solver)
+    start, end = (record.getMessage() for record in caplog.records)
+    assert all(record.name == "ocp" for record in caplog.records)
+    assert start == f"solving 'energy': {plan.variables.size} variables, {plan.multipliers.size} rows"
+    assert end.startswith(f"solved 'energy': {plan.status}, cost {plan.cost:.6g}, {plan.iterations} iterations, ")
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "ocp"):
+        solve(van_der_pol(horizon=20.0), Collocation(100), solver=solver, time_limit=1e-3, check=False)
+    assert "Maximum_WallTime_Exceeded" in caplog.records[-1].getMessage()
+
+
+def test_what_one_thread_keeps_quiet_does_not_silence_another(capsys: pytest.CaptureFixture[str]) -> None:
+    real = sys.stderr
+    inside, leave = threading.Event(), threading.Event()
+
+    def hushed() -> None:
+        with quiet():
+            print("of the thread", file=sys.stderr)
+            inside.set()
+            leave.wait(10.0)
+
+    thread = threading.Thread(target=hushed)
+    thread.start()
+    inside.wait(10.0)
+    with quiet():
+        print("of the main thread, hushed", file=sys.stderr)
+        with quiet():
+            pass
+        print("still hushed", file=sys.stderr)
+    print("of the main thread", file=sys.stderr)
+    leave.set()
+    thread.join()
+    assert sys.stderr is real
+    assert capsys.readouterr().err == "of the main thread\n"
