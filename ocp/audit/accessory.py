@@ -142,23 +142,19 @@ class AccessoryProblem:
         normals *= self.unit
         reach = np.abs(normals).max(axis=2)
 
-        sizes = along.sizes
+        held = np.append(along.sizes.control, along.sizes.path[along.mixed])
+        rests = np.append(along.sizes.state, along.sizes.path[along.still])
 
-        def pushing(
-            limits: Limits, multipliers: np.ndarray, place: slice, own: np.ndarray
-        ) -> tuple[np.ndarray, np.ndarray]:
-            force = np.abs(multipliers) * reach[:, place]
-            gap, equal = np.minimum(limits.below, limits.above)[:, : force.shape[1]], limits.equal[: force.shape[1]]
-            touched = (gap <= AT_BOUND * own) | equal
-            return force > FLAT * (force.max(initial=0.0) or 1.0), touched
+        def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
+            count = multipliers.shape[1]
+            force = np.abs(multipliers) * reach[:, first : first + count]
+            gap = np.minimum(limits.below, limits.above)[:, :count]
+            touched = (gap <= AT_BOUND * size) | limits.equal[:count]
+            return [force > FLAT * (force.max(initial=0.0) or 1.0), touched]
 
-        strong, touched = pushing(
-            along.hold, self.adjoint.holding[:, :nh], slice(0, nh), np.append(sizes.control, sizes.path[along.mixed])
-        )
+        strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], 0, held)
         self.fixed = strong[:, :nu] & touched[:, :nu]
-        at_rest, resting = pushing(
-            along.stand, self.adjoint.standing, slice(nh, None), np.append(sizes.state, sizes.path[along.still])
-        )
+        at_rest, resting = pushing(along.stand, self.adjoint.standing, nh, rests)
         strong = np.hstack([strong & touched | along.hold.equal[:nh], at_rest | along.stand.equal])
         touched = np.hstack([touched, resting])
         n, q = along.shape

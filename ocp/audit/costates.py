@@ -61,6 +61,8 @@ class Adjoint:
         error: Of the costates over each interval, from end to end. Shape (N,).
         between: Of what is reported between the ends of an interval. Shape (N,).
         charge: What the multipliers of the states' limits win over the gaps to them, in each interval. Shape (N,).
+        lumps: What of the costates reported at the ends of the intervals stands for pushes before these: a limit that a
+            transcription holds there alone pushes there at once for both its sides. Shape (N + 1, nx).
         ends: The conditions at the ends.
     """
 
@@ -71,19 +73,23 @@ class Adjoint:
     error: np.ndarray
     between: np.ndarray
     charge: np.ndarray
+    lumps: np.ndarray
     ends: Ends
 
 
-def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps: np.ndarray | float = 0.0) -> Adjoint:
     """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
 
     Args:
         along: The plan.
         curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
         cost: A size of the cost, which errors are weighed by.
+        lumps: Taken from the costates reported at the ends of the intervals, so that pushes spread; see `Adjoint`.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
+    taken = np.broadcast_to(lumps, (n + 1, along.form.nx))
+    first, last = first - taken[:-1], last - taken[1:]
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
     near, at_node = (
         np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
@@ -103,7 +109,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float) -> Adj
     size = along.sizes.state
     places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
     node = along.node_stand
-    lumps = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
+    single = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
     standing = inside / places
     standing[:, 0] += atoms[:, 0] / places[:, 0]
     standing[:, -1] += atoms[:, 1] / places[:, -1]
@@ -117,9 +123,24 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float) -> Adj
         standing.reshape(n * q, m),
         np.abs(first - start) @ size,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
-        stand.sum(axis=(1, 2)) + lumps[0] + lumps[1],
+        stand.sum(axis=(1, 2)) + single[0] + single[1],
+        _lumps(along, holding, atoms),
         _ends(along, costate, holding, inside, atoms, cost),
     )
+
+
+def _lumps(along: Linearisation, holding: np.ndarray, atoms: np.ndarray) -> np.ndarray:
+    """See `Adjoint`. Half of what pushes at a node alone, and the share of a hat of what pushes all along."""
+    (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
+    found = np.zeros((n + 1, nx))
+    if not along.nodal:
+        return found
+    found[:-1] += np.einsum("km,kmi->ki", atoms[:, 0], along.node_stand_x[:-1, :, :nx]) / 2
+    pushes = holding[:, nu : nu + along.mixed.size]
+    rising = (along.share.reshape(n, q) * along.places).ravel()
+    force = np.einsum("k,km,kmi->ki", rising, pushes, along.row_y[:, along.mixed, :nx])
+    found[1:] += force.reshape(n, q, nx).sum(axis=1)
+    return found
 
 
 def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:

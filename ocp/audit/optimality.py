@@ -59,7 +59,12 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
     size = abs(solution.cost) or along.slope_size or 1.0
-    first = adjoint(along, _curved(along), size)
+    curved = _curved(along)
+    first = adjoint(along, curved, size)
+    if first.lumps.any():
+        spread_out = adjoint(along, curved, size, first.lumps)
+        first = min(first, spread_out, key=lambda found: _told(along, found, curved))
+        along.follow((first.standing != 0).reshape(*along.shape, -1).any(axis=1))
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
     cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
@@ -84,10 +89,18 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     )
 
 
+def _told(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
+    """What a plan loses and errs by with these multipliers, in units of cost."""
+    assert curved is not None
+    won = lost(along, found.costate, found.holding, curved).sum() + found.charge.sum() + found.ends.charge
+    return float(won + found.error.sum())
+
+
 def _curved(along: Linearisation) -> np.ndarray | None:
-    """T H_uu at the points but for its path constraints, (M, nu, nu), where an inequality with a control needs it."""
+    """T H_uu at the points but for its path constraints, (M, nu, nu), where what pushes at single points needs it."""
     form = along.form
-    if form.path.equality[along.mixed].all():
+    single = along.nodal and (along.mixed.size > 0 or along.node_stand.near.any())
+    if form.path.equality[along.mixed].all() and not single:
         return None
     lam = form.sym("lam", form.nx)
     total = along.scaled[0] + ca.dot(lam, along.scaled[1])
@@ -110,7 +123,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         1.0,
         along.t,
         np.full(m, np.inf),
-        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, ends),
+        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, np.zeros((n + 1, form.nx)), ends),
         values,
         curved,
     )

@@ -124,28 +124,20 @@ def balance(gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upp
     """Multipliers (M, m) of limits that make gradient (M, n) + directions (M, m, n)' multipliers least at each point.
 
     At least zero where only ``upper`` (M, m) may push, at most zero where only ``lower`` may, free where both may.
-    Wrongly signed ones are dropped one by one, the worst first.
     """
     found = np.zeros(lower.shape)
     active, both = lower | upper, lower & upper
-    left = np.flatnonzero(active.any(axis=1))
-    while left.size:
-        wrong = []
-        for pattern, members in groups(active[left]):
-            mine = left[members]
-            columns = directions[mine][:, pattern].transpose(0, 2, 1)
-            multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[mine])
-            against = np.where(both[mine][:, pattern], 0.0, multipliers)
-            against = np.where(upper[mine][:, pattern], -against, against)
-            worst = np.argmax(against, axis=1)
-            rows = np.arange(len(mine))
-            bad = against[rows, worst] > 1e-12 * (1.0 + np.abs(multipliers).max(axis=1))
-            good = mine[~bad]
-            found[np.ix_(good, np.flatnonzero(pattern))] = multipliers[~bad]
-            active[mine[bad], np.flatnonzero(pattern)[worst[bad]]] = False
-            wrong.append(mine[bad])
-        left = np.concatenate(wrong)
-        left = left[active[left].any(axis=1)]
+    for pattern, members in groups(active):
+        if not pattern.any():
+            continue
+        columns = directions[members][:, pattern].transpose(0, 2, 1)
+        multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[members])
+        free, sign = both[members][:, pattern], np.where(upper[members][:, pattern], 1.0, -1.0)
+        wrong = (sign * multipliers < 0) & ~free
+        for k in np.flatnonzero(wrong.any(axis=1)):  # the signs hold some of them back
+            nothing = np.zeros(len(sign[k]))
+            multipliers[k] = sign[k] * nonnegative(columns[k] * sign[k], -gradient[members[k]], nothing, free[k])
+        found[np.ix_(members, np.flatnonzero(pattern))] = multipliers
     return found
 
 

@@ -392,6 +392,9 @@ def _outcome(
         ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
         return _Outcome(attempt, solution, ended)
     audit = solution.audit()
+    if not audit.passed and not audit.failures:
+        undecided = SolveError(f"it is not decided whether the plan is a minimum: {audit.undecided}", name="audit")
+        return _Outcome(attempt, solution, undecided, "whose audit does not decide")
     if not audit.passed:
         worst = audit.failures[0]
         details = {"value": worst.value, "limit": worst.limit, "time": worst.time}

@@ -181,6 +181,9 @@ class _Judge:
             ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
             return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
+        if not audit.passed and not audit.failures:
+            undecided = SolveError(f"it is not decided whether the plan is a minimum: {audit.undecided}", name="audit")
+            return Attempt(name, solution, undecided)
         if not audit.passed:
             worst = max(audit.failures, key=lambda finding: finding.value / finding.limit if finding.limit else np.inf)
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)

@@ -289,6 +289,18 @@ PLAYED: list[tuple[list[tuple[float, float]], dict[str, Any], list[int], int | N
 the intervals of each attempt; which one is the plan."""
 
 
+@pytest.mark.parametrize("undecided", ["a singular arc from 1 to 2 s", "the solver says Solved_To_Acceptable_Level"])
+def test_a_plan_of_which_it_is_not_decided_whether_it_is_a_minimum_does_not_stand(
+    undecided: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = SimpleNamespace(passed=False, failures=(), undecided=undecided, controls={})
+    plan = SimpleNamespace(success=True, states={}, cost=CHEAP, audit=lambda: audit)
+    monkeypatch.setattr(redundancy, "solve", lambda *_, **__: plan)
+    with pytest.raises(SolveError, match=f"it is not decided whether the plan is a minimum: {undecided}") as caught:
+        plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED)
+    assert caught.value.name == "audit"
+
+
 @pytest.mark.parametrize(("script", "changes", "meshes", "best"), PLAYED)
 def test_meshes_are_refined_while_the_audit_mends_and_guesses_tried_until_one_is_no_dearer_than_the_pseudo_inverse(
     script: list[tuple[float, float]],
