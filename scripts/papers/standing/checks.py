@@ -25,8 +25,8 @@ ALLOWED = {
 """What a plan may be off by, at any of the ten times as many instants."""
 
 LOST = "cost lost, relative"
-"""The finding that a plan of held accelerations may miss: where a constraint of the ground is active they cost more than
-free ones, in proportion to the width of the intervals (ocp.builders.standing.problem)."""
+"""The finding that a plan of held accelerations may miss: where a constraint of the ground is active they cost more
+than free ones, in proportion to the width of the intervals (ocp.builders.standing.problem)."""
 
 
 def check(key: str, plan: Plan) -> Row:
