@@ -16,6 +16,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
+IDENTITY = np.eye(3)
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
@@ -149,8 +150,9 @@ def one_for_each(
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     """Read-only copy of a rotation matrix; ModelError naming `owner` and `what` when it is none."""
     matrix = checked_array(value, (3, 3), owner, what)
-    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if error > 1e-6 or np.linalg.det(matrix) < 0:
+    error = float(np.abs(matrix @ matrix.T - IDENTITY).max())
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # numpy's determinant costs as much as all the rest
+    if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         message = f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
         raise ModelError(message, name=what, value=matrix)
     if error > 1e-12:  # printed to few digits: take the nearest rotation

@@ -19,11 +19,11 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import DEPENDENT, holders
+from ocp.audit.principle import DEPENDENT, holders, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "Backwards", "Ends", "adjoint", "nonnegative"]
+__all__ = ["Adjoint", "Backwards", "Ends", "adjoint"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -61,6 +61,8 @@ class Adjoint:
         error: Of the costates over each interval, from end to end. Shape (N,).
         between: Of what is reported between the ends of an interval. Shape (N,).
         charge: What the multipliers of the states' limits win over the gaps to them, in each interval. Shape (N,).
+        lumps: What of the costates reported at the ends of the intervals stands for pushes before these: a limit that a
+            transcription holds there alone pushes there at once for both its sides. Shape (N + 1, nx).
         ends: The conditions at the ends.
     """
 
@@ -71,35 +73,43 @@ class Adjoint:
     error: np.ndarray
     between: np.ndarray
     charge: np.ndarray
+    lumps: np.ndarray
     ends: Ends
 
 
-def adjoint(along: Linearisation, cost: float) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps: np.ndarray | float = 0.0) -> Adjoint:
     """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
 
     Args:
-        along: The plan. cost: A size of the cost, which errors are weighed by.
+        along: The plan.
+        curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
+        cost: A size of the cost, which errors are weighed by.
+        lumps: Taken from the costates reported at the ends of the intervals, so that pushes spread; see `Adjoint`.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
+    taken = np.broadcast_to(lumps, (n + 1, along.form.nx))
+    first, last = first - taken[:-1], last - taken[1:]
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
     near, at_node = (
         np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
     )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
-    holding = holders(along, costate)
+    holding, across = holders(along, costate, curved)
     for _ in range(ROUNDS):
-        back = Backwards(along, holding)
+        before = holding != 0
+        back = Backwards(along, holding, across)
         for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
+        along.follow((inside != 0).any(axis=1) | (atoms != 0).any(axis=1))
         costate, start = back.integrate(last, inside, atoms)
-        holding = holders(along, costate)
-        if not (limited.size or along.mixed.size):
+        holding, across = holders(along, costate, curved)
+        if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():
             break
     size = along.sizes.state
     places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
     node = along.node_stand
-    lumps = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
+    single = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
     standing = inside / places
     standing[:, 0] += atoms[:, 0] / places[:, 0]
     standing[:, -1] += atoms[:, 1] / places[:, -1]
@@ -113,9 +123,24 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
         standing.reshape(n * q, m),
         np.abs(first - start) @ size,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
-        stand.sum(axis=(1, 2)) + lumps[0] + lumps[1],
+        stand.sum(axis=(1, 2)) + single[0] + single[1],
+        _lumps(along, holding, atoms),
         _ends(along, costate, holding, inside, atoms, cost),
     )
+
+
+def _lumps(along: Linearisation, holding: np.ndarray, atoms: np.ndarray) -> np.ndarray:
+    """See `Adjoint`. Half of what pushes at a node alone, and the share of a hat of what pushes all along."""
+    (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
+    found = np.zeros((n + 1, nx))
+    if not along.nodal:
+        return found
+    found[:-1] += np.einsum("km,kmi->ki", atoms[:, 0], along.node_stand_x[:-1, :, :nx]) / 2
+    pushes = holding[:, nu : nu + along.mixed.size]
+    rising = (along.share.reshape(n, q) * along.places).ravel()
+    force = np.einsum("k,km,kmi->ki", rising, pushes, along.row_y[:, along.mixed, :nx])
+    found[1:] += force.reshape(n, q, nx).sum(axis=1)
+    return found
 
 
 def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
@@ -131,13 +156,13 @@ def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
 class Backwards:
     """The costate equation over every interval backwards, what holds the controls answering to the costates."""
 
-    def __init__(self, along: Linearisation, holding: np.ndarray) -> None:
+    def __init__(self, along: Linearisation, holding: np.ndarray, across: np.ndarray) -> None:
         self.along = along
         n, q = along.shape
         nx, nu = along.form.nx, along.form.nu
         rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
         feed, given = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
-        unit = along.sizes.control
+        unit, mixed = along.sizes.control, slice(nu, nu + along.mixed.size)
         pushing = holding != 0
         self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
         held = np.flatnonzero(pushing.any(axis=1))
@@ -146,8 +171,11 @@ class Backwards:
             inverse = np.linalg.pinv(rows.transpose(0, 2, 1), rcond=DEPENDENT)
             self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
+                given += np.einsum("km,kmi->ki", holding[:, mixed] * across[:, None], along.row_y[:, along.mixed, :nx])
+                held, inverse = held[~across[held]], inverse[~across[held]]
                 # multipliers = - inverse (unit slope): the costate equation has them as a feedback of the costate
-                answer = np.einsum("kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu:]) * unit
+                slopes = along.row_y[held][:, along.mixed, :nx]
+                answer = np.einsum("kmi,kmu->kiu", slopes, inverse[:, mixed]) * unit
                 feed[held] -= answer @ rate_u[held].transpose(0, 2, 1)
                 given[held] -= np.einsum("kiu,ku->ki", answer, along.cost_y[held, nx + 1 :])
         ahead = along.weight - along.matrix  # of the integral from a point to the end
@@ -185,15 +213,18 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     size, unit = along.sizes.state, along.sizes.control
     limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
     slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
-    columns, charges, owners = [], [], []
+    columns, charges, owners, free = [], [], [], []
     for kind, (limit, slope_x) in enumerate(zip(limits, slopes, strict=True)):
-        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower, limit.below, -1.0)):
+        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower & ~limit.equal, limit.below, -1.0)):
             for j, i in zip(*np.nonzero(side), strict=True):
                 reach = float(np.abs(slope_x[j, i]) @ size)
-                if reach > 0:
+                # an equality pushes where a transcription holds it: one unknown for each of its own
+                elsewhere = limit.equal[i] and (kind, j) != (1, 0) if along.nodal else limit.equal[i] and kind == 1
+                if reach > 0 and not elsewhere:
                     columns.append((kind, j, sign * slope_x[j, i] / reach))
                     charges.append(gap[j, i] / reach)
                     owners.append((kind, j, i, sign / reach))
+                    free.append(bool(limit.equal[i]))
     inside, atoms = np.zeros((q, m)), np.zeros((2, m))
     if not columns:
         return inside, atoms
@@ -222,38 +253,10 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     slopes_c = np.einsum("j,juv,cjv->cju", weight, held, unit * np.einsum("jiu,cji->cju", rate_u, answer))
     target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
     matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    found = nonnegative(matrix, target, TRUSTED * np.array(charges)) * cost
+    found = nonnegative(matrix, target, TRUSTED * np.array(charges), np.array(free, bool)) * cost
     for (kind, j, i, scale), value in zip(owners, found, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
-
-
-def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """The y >= 0 (m,) of least |matrix y - target|^2 / 2 + price . y, by active sets (Lawson, Hanson 1974, ch 23)."""
-    m = matrix.shape[1]
-    y, passive = np.zeros(m), np.zeros(m, bool)
-    normal, right = matrix.T @ matrix, matrix.T @ target - price
-    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
-    for _ in range(3 * m + 10):
-        pull = np.where(passive, -np.inf, right - normal @ y)
-        if not m or pull.max() <= small:
-            break
-        passive[int(np.argmax(pull))] = True
-        while True:
-            index = np.flatnonzero(passive)
-            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
-            if (best > 0).all():
-                y[:] = 0.0
-                y[index] = best
-                break
-            falling = best <= 0
-            share = np.min(y[index][falling] / (y[index][falling] - best[falling] + np.finfo(float).tiny))
-            y[index] += min(max(share, 0.0), 1.0) * (best - y[index])
-            drop = index[(y[index] <= 1e-15 * np.abs(y).max(initial=0.0)) & falling]
-            if not drop.size:
-                drop = index[falling][:1]
-            y[drop], passive[drop] = 0.0, False
-    return y
 
 
 def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -293,7 +296,9 @@ def _ends(
     value, slopes, gradient = (np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, along.p))
     # dT H/dT along the plan, what pushes included
     by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
-    by_horizon += np.einsum("km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu :])
+    by_horizon += np.einsum(
+        "km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu : form.nu + along.mixed.size]
+    )
     lasting = float(along.share @ by_horizon)
     n, q = along.shape
     lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
@@ -310,7 +315,7 @@ def _ends(
     at_horizon = Limits(
         np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
     )
-    columns, charges, owners = [], [], []
+    columns, charges, owners, unsigned = [], [], [], []
     eye = np.eye(2 * nx + 1)
     node = along.node_stand
     into = [*range(nx), 2 * nx], [*range(nx, 2 * nx), 2 * nx]
@@ -321,19 +326,23 @@ def _ends(
         wide[:, where] = along.node_stand_x[k]
         parts.append((node.at(slice(k, k + 1)), wide, np.full(len(wide), -1)))
     for limit, slope_y, own in parts:
-        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (limit.lower[0], limit.below[0], -1.0)):
+        lower = limit.lower[0] & ~limit.equal
+        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (lower, limit.below[0], -1.0)):
             for i in np.flatnonzero(side):
                 reach = float(np.abs(slope_y[i]) @ unit)
                 if reach > 0:
                     columns.append(sign * slope_y[i] / reach)
                     charges.append(gap[i] / reach)
                     owners.append((int(own[i]), sign / reach))
+                    unsigned.append(bool(limit.equal[i]))
     free = np.ones(2 * nx + 1, bool)
     free[:nx] = low[places["terminal"]] < high[places["terminal"]]
     free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
     free[-1] = form.horizon_is_free
     matrix = (np.array(columns).reshape(len(columns), 2 * nx + 1) * unit).T[free]
-    found = nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges)) * cost
+    found = (
+        nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges), np.array(unsigned, bool)) * cost
+    )
     left = np.zeros(2 * nx + 1)
     left[free] = np.abs((target * unit)[free] - matrix @ found)
     multipliers = np.zeros(len(index))

@@ -112,7 +112,8 @@ def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
     whole[..., nz:] /= np.repeat(metric, nu, axis=1)[:, None, None, :]
     step = np.einsum("k,j,kjab,kjbc->kac", h, b, rate, whole)
     step[:, :, :nz] += np.eye(nz)
-    stage = np.einsum("k,j,kjac,kjab,kjbd->kcd", h, b, whole, accessory.hessian.reshape(n, q, nz + nu, nz + nu), whole)
+    weighted = (h[:, None] * b)[:, :, None, None] * accessory.hessian.reshape(n, q, nz + nu, nz + nu)
+    stage = (np.swapaxes(whole, 2, 3) @ weighted @ whole).sum(axis=1)
 
     for k, i in zip(*np.nonzero(accessory.moved), strict=True):
         area = np.zeros(nz + q * nu)
@@ -128,6 +129,7 @@ def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
     for k in reversed(range(n)):
         joined = stage[k] + step[k].T @ cost @ step[k]
         own = [accessory.rows[k * q + j] @ whole[k, j] for j in range(q)]
+        own += [accessory.node_rows[k] @ np.eye(nz, step.shape[2]), accessory.node_rows[k + 1] @ step[k]]
         if weak:
             own += [accessory.weak[k * q + j] @ whole[k, j] for j in range(q)]
         for i in np.flatnonzero(accessory.moved[k]):  # a switch moves: one variation, of the mean

@@ -63,7 +63,7 @@ def _moves(along: Linearisation, holding: np.ndarray) -> np.ndarray:
     form, (low, high), places = along.form, along.bounds, along.form.bounds.places
     (n, q), nx = along.shape, form.nx
     given = low[places["terminal"]] == high[places["terminal"]]
-    back = Backwards(along, holding)
+    back = Backwards(along, holding, np.zeros(len(holding), bool))
     end = np.eye(nx)[:, given]
     points = np.zeros((n, q, nx, end.shape[1]))
     for k in reversed(range(n)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem
@@ -24,7 +25,7 @@ CONTROLS_KNOWN = 1e-3
 
 DEGENERATE = 1e-5
 """Share of the cost from which on it is worth looking for costates that fit the plan better than those reported."""
-ROUNDING = 1e-12
+ROUNDING = 1e-10
 """Share of what the controls themselves would cost, below which costates are rounding."""
 
 
@@ -58,7 +59,12 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
     size = abs(solution.cost) or along.slope_size or 1.0
-    first = adjoint(along, size)
+    curved = _curved(along)
+    first = adjoint(along, curved, size)
+    if first.lumps.any():
+        spread_out = adjoint(along, curved, size, first.lumps)
+        first = min(first, spread_out, key=lambda found: _told(along, found, curved))
+        along.follow((first.standing != 0).reshape(*along.shape, -1).any(axis=1))
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
     cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
@@ -66,7 +72,7 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     total = lost(along, first.costate, first.holding, accessory.curved)
     if accessory.flat.any() and total.sum() > DEGENERATE * cost:
         costate = better_costates(along, first.costate, first.holding, accessory.flat)
-        less = lost(along, costate, holders(along, costate), accessory.curved)
+        less = lost(along, costate, holders(along, costate, accessory.curved)[0], accessory.curved)
         total = min(total, less, key=np.sum)
     total = np.maximum(total, 0.0) + first.charge
     total[0] += first.ends.charge
@@ -81,6 +87,25 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
         hamiltonian(form, solution, p),
         second,
     )
+
+
+def _told(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
+    """What a plan loses and errs by with these multipliers, in units of cost."""
+    assert curved is not None
+    won = lost(along, found.costate, found.holding, curved).sum() + found.charge.sum() + found.ends.charge
+    return float(won + found.error.sum())
+
+
+def _curved(along: Linearisation) -> np.ndarray | None:
+    """T H_uu at the points but for its path constraints, (M, nu, nu), where what pushes at single points needs it."""
+    form = along.form
+    single = along.nodal and (along.mixed.size > 0 or along.node_stand.near.any())
+    if form.path.equality[along.mixed].all() and not single:
+        return None
+    lam = form.sym("lam", form.nx)
+    total = along.scaled[0] + ca.dot(lam, along.scaled[1])
+    (curved,) = form.sampled([ca.hessian(total, form.u)[0]], *along.here, (lam, along.costate))
+    return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
@@ -98,7 +123,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         1.0,
         along.t,
         np.full(m, np.inf),
-        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, ends),
+        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, np.zeros((n + 1, form.nx)), ends),
         values,
         curved,
     )

@@ -16,10 +16,24 @@ from ocp.audit.linearisation import Linearisation
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, stack
 
-__all__ = ["FLAT", "Hamiltonian", "balance", "groups", "hamiltonian", "holders", "lost", "reduced_slope", "slope"]
+__all__ = [
+    "DEPENDENT",
+    "FLAT",
+    "Hamiltonian",
+    "balance",
+    "groups",
+    "hamiltonian",
+    "holders",
+    "lost",
+    "nonnegative",
+    "reduced_slope",
+    "slope",
+]
 
 DEPENDENT = 1e-9
 """Singular values below this share of the largest are none."""
+STEEP = 1e-6
+"""Slope of the Hamiltonian, of the largest, above which it is worth looking for what holds it across a gap."""
 FLAT = 1e-7
 """Curvature, relative to the largest of the plan, below which the cost counts as not curved."""
 
@@ -54,14 +68,50 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
 
 
-def holders(along: Linearisation, costate: np.ndarray) -> np.ndarray:
-    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points. Shape (M, nu + r).
+def holders(
+    along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points.
 
-    Those that make T H most nearly stationary, controls in units of their sizes.
+    Those that make T H most nearly stationary, controls in units of their sizes. What a plan meets at single points of
+    an interval only, as with held controls, pushes over the gap elsewhere, where that loses less than the slope does.
+
+    Args:
+        along: The plan. costate: (M, nx).
+        curved: T H_uu, (M, nu, nu); None where it is not known yet, and nothing pushes over a gap.
+
+    Returns:
+        multipliers: Per unit of s. Shape (M, nu + r + a).
+        across: At which points some push over a gap. Shape (M,), bool.
     """
-    unit = along.sizes.control
-    hold = along.hold
-    return balance(slope(along, costate) * unit, along.hold_u * unit, hold.lower, hold.upper)
+    unit, hold, mixed = along.sizes.control, along.hold, along.mixed.size
+    gradient, directions = slope(along, costate) * unit, along.hold_u * unit
+    found = balance(gradient, directions, hold.lower, hold.upper)
+    across = np.zeros(len(found), bool)
+    if curved is None or not mixed:
+        return found, across
+    left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
+    steep = float(np.abs(gradient).max())
+    for k in np.flatnonzero(left > STEEP * steep):
+        bend = curved[k] * unit * unit[:, None]
+        values, vectors = np.linalg.eigh((bend + bend.T) / 2)
+        root = vectors / np.sqrt(np.maximum(values, np.abs(gradient[k]).max() * FLAT + FLAT * np.abs(values).max()))
+        sides = []
+        for i in range(len(found[k])):
+            both = hold.lower[k, i] and hold.upper[k, i]
+            if both:
+                sides.append((i, 1.0, 0.0, True))
+            elif i < len(unit) + mixed:
+                sides += [(i, 1.0, hold.above[k, i], False), (i, -1.0, hold.below[k, i], False)]
+        sides = [side for side in sides if np.isfinite(side[2]) and np.abs(directions[k, side[0]]).max() > 0]
+        which, sign, gap, free = (np.array(part) for part in zip(*sides, strict=True))
+        rows = directions[k, which] * sign[:, None]
+        size = np.abs(rows).max(axis=1)
+        pushed = nonnegative((rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool))
+        found[k] = 0.0
+        np.add.at(found[k], which, sign * pushed / size)
+        across[k] = True
+    return found, across
 
 
 def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
@@ -74,28 +124,20 @@ def balance(gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upp
     """Multipliers (M, m) of limits that make gradient (M, n) + directions (M, m, n)' multipliers least at each point.
 
     At least zero where only ``upper`` (M, m) may push, at most zero where only ``lower`` may, free where both may.
-    Wrongly signed ones are dropped one by one, the worst first.
     """
     found = np.zeros(lower.shape)
     active, both = lower | upper, lower & upper
-    left = np.flatnonzero(active.any(axis=1))
-    while left.size:
-        wrong = []
-        for pattern, members in groups(active[left]):
-            mine = left[members]
-            columns = directions[mine][:, pattern].transpose(0, 2, 1)
-            multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[mine])
-            against = np.where(both[mine][:, pattern], 0.0, multipliers)
-            against = np.where(upper[mine][:, pattern], -against, against)
-            worst = np.argmax(against, axis=1)
-            rows = np.arange(len(mine))
-            bad = against[rows, worst] > 1e-12 * (1.0 + np.abs(multipliers).max(axis=1))
-            good = mine[~bad]
-            found[np.ix_(good, np.flatnonzero(pattern))] = multipliers[~bad]
-            active[mine[bad], np.flatnonzero(pattern)[worst[bad]]] = False
-            wrong.append(mine[bad])
-        left = np.concatenate(wrong)
-        left = left[active[left].any(axis=1)]
+    for pattern, members in groups(active):
+        if not pattern.any():
+            continue
+        columns = directions[members][:, pattern].transpose(0, 2, 1)
+        multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[members])
+        free, sign = both[members][:, pattern], np.where(upper[members][:, pattern], 1.0, -1.0)
+        wrong = (sign * multipliers < 0) & ~free
+        for k in np.flatnonzero(wrong.any(axis=1)):  # the signs hold some of them back
+            nothing = np.zeros(len(sign[k]))
+            multipliers[k] = sign[k] * nonnegative(columns[k] * sign[k], -gradient[members[k]], nothing, free[k])
+        found[np.ix_(members, np.flatnonzero(pattern))] = multipliers
     return found
 
 
@@ -109,6 +151,43 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
     parts = np.abs(along.cost_y[:, of:]) + np.einsum("kiu,ki->ku", np.abs(along.rate_y[:, :, of:]), np.abs(costate))
     size = float((parts * unit).max(initial=0.0)) or 1.0
     return np.asarray(np.abs(left).max(axis=1, initial=0.0) / size)
+
+
+def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The y (m,) of least |matrix y - target|^2 / 2 + price . y, at least zero but where it is ``free`` (m,), bool.
+
+    By active sets (Lawson, Hanson 1974, chapter 23); of the free ones the least that do it.
+    """
+    y = np.zeros(matrix.shape[1])
+    bound = ~free
+    if free.any():
+        inverse = np.linalg.pinv(matrix[:, free], rcond=DEPENDENT)
+        rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
+        left = target - matrix[:, free] @ (inverse @ target)
+        y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
+        y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
+        return y
+    normal, right = matrix.T @ matrix, matrix.T @ target - price
+    passive = np.zeros(len(y), bool)
+    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
+    for _ in range(3 * len(y)):
+        pull = np.where(passive, -np.inf, right - normal @ y)
+        if pull.max() <= small:
+            break
+        passive[np.argmax(pull)] = True
+        while True:
+            index = np.flatnonzero(passive)
+            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
+            falling = best <= 0
+            if not falling.any():
+                y[index] = best
+                break
+            ratio = y[index][falling] / np.maximum(y[index][falling] - best[falling], np.finfo(float).tiny)
+            y[index] += float(np.clip(ratio.min(), 0.0, 1.0)) * (best - y[index])
+            drop = index[falling & (y[index] <= 1e-15 * np.abs(y).max())]
+            drop = drop if drop.size else index[falling][:1]
+            y[drop], passive[drop] = 0.0, False
+    return y
 
 
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -144,7 +223,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
     size = np.abs(along.hold_u * unit).max(axis=2)
     pushes = (np.abs(multipliers) * size > FLAT * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
-    fixed = pushes.copy()
+    fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
     best = np.zeros(len(won))
     while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
         blocked = fixed.copy()

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ocp.console import Interrupt, Progress, interruptible
+from ocp.console import Interrupt, Progress, interruptible, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, checked_choice
 
-__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
+__all__ = ["ADVICE", "ROUNDING", "SOLVERS", "Outcome", "build_solver", "call_solver", "largest_number_of_iterations"]
 
 IPOPT = {
     "tol": 1e-10,
@@ -31,7 +32,9 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-SOLVERS = ("ipopt", "fatrop")
+SLEQP = {"print_level": 0, "max_iter": 1000}
+DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp": SLEQP}
+SOLVERS = tuple(DEFAULTS)
 
 ADVICE = {
     "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
@@ -54,7 +57,11 @@ SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word."""
+    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word.
+
+    ``regularised``: whether the cost did not curve upwards where it ended, as far as the solver saw: its last step was
+    made with a Hessian that it had changed, or it made none.
+    """
 
     variables: np.ndarray
     cost: float
@@ -64,6 +71,7 @@ class Outcome:
     status: str
     iterations: int
     seconds: float
+    regularised: bool = False
 
 
 def build_solver(
@@ -77,15 +85,18 @@ def build_solver(
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-    defaults = IPOPT if solver == "ipopt" else FATROP
-    own = {**defaults, **options}
-    if not own["print_level"] and "max_iter" in own:
+    own = {**DEFAULTS[solver], **options}
+    if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
     progress, nlp = None, program.nlp
     if solver == "ipopt":
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
+    elif solver == "sleqp":
+        # like fatrop's, its interface looks for ready-made derivatives in its cache
+        settings["cache"] = {"nlp_grad_f": program.gradient, "nlp_jac_g": program.jacobian}
+        settings |= {key: own.pop(key) for key in SLEQP if key in own}  # its interface asks for these outside
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
@@ -103,6 +114,12 @@ def build_solver(
     except RuntimeError as error:
         words = f"{solver} does not take these options {options!r}: {last_line(error)}"
         raise ProblemError(words, name="options", value=options) from error
+
+
+def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
+    """After how many iterations a solver gives up, by its options; 0 where these make no sense."""
+    most = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
+    return int(most) if isinstance(most, int | float | np.number) else 0
 
 
 def fatrop_functions(program: Program) -> dict[str, Any]:
@@ -143,8 +160,9 @@ def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.
     if progress is not None:
         progress.open(arguments["lbg"], arguments["ubg"])
     try:
-        with interruptible(asked):
-            result = solver(**(arguments if progress is not None else tightened(arguments)))
+        # SLEQP tells of each subproblem that it gives up
+        with interruptible(asked), nullcontext() if progress is not None else quiet():
+            result = solver(**(tightened(arguments) if solver.class_name() == "FatropInterface" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
@@ -177,7 +195,14 @@ def call_solver(solver: Any, progress: Progress | None, arguments: dict[str, np.
         f"{word}: {advice}" if advice else word,
         int(stats.get("iter_count", 0)),
         time.monotonic() - began,
+        regularised(stats),
     )
+
+
+def regularised(stats: dict[str, Any]) -> bool:
+    """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
+    sizes = stats.get("iterations", {}).get("regularization_size", ())
+    return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:

@@ -48,6 +48,8 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         (lambda: checked_number(-1, "a", "b", positive=True, unit="m"), "a: b -1.0 m is not positive", "b", 0.0),
         (lambda: one_for_each([1, 2], 3, "a", "b", "joints"), "or one for each of the 3 joints", "b", (3,)),
         (lambda: checked_rotation(2 * np.eye(3), "a", "b"), "is not a rotation matrix", "b", None),
+        (lambda: checked_rotation(np.diag([1, 1, -1]), "a", "b"), "is not a rotation matrix", "b", None),
+        (lambda: checked_rotation(np.eye(3)[[1, 0, 2]], "a", "b"), "is not a rotation matrix", "b", None),
         (lambda: checked_choice("c", "de", "a", "b"), r"'c' is unknown; use one of \['d', 'e'\]", "b", ("d", "e")),
     ],
 )  # fmt: skip

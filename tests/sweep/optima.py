@@ -45,14 +45,13 @@ class Known:
 def miss(known: Known, plan: Solution, places: int = 12) -> float:
     """How far a plan misses what is asked, as a share of the spread of each thing: by Runge-Kutta steps of its own.
 
-    The greatest of the defects of each interval, from the plan's own state at its start, the ends and the bounds.
+    The greatest of the defects within each interval from the plan's own state at its start, at the ends, of bounds.
     """
     curve = plan.control_interpolant
     mesh, n = curve.breaks * plan.horizon, len(curve.breaks) - 1
-    # states in the order of the family
-    columns = {name: values for name, values in plan.states.items()}
-    order, offset = {}, 0
-    for name, values in columns.items():
+    order: dict[str, list[int]] = {}  # of the states of the family
+    offset = 0
+    for name, values in plan.states.items():
         order[name] = list(range(offset, offset + values.shape[1]))
         offset += values.shape[1]
     index = [i for name in known.states for i in order[name]]
@@ -71,16 +70,18 @@ def miss(known: Known, plan: Solution, places: int = 12) -> float:
             k3 = known.rate(t + step / 2, state + step / 2 * k2, u[1])
             k4 = known.rate(t + step, state + step * k3, u[2])
             state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        after = plan.state_interpolant(np.array([curve.breaks[k + 1] - 1e-13]))[0, index]
-        worst = max(worst, float((np.abs(after - state) / spread).max()))
+            here = curve.breaks[k] + (curve.breaks[k + 1] - curve.breaks[k]) * (j + 1) / places - 1e-13
+            defect = np.abs(plan.state_interpolant(np.array([here]))[0, index] - state)
+            worst = max(worst, float((defect / spread).max()))
     for given, found in ((known.start, x[0]), (known.end, x[-1])):
         held = np.isfinite(given)
         worst = max(worst, float((np.abs(found - given) / spread)[held].max(initial=0.0)))
     piece, place = np.repeat(np.arange(n), 21), np.tile(np.linspace(0, 1, 21), n)
-    u = curve.within(piece, place)
+    pushes = curve.within(piece, place)
     for name, (low, high) in known.bounds.items():
-        values = x[:, known.states.index(name)] if name in known.states else u
-        worst = max(worst, float(np.maximum(values - high, low - values).max() / (high - low)))
+        values = x[:, known.states.index(name)] if name in known.states else pushes
+        size = max(abs(bound) for bound in (low, high) if np.isfinite(bound))
+        worst = max(worst, float(np.maximum(values - high, low - values).max() / size))
     return worst
 
 
@@ -148,7 +149,7 @@ def breakwell(seed: int) -> Known:
     problem.minimize(u**2 / 2)
     ends = np.array([0.0, speed]), np.array([0.0, -speed])
     rate: Rate = lambda t, x, u: np.array([x[1], u[0]])  # noqa: E731
-    return Known(problem, rate, ("q", "v"), *ends, lambda _: cost, {"q": (-10 * ceiling, ceiling)})
+    return Known(problem, rate, ("q", "v"), *ends, lambda _: cost, {"q": (-np.inf, ceiling)})
 
 
 def pendulum(seed: int) -> Known:
@@ -170,7 +171,9 @@ def pendulum(seed: int) -> Known:
     problem.minimize(u**2)
 
     def canonical(t: Array, y: Array) -> Array:
-        return np.array([y[1], -stiff * np.sin(y[0]) - drag * y[1] - y[3] / 2, stiff * np.cos(y[0]) * y[3], -y[2] + drag * y[3]])
+        return np.array(
+            [y[1], -stiff * np.sin(y[0]) - drag * y[1] - y[3] / 2, stiff * np.cos(y[0]) * y[3], -y[2] + drag * y[3]]
+        )
 
     def ends_met(first: Array, last: Array) -> Array:
         return np.array([first[0] - ends[0], first[1], last[0] - ends[1], last[1]])

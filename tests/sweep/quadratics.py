@@ -63,15 +63,14 @@ class Quadratic:
         n = len(self.a)
         step = expm(-self.matrix * until / STEPS)
         frame = np.vstack([np.zeros((n, n)), np.eye(n)] if self.fixed else [np.eye(n), self.f])
-        first, total, before = np.zeros(n), 0.0, None
+        first, total, before = np.zeros(n), 0.0, np.eye(n, dtype=complex)
         for k in range(STEPS + 1):
             x, y = frame[:n], frame[n:]
             unitary = (y + 1j * x) @ np.linalg.inv(y - 1j * x)
-            if before is None:
-                first = np.zeros(n) if self.fixed else np.angle(np.linalg.eigvals(unitary)) % (2 * np.pi)
-            else:
-                turn = float(np.angle(np.linalg.det(unitary @ before.conj().T)))
-                total += turn
+            if k:
+                total += float(np.angle(np.linalg.det(unitary @ before.conj().T)))
+            elif not self.fixed:
+                first = np.angle(np.linalg.eigvals(unitary)) % (2 * np.pi)
             before = unitary
             if k < STEPS:
                 frame = np.linalg.qr(step @ frame)[0]
@@ -92,10 +91,12 @@ class Quadratic:
         n, m = self.b.shape
         problem = Problem("quadratic")
         x = problem.state("x", n, initial=self.start, terminal=np.zeros(n) if self.fixed else None, guess=0.0)
-        limits = {} if self.bound == np.inf else {"lower": -self.bound, "upper": self.bound}
+        limits: dict[str, Any] = {} if self.bound == np.inf else {"lower": -self.bound, "upper": self.bound}
         u = problem.control("u", m, guess=0.0, **limits)
         rate = ca.mtimes(self.a, x) + ca.mtimes(self.b, u)
-        running = ca.bilin(ca.DM(self.q), x, x) / 2 + ca.bilin(ca.DM(self.r), u, u) / 2 + ca.dot(x, ca.mtimes(self.s, u))
+        running = (
+            ca.bilin(ca.DM(self.q), x, x) / 2 + ca.bilin(ca.DM(self.r), u, u) / 2 + ca.dot(x, ca.mtimes(self.s, u))
+        )
         if self.push is not None:
             w = problem.control("w", lower=-1.0, upper=1.0, guess=0.9)
             rate, running = rate + ca.DM(self.push) * w, running - self.pull * w + w**2 / 2
