@@ -24,6 +24,7 @@ __all__ = [
     "checked_mapping",
     "checked_nonnegative",
     "checked_positive",
+    "checked_text",
     "unknown_name",
 ]
 
@@ -130,6 +131,13 @@ def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
         kind = "positive and finite" if below == np.inf else f"between 0 and {below:g}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
     return value  # type: ignore[return-value]
+
+
+def checked_text(what: str, value: Any) -> str:
+    """``value``, or ProblemError unless it is a string; an empty one will do."""
+    if not isinstance(value, str):
+        raise ProblemError(f"{what} must be a string, not {value!r}", name=_last(what), value=value)
+    return value
 
 
 def checked_mapping(what: str, values: Any) -> dict[str, Any]:

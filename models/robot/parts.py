@@ -200,6 +200,16 @@ class Joint:
         """Whether the joint is not fixed; one that follows another moves with it."""
         return self.kind != "fixed"
 
+    @property
+    def unit(self) -> str:
+        """Of its position: "m" of a prismatic joint, "rad" of any other."""
+        return "m" if self.kind == "prismatic" else "rad"
+
+    @property
+    def effort_unit(self) -> str:
+        """Of what drives it: "N" of a prismatic joint, "N m" of any other."""
+        return "N" if self.kind == "prismatic" else "N m"
+
     def placed(self, position: float) -> tuple[Array, Array]:
         """Placement of the child link in the parent link at a joint position (rad or m): rotation, translation."""
         turn, shift = self.rotation, self.translation

@@ -173,6 +173,15 @@ class Robot:
         """Names of the entries of the joint vector."""
         return tuple(joint.name for joint in self.moving_joints)
 
+    def unit(self, per: str = "") -> str:
+        """Unit of the joint vector, or with `per` "/s" of its rates: "rad", "m", or both, "rad, m", in its order."""
+        return ", ".join(dict.fromkeys(joint.unit + per for joint in self.moving_joints))
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the efforts of the joint vector, likewise: "N m", "N" or "N m, N"."""
+        return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
+
     @property
     def dof(self) -> int:
         """Length of the joint vector."""
@@ -267,8 +276,7 @@ class Robot:
 
 
 def _limits(joint: Joint) -> str:
-    unit, push = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
-    parts: list[str] = [joint.kind]
+    unit, parts = joint.unit, [str(joint.kind)]
     if (tie := joint.mimic) is not None:
         parts.append(f"{tie.multiplier:g} x {tie.joint}" + (f" {tie.offset:+g} {unit}" if tie.offset else ""))
     if np.isfinite([joint.lower, joint.upper]).any() and joint.moves:
@@ -276,7 +284,7 @@ def _limits(joint: Joint) -> str:
     if np.isfinite(joint.velocity) and joint.moves:
         parts.append(f"{joint.velocity:g} {unit}/s")
     if np.isfinite(joint.effort) and joint.moves:
-        parts.append(f"{joint.effort:g} {push}")
+        parts.append(f"{joint.effort:g} {joint.effort_unit}")
     return ", ".join(parts)
 
 

@@ -165,9 +165,11 @@ def roll_problem(
     start, speed = Samples(t, first[:, None]), Samples(t, np.gradient(first, t)[:, None])
 
     problem = Problem("roll plan", symbols=symbols)
-    roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=start)
-    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=speed)
-    pull = problem.control("acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0)
+    roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=start, unit="rad")
+    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=speed, unit="rad/s")
+    pull = problem.control(
+        "acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0, unit="rad/s^2"
+    )
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, pull)
@@ -179,9 +181,10 @@ def roll_problem(
 
     problem.path("reach", along("reach", reached), -LARGEST_SINE, LARGEST_SINE)
     if held:
-        problem.path("limits", along("joints", limited), rig.lower[held], rig.upper[held])
+        unit = ", ".join(dict.fromkeys("rad" if k else "m" for k in held))  # the first joint slides
+        problem.path("limits", along("joints", limited), rig.lower[held], rig.upper[held], unit=unit)
     if surroundings is not None and np.isfinite(clearance):
-        problem.path("clearance", along("gap", gap), clearance)
+        problem.path("clearance", along("gap", gap), clearance, unit="m")
     running = along("index", index + near)
     problem.minimize(running=running + rate_weight * rate**2 + acceleration_weight * pull**2)
     return problem

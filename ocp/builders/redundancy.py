@@ -147,10 +147,11 @@ def minimum_velocity_problem(
     problem = Problem(f"minimum velocity, {formulation.replace('_', ' ')}", symbols=symbols)
     base: Any = np.zeros(0)
     if machine.base_size:
-        base = problem.state("base", initial=place, guess=_guess(local, "base"))
+        unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
+        base = problem.state("base", initial=place, guess=_guess(local, "base"), unit=unit)
     ends = {} if free_start else {"initial": start, "terminal": start if cyclic else None}
     joints = problem.state(
-        "joints", machine.joint_size, **ends, lower=lower, upper=upper, guess=_guess(local, "joints")
+        "joints", machine.joint_size, **ends, lower=lower, upper=upper, guess=_guess(local, "joints"), unit=robot.unit()
     )
     problem.horizon(duration)
     try:
@@ -160,19 +161,21 @@ def minimum_velocity_problem(
         raise ProblemError(message, name="symbols", value=symbols, limit=ca.MX) from error
     closure: Any = ca.DM(equations.size, 1)
     if cyclic and (directions := equations.closing(place, start)).shape[1]:
-        slack = problem.state("closure", directions.shape[1], guess=0.0)
+        slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
         problem.dynamics(slack, np.zeros(directions.shape[1]))
         closure = ca.mtimes(ca.DM(directions), slack)
 
     running: Any = 0
+    per_second = robot.unit("/s")
     if formulation == "rates":
-        rates = problem.control("rates", lower=-speed, upper=speed, guess=_guess(local, "joint_rates"))
+        rates = problem.control("rates", lower=-speed, upper=speed, guess=_guess(local, "joint_rates"), unit=per_second)
         base_rate = machine.base_rate(base, joints, rates)
         residual = equations.residual(base, joints, rates, targets)
         base_rate, residual = ca.cse([base_rate, residual])  # both contain the kinematics
-        problem.path("task", residual - closure, lower=0, upper=0)
+        problem.path("task", residual - closure, lower=0, upper=0, unit=equations.unit())
     else:
-        null = problem.control("null", machine.joint_size, guess=0.0)  # local motion has no part there
+        # local motion has no part there
+        null = problem.control("null", machine.joint_size, guess=0.0, unit=per_second)
         wanted = equations.right(base, joints, targets) + closure
         root = np.sqrt(heavy)  # in the scaled rates root x2' the weights are one
         scaled = ca.mtimes(equations.jacobian(base, joints), ca.diag(1 / ca.DM(root)))
@@ -182,14 +185,14 @@ def minimum_velocity_problem(
         base_rate, rates, idle = ca.cse([machine.base_rate(base, joints, rates), rates, idle])
         running += ca.dot(idle, idle) / 2
         if np.isfinite(speed).any():
-            problem.path("velocity limits", rates, lower=-speed, upper=speed)
+            problem.path("velocity limits", rates, lower=-speed, upper=speed, unit=per_second)
     if machine.base_size:
         problem.dynamics(base, base_rate)
     problem.dynamics(joints, rates)
     if free_start:
         _start_conditions(problem, equations, place, start, base, joints)
         if cyclic:
-            problem.end("cyclic", joints - problem.at_start(joints), 0, 0)
+            problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=robot.unit())
     problem.minimize(running=running + ca.dot(rates, ca.DM(heavy) * rates) / 2)
     return problem
 
@@ -225,7 +228,8 @@ def _start_conditions(
     at_zero = equations.target_function()(0.0)
     pose = np.repeat([part.task.is_pose for part in equations.bound], [part.task.size for part in equations.bound])
     error = equations.error(base, joints, at_zero)[np.flatnonzero(pose).tolist()]
-    problem.start("start pose", ca.vertcat(error, equations.holding(base, joints, place, start)), 0, 0)
+    condition = ca.vertcat(error, equations.holding(base, joints, place, start))
+    problem.start("start pose", condition, 0, 0, unit=equations.unit("", ""))
 
 
 def _guess(local: LocalSolution, what: str) -> Samples:

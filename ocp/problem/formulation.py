@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, unknown_name
-from ocp.problem.problem import Constraint, Problem, Variable, checked_problem
+from ocp.problem.problem import Constraint, Declarations, Problem, Variable, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "at_samples"]
@@ -99,6 +99,8 @@ class Formulation:
         path, start, end: Constraint rows.
         states, controls, parameters: Slices of the vectors by name. state_labels,
             control_labels: A name for every entry.
+        units: Of states, controls and constraints by name, as declared; empty where none is, or where a constraint
+            bears the name of a variable of another unit.
         bounds: The bound table.
         horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
@@ -119,6 +121,7 @@ class Formulation:
         self.controls = slices(declared.controls)
         self.parameters = slices(declared.parameters)
         self.state_labels, self.control_labels = labels(declared.states), labels(declared.controls)
+        self.units = units(declared)
         self.nx, self.nu, self.np = (total(s) for s in (self.states, self.controls, self.parameters))
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
         self.x0, self.u0 = sym("x0", self.nx), sym("u0", self.nu)
@@ -341,6 +344,15 @@ def slices(pool: dict[str, Variable]) -> dict[str, slice]:
 def labels(pool: dict[str, Any]) -> tuple[str, ...]:
     """A name for every entry: ``q`` alone, ``q[2]`` of several."""
     return tuple(f"{v.name}[{i}]" if v.size > 1 else v.name for v in pool.values() for i in range(v.size))
+
+
+def units(declared: Declarations) -> dict[str, str]:
+    """Of states, controls and constraints by name; a name that two bear in different units has none."""
+    found: dict[str, set[str]] = {}
+    for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end):
+        for name, item in pool.items():
+            found.setdefault(name, set()).update([item.unit] if item.unit else [])
+    return {name: next(iter(given)) if len(given) == 1 else "" for name, given in found.items()}
 
 
 def is_free(end: Any) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_count, unknown_name
+from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.values import (
     check_finite,
     check_horizon,
@@ -64,6 +64,7 @@ class Variable:
         lower, upper: Bounds, casadi expressions of parameters. Shape (n, 1).
         initial, terminal: Values at both ends, nan where an entry is free. Shape (n, 1). States only.
         guess: A value, a function of time, or None. States and controls only.
+        unit: For those who read it, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
     """
 
     name: str
@@ -73,6 +74,7 @@ class Variable:
     initial: Any = None
     terminal: Any = None
     guess: Guess = None
+    unit: str = ""
 
     @property
     def size(self) -> int:
@@ -80,7 +82,8 @@ class Variable:
 
     def __str__(self) -> str:
         low, high = _column_text(self.lower), _column_text(self.upper)
-        return f"{self.name} ({self.size})" + ("" if (low, high) == ("-inf", "inf") else f" in [{low}, {high}]")
+        bounds = "" if (low, high) == ("-inf", "inf") else f" in [{low}, {high}]"
+        return f"{self.name} ({self.size}){bounds} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -91,12 +94,14 @@ class Constraint:
         name: Its name, unique among the constraints of the problem.
         expression: Shape (m, 1).
         lower, upper: casadi expressions of parameters. Shape (m, 1).
+        unit: As of a variable.
     """
 
     name: str
     expression: Any
     lower: Any
     upper: Any
+    unit: str = ""
 
     @property
     def size(self) -> int:
@@ -104,7 +109,7 @@ class Constraint:
 
     def __str__(self) -> str:
         low, high = _column_text(self.lower), _column_text(self.upper)
-        return f"{self.name} ({self.size}): {low} <= {_short(self.expression)} <= {high}"
+        return f"{self.name} ({self.size}): {low} <= {_short(self.expression)} <= {high} {self.unit}".rstrip()
 
 
 @dataclass
@@ -169,6 +174,7 @@ class Problem:
         lower: Value = None,
         upper: Value = None,
         guess: Guess = None,
+        unit: str = "",
     ) -> Any:
         """Declare a state and return its symbol, shape (n, 1).
 
@@ -179,9 +185,10 @@ class Problem:
                 for every entry. May be expressions of parameters.
             lower, upper: Bounds at every time; may be expressions of parameters.
             guess: A value, or a function ``time -> value``.
+            unit: Shown beside its values, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
         """
         what, given = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
-        variable = self._variable("state", name, size, given, guess)
+        variable = self._variable("state", name, size, given, guess, unit)
         low, high = constant(variable.lower), constant(variable.upper)
         ends = {label: self._column(f"{what}: {label}", given[label], variable.size, np.nan) for label in ENDS}
         for label, value in ends.items():
@@ -191,10 +198,18 @@ class Problem:
 
     @_about_its_name
     def control(
-        self, name: str, size: int | None = None, *, lower: Value = None, upper: Value = None, guess: Guess = None
+        self,
+        name: str,
+        size: int | None = None,
+        *,
+        lower: Value = None,
+        upper: Value = None,
+        guess: Guess = None,
+        unit: str = "",
     ) -> Any:
         """Declare a control and return its symbol, shape (n, 1). Arguments as for :meth:`state`."""
-        self.declared.controls[name] = self._variable("control", name, size, {"lower": lower, "upper": upper}, guess)
+        bounds = {"lower": lower, "upper": upper}
+        self.declared.controls[name] = self._variable("control", name, size, bounds, guess, unit)
         return self.declared.controls[name].symbol
 
     @_about_its_name
@@ -237,19 +252,19 @@ class Problem:
         self.declared.dynamics[found.name] = expression
 
     @_about_its_name
-    def path(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+    def path(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at every time; equal bounds make an equality."""
-        self._constrain("path", name, expression, lower, upper)
+        self._constrain("path", name, expression, lower, upper, unit)
 
     @_about_its_name
-    def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+    def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at the start."""
-        self._constrain("start", name, expression, lower, upper)
+        self._constrain("start", name, expression, lower, upper, unit)
 
     @_about_its_name
-    def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None) -> None:
+    def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
-        self._constrain("end", name, expression, lower, upper, list(self.declared.at_start.values()))
+        self._constrain("end", name, expression, lower, upper, unit, list(self.declared.at_start.values()))
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
@@ -308,8 +323,11 @@ class Problem:
 
     # ---- checks ----------------------------------------------------------------------------------------------
 
-    def _variable(self, kind: str, name: str, size: int | None, given: dict[str, Value], guess: Guess) -> Variable:
+    def _variable(
+        self, kind: str, name: str, size: int | None, given: dict[str, Value], guess: Guess, unit: str
+    ) -> Variable:
         what = f"{kind} {name!r}"
+        checked_text(f"{what}: unit", unit)
         size = self._size(what, size, {**given, "guess": guess})
         symbol = self._symbol(kind, name, size)
         low, high = self._bounds(what, size, given["lower"], given["upper"])
@@ -320,7 +338,7 @@ class Problem:
                 raise ProblemError(
                     f"{what}: guess has {array.size} entries, {size} expected", value=array.size, limit=size
                 )
-        return Variable(name, symbol, low, high, guess=guess)
+        return Variable(name, symbol, low, high, guess=guess, unit=unit)
 
     def _horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
         if self.declared.horizon is not None:
@@ -451,12 +469,13 @@ class Problem:
         )
 
     def _constrain(
-        self, kind: str, name: str, expression: Value, lower: Value, upper: Value, known: Sequence[Any] = ()
+        self, kind: str, name: str, expression: Value, lower: Value, upper: Value, unit: str, known: Sequence[Any] = ()
     ) -> None:
         """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""
         what = f"{kind} constraint {name!r}"
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} constraint: its name must be a non-empty string, not {name!r}")
+        checked_text(f"{what}: unit", unit)
         for other in (self.declared.path, self.declared.start, self.declared.end):
             if name in other:
                 raise ProblemError(f"{what}: a constraint of this name exists already")
@@ -466,7 +485,7 @@ class Problem:
         if lower is None and upper is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
-        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high)
+        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high, unit)
 
 
 def _column_text(value: Any) -> str:

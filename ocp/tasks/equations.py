@@ -69,6 +69,19 @@ class TaskEquations:
         """Which rows are of poses. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
+    def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
+        """Units of the rows, "rad/s, m/s" of `residual`: rad of turning and m of places, with what they are taken per.
+
+        Args:
+            pose, velocity: Of the rows of poses and of those of velocities: "" for `error`, "/s^2" for `acceleration`.
+        """
+        found: dict[str, None] = {}
+        for task in (part.task for part in self.bound):
+            tilt = ["rad"] if task.direction is not None else []
+            kinds = [*tilt, *("rad" if row in ANGULAR else "m" for row in task.chosen)]
+            found |= dict.fromkeys(kind + (pose if task.is_pose else velocity) for kind in kinds)
+        return ", ".join(found)
+
     def targets(self, time: Any, pace: Any = 1) -> Any:
         """What the tasks ask at a time, a column of expressions of the symbol `time`.
 

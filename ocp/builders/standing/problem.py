@@ -39,6 +39,7 @@ from models.machines.standing import External, Standing, center_of_pressure, wre
 from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
+from models.robot.robot import Robot
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative
 from ocp.problem.problem import Problem
@@ -193,7 +194,7 @@ def standing_problem(
     problem = Problem("standing plan", symbols=symbols)
     final = _horizon(problem, horizon)
     resting = None if end == "free" else _rest(equations, guess["joints"].values[-1], tip_level)
-    motion, jerks = _motion(problem, bounds, begin, start, resting, end_joints, control, guess)
+    motion, jerks = _motion(problem, machine.robot, bounds, begin, start, resting, end_joints, control, guess)
     joints, velocities, accelerations = motion
     progress: tuple[Any, ...] = (problem.time,)
     if along == "parameter":
@@ -202,11 +203,13 @@ def standing_problem(
     if tip_level == "acceleration":
         if start == "free":
             targets = equations.targets(*progress[:2])
-            problem.start("tip velocity", equations.residual(none, joints, velocities, targets), lower=0, upper=0)
+            residual = equations.residual(none, joints, velocities, targets)
+            problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
         gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
+        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     else:
         gap = equations.gap(none, joints, velocities, equations.targets(*progress[:2]))
-    problem.path("tip", gap, lower=0, upper=0)
+        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""))
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _ground(problem, machine, motion, wrenches, zmp, limits)
@@ -214,7 +217,7 @@ def standing_problem(
     if np.isfinite(effort).any():
         limited = np.flatnonzero(np.isfinite(effort)).tolist()
         torques = machine.joint_torques(*motion, wrenches)[limited]
-        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited])
+        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
 
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
@@ -234,6 +237,7 @@ def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:
 
 def _motion(
     problem: Problem,
+    robot: Robot,
     bounds: JointBounds,
     begin: Array,
     start: str,
@@ -245,18 +249,21 @@ def _motion(
     """The states and controls of the joints: (positions, velocities, accelerations), and jerks, nothing if not one."""
     n = len(begin)
     joints = problem.state(
-        "joints", n, initial=begin, terminal=end_joints, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"]
-    )
+        "joints", n, initial=begin, terminal=end_joints, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
+        unit=robot.unit(),
+    )  # fmt: skip
     fast, push, rough = bounds.velocity, bounds.acceleration, bounds.jerk
     velocities = problem.state(
         "velocities", n, initial=0.0 if start == "rest" else None, terminal=resting, lower=-fast, upper=fast,
-        guess=guess["velocities"],
+        guess=guess["velocities"], unit=robot.unit("/s"),
     )  # fmt: skip
     jerks: Any = ca.DM(0, 1)
     declare: Any = problem.state if control == "jerk" else problem.control
-    accelerations = declare("accelerations", n, lower=-push, upper=push, guess=guess["accelerations"])
+    accelerations = declare(
+        "accelerations", n, lower=-push, upper=push, guess=guess["accelerations"], unit=robot.unit("/s^2")
+    )
     if control == "jerk":
-        jerks = problem.control("jerks", n, lower=-rough, upper=rough)
+        jerks = problem.control("jerks", n, lower=-rough, upper=rough, unit=robot.unit("/s^3"))
         problem.dynamics(accelerations, jerks)
     problem.dynamics(joints, velocities)
     problem.dynamics(velocities, accelerations)
@@ -267,8 +274,8 @@ def _progress(problem: Problem, start: str, end: str, guess: Mapping[str, Any]) 
     """The path parameter, from 0 to 1, its rate and the rate of that."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if side == "rest" else None for side in (start, end))
-    rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last)
-    push = problem.control("path_acceleration", guess=guess["path_acceleration"])
+    rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last, unit="1/s")
+    push = problem.control("path_acceleration", guess=guess["path_acceleration"], unit="1/s^2")
     problem.dynamics(at, rate)
     problem.dynamics(rate, push)
     return at, rate, push
@@ -316,7 +323,7 @@ def _ground(
     """The path constraints on what the ground bears."""
     reaction = machine.ground_reaction(*motion, wrenches)
     force = reaction[3:6]
-    problem.path("vertical force", force[2], lower=limits.least_force(machine))
+    problem.path("vertical force", force[2], lower=limits.least_force(machine), unit="N")
     if np.isfinite(limits.friction):
         room = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
         problem.path("friction", room, lower=0)
@@ -324,10 +331,10 @@ def _ground(
     if isinstance(zmp, IndexAtLeast):
         low, high = zmp.region(machine)
         rows = index_rows(machine, zmp, point, bool(wrenches))
-        problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows])
+        problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows], unit="m")
     elif isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
-        problem.path("zero moment point", gap, lower=0, upper=0)
+        problem.path("zero moment point", gap, lower=0, upper=0, unit="m")
     inside = foot_rows(machine, zmp, point, bool(wrenches))
     if inside.numel():
-        problem.path("zero moment point" if isinstance(zmp, InFoot) else "foot", inside, lower=0)
+        problem.path("zero moment point" if isinstance(zmp, InFoot) else "foot", inside, lower=0, unit="m")
