@@ -36,8 +36,15 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "axis": ("xyz",),
     "mass": ("value",),
     "inertia": MOMENTS,
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "mesh": ("filename", "scale"),
 }
 """Elements in which a misspelt attribute would go unseen, and the attributes that they have."""
+MISSPELT = 0.8
+"""Likeness to an attribute that is given too, from which another one is that, misspelt; `iyx` beside `ixy` is not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,19 +324,20 @@ def _unread(owner: ElementTree.Element) -> list[str]:
     """Attributes below a link or a joint that are none of URDF's, where one is lacking that they may stand for.
 
     Beside all of URDF's they are an extension, and passed over as unknown elements are. ModelError for an attribute
-    that looks like one that is lacking.
+    that looks like one that is lacking, or nearly is another one.
     """
     found = []
-    parts = [part for tag in ("inertial", "collision") for part in owner.findall(tag)]
+    parts = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
     for element in (each for part in (owner, *parts) for each in part):
         known = ATTRIBUTES.get(element.tag, ())
         lacking = [word for word in known if word not in element.attrib]
-        for key in [key for key in element.attrib if lacking and key not in known and "}" not in key]:
+        for key in [key for key in element.attrib if known and key not in known and "}" not in key]:
             where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
-            if near := get_close_matches(key.casefold(), lacking, n=1):
+            word = key.casefold()
+            if near := get_close_matches(word, lacking, 1) or get_close_matches(word, known, 1, MISSPELT):
                 message = f"{where} is no attribute of URDF; did you mean {near[0]!r}?"
                 raise ModelError(message, name=key, value=element.get(key), limit=known)
-            found.append(where)
+            found += [where] if lacking else []
     return found
 
 

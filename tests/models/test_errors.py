@@ -32,7 +32,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
     assert checked_array(2.0, ("times",), "motion", "t").tolist() == [2.0]
     assert np.isnan(checked_array([np.nan, 1], (2,), "a", "b", nan=True)[0])
     assert one_for_each(0.5, 3, "path", "speed", "segments").tolist() == [0.5] * 3
-    assert checked_number("1e-3", "rig", "length", positive=True, unit="m") == 1e-3
+    assert checked_number(1e-3, "rig", "length", positive=True, unit="m") == 1e-3
     assert checked_choice("left", ("left", "right"), "scara", "elbow") == "left"
 
 
