@@ -15,6 +15,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
+MOST = 100_000
+"""Of what is counted: more than these take longer than anybody waits."""
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
@@ -113,11 +115,43 @@ def _shown(array: Array, wrong: Any, what: str) -> str:
     return f"{what} (row {row}) {array[row].tolist()}"
 
 
+def checked_numbers(value: ArrayInput, owner: str, what: str) -> Array:
+    """`value` as an array of floats of its own shape, all finite; errors as of checked_array."""
+    array = _read(value, owner, what)
+    return checked_array(array, array.shape, owner, what)
+
+
 def checked_number(
     value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
 ) -> float:
     """`value` as a float; arguments and errors as of checked_array."""
     return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
+
+
+def checked_nonnegative(value: ArrayInput, owner: str, what: str, unit: str = "") -> float:
+    """`value` as a float; ModelError naming `owner` and `what` unless it is a finite number, zero or above."""
+    number = checked_number(value, owner, what)
+    if number < 0:
+        message = f"{owner}: {what} {number:g} {unit}".rstrip()
+        raise ModelError(f"{message} is negative", name=what, value=number, limit=0.0)
+    return number
+
+
+def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int = MOST) -> int:
+    """`value` as an int; ModelError naming `owner` and `what` unless it is a whole number from `least` to `most`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
+        message = f"{owner}: {what} must be a whole number, {least} to {most}, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=(least, most))
+    return int(value)
+
+
+def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np.intp]:
+    """`value` as an array of indices; ModelError naming `owner` and `what` unless they are whole, from 0 to `count`."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "iu" or ((found < 0) | (found >= count)).any():
+        message = f"{owner}: {what} must be whole numbers from 0, below {count}, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=(0, count))
+    return found.astype(np.intp)
 
 
 def one_for_each(

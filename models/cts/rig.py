@@ -16,7 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number
 from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
@@ -131,6 +131,11 @@ class Branch(NamedTuple):
 
 BRANCHES = (Branch(-1, 1), Branch(-1, -1), Branch(1, 1), Branch(1, -1))
 HOME = BRANCHES[0]
+
+
+def checked_branch(branch: Branch) -> Branch:
+    """The branch itself; ModelError unless it is one of the four."""
+    return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
 
 
 class RigPosture(NamedTuple):

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number
+from models.arrays import Array, ArrayInput, checked_array, checked_instance, checked_number
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
-from models.robot.kinematics import checked_vector
+from models.robot.kinematics import checked_vector, joint_vector
 from models.robot.parts import massless
 from models.robot.rebuild import simplified
 from models.robot.robot import Robot
@@ -86,9 +86,7 @@ class Standing(FixedBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         owner = "standing machine"
-        if not isinstance(self.support, Support):
-            message = f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}"
-            raise ModelError(message, name="support", value=self.support)
+        checked_instance(self.support, Support, owner, "support")
         if self.robot.total_mass == 0:
             raise massless("nothing presses its foot on the ground")
         gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")
@@ -157,6 +155,7 @@ class Standing(FixedBase):
         """
         outside = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector(point, 2, "point", "x and y on the ground")
+        q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
         jacobian, first, second, right = self._zmp_rows(q, qd, point, outside)
         return ZmpRows(jacobian, (first, second), right)
 
@@ -228,6 +227,7 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
         stiffness: Along world x, y, z. Shape (3,), N/m.
         rest: Position of the tip where the spring is relaxed. Shape (3,), m.
     """
+    checked_instance(machine, Standing, "tip spring", "machine")
     k = checked_array(stiffness, (3,), "tip spring", "stiffness")
     relaxed = checked_array(rest, (3,), "tip spring", "rest")
     return lambda time, tip: [machine.tip_wrench(-ca.DM(k) * (tip - ca.DM(relaxed)))]

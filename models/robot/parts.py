@@ -20,6 +20,7 @@ from models.arrays import (
     checked_flag,
     checked_instance,
     checked_name,
+    checked_nonnegative,
     checked_number,
     checked_rotation,
     checked_text,
@@ -106,9 +107,7 @@ class Link:
     def __post_init__(self) -> None:
         owner = f"link {checked_name(self.name, 'link', 'name')!r}"
         checked_flag(self.any_inertia, owner, "any_inertia")
-        mass = checked_number(self.mass, owner, "mass")
-        if mass < 0:
-            raise ModelError(f"{owner}: mass {mass} kg is negative", name="mass", value=mass, limit=0.0)
+        mass = checked_nonnegative(self.mass, owner, "mass", "kg")
         inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
         _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
