@@ -31,11 +31,11 @@ from ocp.builders.timing_tables import (
     table,
 )
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_count
+from ocp.errors import ProblemError, checked_count, checked_instance
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import JointPath, LineLimits, PathLike
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, SpeedProfile, advanced
 from ocp.solution import Solution
@@ -190,10 +190,9 @@ def minimum_time_problem(
             joints that are not finite; a guess for another path; fewer than 10 intervals.
     """
     checked_count("intervals", intervals, 10)
-    if limits.joints is not None and joints is None:
-        message = "joint limits need the joints along the path: plan_minimum_time(path, limits, arm)"
-        raise ProblemError(message, name="joints")
-    limited = joints if limits.joints is not None else None
+    limited = check_line(path, limits, joints)
+    if guess is not None:
+        checked_instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
