@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_flag
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
 
@@ -49,6 +49,7 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
+    checked_flag("prepare: compiled", compiled)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled)
 
 
@@ -78,4 +79,5 @@ def solve(
         SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
             worst residuals by constraint, state and time.
     """
+    checked_flag("solve: check", check)
     return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)

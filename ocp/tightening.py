@@ -12,7 +12,7 @@ import numpy as np
 
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
-from ocp.errors import SolveError
+from ocp.errors import SolveError, checked_mapping
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import ByName, Guess, Solution
 
@@ -50,7 +50,7 @@ def tighten(
     check_meshed("tighten", method, tolerance)
     prepared = method.prepare(problem, solver=solver, options=options)
     form, fragment = prepared.formulation, prepared.fragment
-    p = form.parameter_vector(dict(parameters or {}))
+    p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
     bounds = form.bound_values(p)
     where = _places(form, fragment)
     moves = {key: np.zeros(len(where[key[-1]][0])) for key in ("lbx", "ubx", "lbg", "ubg")}

@@ -9,7 +9,7 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.geometry import Bound, is_holonomic, target_size
 from ocp.tasks.tip_task import ANGULAR, TipTask
@@ -36,10 +36,7 @@ STILL = 1e-6
 
 def checked_horizon(horizon: Any) -> float:
     """The horizon; ProblemError unless it is a positive, finite number."""
-    try:
-        duration = float(horizon)
-    except (TypeError, ValueError):
-        duration = np.nan
+    duration = real(horizon)
     if not 0 < duration < np.inf:
         words = f"horizon must be a positive number of seconds, not {horizon!r}"
         raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
@@ -77,8 +74,8 @@ def checked_weights(weights: Any, size: int) -> Array:
 def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
     """Finite numbers as a flat array; ProblemError, with their name and meaning, unless there are `size` of them."""
     try:
-        array = np.asarray(value, dtype=float).ravel()
-    except (TypeError, ValueError) as error:
+        array = floats(value).ravel()
+    except NOT_NUMBERS as error:
         raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.shape != (size,):
         words = f"{what} has {array.size} entries, expected {size}: {meaning}"

@@ -54,7 +54,8 @@ def random_quadratic(rng: np.random.Generator, fixed: bool, bounded: bool) -> Pr
     r, s = rng.normal(size=(m, m)), 0.3 * rng.normal(size=(n, m))
     problem = Problem("quadratic")
     x = problem.state("x", n, initial=np.zeros(n), terminal=np.zeros(n) if fixed else None, guess=0.0)
-    u = problem.control("u", m, guess=0.0, **({"lower": -1.0, "upper": 1.0} if bounded else {}))
+    lower, upper = (-1.0, 1.0) if bounded else (None, None)
+    u = problem.control("u", m, guess=0.0, lower=lower, upper=upper)
     problem.dynamics(x, ca.mtimes(a, x) + ca.mtimes(b, u))
     problem.horizon(float(rng.uniform(0.3, 3.0)))
     bend = 4.0 if fixed else 1.0  # an end that is given needs more of it to spoil a minimum
