@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, TypeAlias, TypeVar
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -17,6 +18,10 @@ ArrayInput: TypeAlias = Any
 
 MOST = 100_000
 """Of what is counted: more than these take longer than anybody waits."""
+TWO_TURNS, ENDLESS = 4 * np.pi, 1e4
+"""rad: angles between the two look like degrees; beyond the second they are written for no limit at all."""
+LONGEST_PART = 50.0
+"""m: longer parts look like millimetres."""
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
@@ -167,6 +172,30 @@ def one_for_each(
         raise ModelError(message, name=what, value=array, limit=(count,))
     known = checked_array(array, array.shape, owner, what, finite=finite, **checks)
     return frozen(np.array(np.broadcast_to(known, (count,))))
+
+
+def warn_of_degrees(angles: ArrayInput, owner: str, name: str, what: str) -> None:
+    """Warn where an angle, rad, is that large that it looks like degrees: beyond two turns, but no stand-in for none.
+
+    Python says the same words once only.
+
+    Warns:
+        ModelWarning: With `name`, of a joint or argument, and the angle.
+    """
+    given = np.ravel(angles)
+    odd = given[(np.abs(given) > TWO_TURNS) & (np.abs(given) < ENDLESS)]
+    if odd.size:
+        message = f"{owner}: {what} {odd[0]:g} rad is more than two turns; angles are in rad, is it in degrees?"
+        warn(ModelWarning(message, name=name, value=float(odd[0]), limit=TWO_TURNS), stacklevel=1)
+
+
+def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, what: str) -> None:
+    """Warn where a length, m, is that large that it looks like millimetres; as warn_of_degrees."""
+    given = np.ravel(lengths)
+    odd = given[np.abs(given) > LONGEST_PART]
+    if odd.size and np.isfinite(odd[0]):
+        message = f"{owner}: {what} {odd[0]:g} m is long for a robot; lengths are in m, is it in millimetres?"
+        warn(ModelWarning(message, name=name, value=float(odd[0]), limit=LONGEST_PART), stacklevel=1)
 
 
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:

@@ -19,6 +19,7 @@ from models.arrays import (
     checked_instance,
     checked_number,
     one_for_each,
+    warn_of_degrees,
 )
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clear_inverse
@@ -226,4 +227,6 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
     """Targets (x, y, z, yaw, pitch), at least one, shape (samples, 5); ModelError naming the first wrong row."""
-    return checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
+    rows = checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
+    warn_of_degrees(rows[:, 3:], "table", "targets", "yaw or pitch")
+    return rows

@@ -17,7 +17,16 @@ from typing import Any, Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_each, checked_number
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_each,
+    checked_number,
+    warn_of_degrees,
+    warn_of_millimetres,
+)
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
 from models.robot.parts import Joint, Link
@@ -59,6 +68,7 @@ class Scara:
         for what in ("upper_arm", "forearm"):
             length = checked_number(getattr(self, what), "scara", what, positive=True, unit="m")
             object.__setattr__(self, what, length)
+            warn_of_millimetres(length, "scara", what, what)
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
         for what in ("lower", "upper"):
             object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
@@ -70,6 +80,10 @@ class Scara:
             if low > high or low == np.inf or high == -np.inf:
                 message = f"scara: joint {name!r} has limits {low:g} .. {high:g}, which leave it no position"
                 raise ModelError(message, name=name, value=low, limit=high)
+
+        for joint, name in enumerate(self.names):
+            if joint != QUILL:
+                warn_of_degrees((self.lower[joint], self.upper[joint]), "scara", name, f"limit of {name!r}")
 
     @property
     def outer(self) -> float:

@@ -86,7 +86,9 @@ class Standing(FixedBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         owner = "standing machine"
-        checked_instance(self.support, Support, owner, "support")
+        if not isinstance(self.support, Support):
+            message = f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}"
+            raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
             raise massless("nothing presses its foot on the ground")
         gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")

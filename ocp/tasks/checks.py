@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.arrays import Array, warn_of_degrees
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.geometry import Bound, is_holonomic, target_size
@@ -48,11 +48,17 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
     Raises:
         ProblemError: Wrong sizes, not finite; a quaternion that is not of unit length.
+
+    Warns:
+        ModelWarning: Angles that look like degrees.
     """
     if joints is None:
         words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start_joints")
     angles = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
+    for joint, angle in zip(machine.robot.moving_joints, angles, strict=True):
+        if joint.kind != "prismatic":
+            warn_of_degrees(angle, "start_joints", joint.name, f"joint {joint.name!r} at")
     home = machine.base_home() if base is None else base
     place = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
     if machine.base_size == 7 and abs(np.linalg.norm(place[3:]) - 1) > 1e-9:
