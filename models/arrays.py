@@ -137,7 +137,7 @@ def checked_nonnegative(value: ArrayInput, owner: str, what: str, unit: str = ""
     """`value` as a float; ModelError naming `owner` and `what` unless it is a finite number, zero or above."""
     number = checked_number(value, owner, what)
     if number < 0:
-        message = f"{owner}: {what} {number:g} {unit}".rstrip()
+        message = f"{owner}: {what} {number} {unit}".rstrip()
         raise ModelError(f"{message} is negative", name=what, value=number, limit=0.0)
     return number
 

@@ -133,7 +133,7 @@ def roll_problem(
     checked_positive("roll_problem: horizon", horizon)
     for name, given in (("start_roll", start_roll), ("start_rate", start_rate)):
         if given is not None and not np.isfinite(real(given)):
-            raise ProblemError(f"roll_problem: {name} must be a finite number, not {given!r}", name=name, value=given)
+            raise ProblemError(f"roll_problem: {name} {given!r} must be a finite number", name=name, value=given)
     checked_instance("roll_problem: rig", rig, Rig)
     checked_instance("roll_problem: tunnel", tunnel, Tunnel)
     if radii is not None:
