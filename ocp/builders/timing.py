@@ -31,7 +31,7 @@ from ocp.builders.timing_tables import (
     table,
 )
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_count, checked_instance
+from ocp.errors import ProblemError, checked_count, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
@@ -157,10 +157,12 @@ def plan_minimum_time(
     Raises:
         ProblemError: As minimum_time_problem. SolveError: the solver failed, naming the worst residuals.
     """
+    checked_count("rounds", rounds, 0)
+    own = checked_mapping("options", options)
     timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
-        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **(options or {})})
+        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **own})
         profile = timing.profile(solution)
         demand = demand_of_pieces(path, limits, joints, profile)
         parts = _parts(profile, demand)

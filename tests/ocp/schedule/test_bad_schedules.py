@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models import Path, Scara, scara_along, smooth
-from ocp import minimum_time_problem
+from ocp import minimum_time_problem, plan_minimum_time
 from ocp.schedule import (
     JointLimits,
     JointTrajectory,
@@ -29,9 +29,11 @@ from tests.bad_values import (
     INF,
     INSTANCE,
     LIMIT,
+    MAPPING,
     NONNEGATIVE,
     NOTHING,
     POSITIVE,
+    WHOLE,
     Bad,
     Case,
     array,
@@ -165,6 +167,20 @@ CASES = [
                 "points are none": {"joint_names": ["a"], "points": [None]},
                 "texts": {**JOINTS.to_ros(), "joint_names": [1, 2, 3, 4]},
             }
+        },
+    ),
+    Case(
+        "plan_minimum_time",
+        plan_minimum_time,
+        {"path": PATH, "limits": LIMITS, "intervals": 10, "rounds": 0},
+        {
+            "path": INSTANCE,
+            "limits": INSTANCE,
+            "joints": but(INSTANCE, "None"),
+            "guess": but(INSTANCE, "None"),
+            "intervals": COUNT | NOTHING | {"few": 9},
+            "rounds": WHOLE | NOTHING,
+            "options": MAPPING | {"unknown": {"no_such": 1}},
         },
     ),
     Case(
