@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark test check format dev build clean anew
+.PHONY: help reproduce gallery benchmark test sweep check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -44,6 +44,9 @@ benchmark: $(VENV)/peers.stamp $(VENV)/gallery.stamp ## time model functions, bu
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
+
+sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is known (ARGS="--only pendulum --seed 3")
+	$(BIN)/python -m tests.sweep --workers $(WORKERS) --out "$(OUT)" $(ARGS)
 
 check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
 	$(BIN)/ruff check .

@@ -1,8 +1,10 @@
-"""What users give, read and checked: arrays, numbers, and names to choose from. Arrays are frozen."""
+"""What users give, read and checked: arrays, numbers, names, flags, parts of a machine. Arrays are frozen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from math import isfinite, isnan
+from numbers import Real
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -14,9 +16,14 @@ Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
+IDENTITY = np.eye(3)
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
+NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
+"""What numpy and casadi raise of values that are no numbers."""
+
 _Choice = TypeVar("_Choice")
+_Kind = TypeVar("_Kind")
 
 
 def frozen(array: Array) -> Array:
@@ -54,6 +61,43 @@ def checked_array(
             `name` is `what`.
     """
     array = _read(value, owner, what)
+    if array.shape != shape:
+        array = _shaped(array, shape, owner, what, least)
+    if not np.isfinite(array).all():
+        wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
+        if wrong.any():
+            raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
+    if positive and not (array > 0).all():
+        shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
+        raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
+    return frozen(array)
+
+
+def floats(value: ArrayInput) -> Array:
+    """`value` as a new array of floats; one of NOT_NUMBERS where it is none.
+
+    That is also where numpy would read a number all the same: in a text, in True, in None and in a symbol (nan), in the
+    real part of a complex number.
+    """
+    plain = np.asarray(value)
+    if plain.dtype.kind == "O":
+        fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
+    else:
+        fits = plain.dtype.kind in "iuf"
+    if not fits:
+        raise TypeError(f"{plain.dtype} is no real number")
+    return np.array(plain, dtype=float)
+
+
+def _read(value: ArrayInput, owner: str, what: str) -> Array:
+    try:
+        return floats(value)
+    except NOT_NUMBERS as error:
+        raise ModelError(f"{owner}: {what} {value!r} is not numeric", name=what, value=value) from error
+
+
+def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, what: str, least: int) -> Array:
+    """The array itself, or a bare number as a list of one, where it fits a shape that names free dimensions."""
     if array.ndim == 0 and len(shape) == 1 and isinstance(shape[0], str):
         array = array.reshape(1)
     fits = array.ndim == len(shape) and all(
@@ -65,20 +109,7 @@ def checked_array(
         hint = f", {least} at least" if any(isinstance(wanted, str) for wanted in shape) else ""
         message = f"{owner}: {what} has shape {array.shape}, expected {expected}{hint}"
         raise ModelError(message, name=what, value=array, limit=shape)
-    wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
-    if wrong.any():
-        raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
-    if positive and not (array > 0).all():
-        shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
-        raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
-    return frozen(array)
-
-
-def _read(value: ArrayInput, owner: str, what: str) -> Array:
-    try:
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{owner}: {what} {value!r} is not numeric", name=what, value=value) from error
+    return array
 
 
 def _shown(array: Array, wrong: Any, what: str) -> str:
@@ -96,6 +127,8 @@ def checked_number(
     value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
 ) -> float:
     """`value` as a float; arguments and errors as of checked_array."""
+    if isinstance(value, float) and (isfinite(value) or not (finite or isnan(value))) and (value > 0 or not positive):
+        return float(value)  # nothing to say, and no array needed: a robot has hundreds of numbers
     return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
 
 
@@ -117,8 +150,9 @@ def one_for_each(
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     """Read-only copy of a rotation matrix; ModelError naming `owner` and `what` when it is none."""
     matrix = checked_array(value, (3, 3), owner, what)
-    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if error > 1e-6 or np.linalg.det(matrix) < 0:
+    error = float(np.abs(matrix @ matrix.T - IDENTITY).max())
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # numpy's determinant costs as much as all the rest
+    if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         message = f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
         raise ModelError(message, name=what, value=matrix)
     if error > 1e-12:  # printed to few digits: take the nearest rotation
@@ -130,7 +164,56 @@ def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
 def checked_choice(value: _Choice, choices: Iterable[Any], owner: str, what: str) -> _Choice:
     """`value` itself; ModelError naming `owner`, `what` and the choices when it is none of them."""
     known = tuple(choices)
-    if value not in known:
+    if not any(isinstance(value, type(choice)) and value == choice for choice in known):
         message = f"{owner}: {what} {value!r} is unknown; use one of {list(known)}"
         raise ModelError(message, name=what, value=value, limit=known)
     return value
+
+
+def checked_instance(value: Any, kind: type[_Kind], owner: str, what: str) -> _Kind:
+    """`value` itself; ModelError naming `owner` and `what` unless it is a `kind`."""
+    if not isinstance(value, kind):
+        message = f"{owner}: {what} must be a {kind.__name__}, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=kind.__name__)
+    return value
+
+
+def checked_each(values: Any, kind: type[_Kind], owner: str, what: str) -> tuple[_Kind, ...]:
+    """`values` as a tuple; ModelError naming `owner` and `what` unless they are several (or none) of a `kind`."""
+    try:
+        each = tuple(values)
+    except TypeError as error:
+        message = f"{owner}: {what} must be a list of {kind.__name__}, not {values!r}"
+        raise ModelError(message, name=what, value=values, limit=kind.__name__) from error
+    for value in each:
+        checked_instance(value, kind, owner, what)
+    return each
+
+
+def checked_name(value: Any, owner: str, what: str) -> str:
+    """`value` itself; ModelError naming `owner` and `what` unless it is a string that is not empty."""
+    if not isinstance(value, str) or not value:
+        message = f"{owner}: {what} must be a name, a string that is not empty, not {value!r}"
+        raise ModelError(message, name=what, value=value)
+    return value
+
+
+def checked_text(value: Any, owner: str, what: str) -> str:
+    """`value` itself; ModelError naming `owner` and `what` unless it is a string."""
+    return checked_instance(value, str, owner, what)
+
+
+def checked_flag(value: Any, owner: str, what: str) -> bool:
+    """`value` as a bool; ModelError naming `owner` and `what` unless it is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        message = f"{owner}: {what} must be True or False, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=(True, False))
+    return bool(value)
+
+
+def checked_mapping(values: Any, owner: str, what: str) -> dict[str, Any]:
+    """A dictionary by name as one of its own; ModelError naming `owner` and `what` for anything else."""
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        message = f"{owner}: {what} must be a dictionary by name, not {values!r}"
+        raise ModelError(message, name=what, value=values)
+    return dict(values)

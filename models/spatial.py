@@ -19,6 +19,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 import casadi as ca
 import numpy as np
 
+from models.arrays import NOT_NUMBERS, floats
+from models.errors import ModelError
+
 Expression = Any
 """A casadi SX, MX or DM, whatever numpy reads as an array of floats, or a (nested) list with casadi entries."""
 
@@ -48,13 +51,20 @@ def expression(value: Expression) -> Expression:
     """`value` itself if it is a casadi matrix, else a DM without its exact zeros; vectors become columns.
 
     Lists, tuples and arrays with casadi entries are stacked: the entries below each other, inner lists side by side.
+
+    Raises:
+        ModelError: Texts, truths, ragged lists, arrays of more than two dimensions.
     """
     if isinstance(value, ca.SX | ca.MX | ca.DM):
         return value
     if has_expressions(value):  # numpy would read a symbol as nan
         rows = [ca.horzcat(*map(expression, row)) if _is_sequence(row) else expression(row) for row in value]
         return ca.vertcat(*rows)
-    return ca.sparsify(ca.DM(np.asarray(value, dtype=float)))
+    try:
+        return ca.sparsify(ca.DM(floats(value)))
+    except NOT_NUMBERS as error:
+        message = f"{value!r} is neither an expression nor an array of numbers"
+        raise ModelError(message, name="expression", value=value) from error
 
 
 def has_expressions(value: Any) -> bool:

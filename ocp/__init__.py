@@ -1,12 +1,13 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
 
 from ocp.audit.audit import Audit, Finding
-from ocp.audit.certificate import Certificate, certificate
+from ocp.audit.certificate import Certificate
 from ocp.builders.cts import roll_problem, spline_targets
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.builders.standing.plan import plan_standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.builders.timing import minimum_time_problem, plan_minimum_time
+from ocp.confirmation import certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError

@@ -181,19 +181,19 @@ def time_left() -> float:
 
 
 class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two."""
+    """One line on the terminal for each iteration, and a way to stop between two, at an iterate that is kept."""
 
     def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
         self.title, self.show = title, show
-        self.stopped = ""
+        self.stopped, self.iterate, self.iterations = "", np.zeros(n), 0
         self.bar: Any = None
         self.construct("progress", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
         """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
-        self.lower, self.upper, self.stopped = lower, upper, ""
+        self.lower, self.upper, self.stopped, self.iterations = lower, upper, "", 0
         disable = None if self.show else True
         form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
         self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
@@ -221,6 +221,9 @@ class Progress(ca.Callback):  # type: ignore[misc]
             self.stopped = reason_to_stop()
         except KeyboardInterrupt:  # CasADi would make another error of it
             self.stopped = INTERRUPTED
+        self.iterations += 1
+        if self.stopped:
+            self.iterate = np.asarray(arguments[0].full()).reshape(-1)
         return [int(bool(self.stopped))]
 
     def close(self) -> None:

@@ -16,13 +16,25 @@ __all__ = [
     "PiecewisePolynomial",
     "barycentric_weights",
     "differentiation_matrix",
+    "dormand_prince_step",
     "integrator",
     "lagrange",
     "lagrange_expressions",
+    "newton_coefficients",
     "quadrature_weights",
     "rk4_step",
 ]
 
+DORMAND_PRINCE = (
+    (0.0, ()),
+    (1 / 5, (1 / 5,)),
+    (3 / 10, (3 / 40, 9 / 40)),
+    (4 / 5, (44 / 45, -56 / 15, 32 / 9)),
+    (8 / 9, (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729)),
+    (1.0, (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
+    (1.0, (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
+)  # place and weights of each stage; the last are those of the step
+DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 TOUCHING = 1e-100  # a place nearer to a node than this is the node: its barycentric weight would overflow
 
 
@@ -100,6 +112,18 @@ def lagrange_expressions(nodes: np.ndarray, place: Any) -> Any:
     return ca.vertcat(*polynomials)
 
 
+def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Divided differences c of values (K, d, n) at nodes (d,). Shape (K, d, n).
+
+    The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations.
+    """
+    found = np.array(values, dtype=float)
+    for i in range(1, len(nodes)):
+        width = (nodes[i:] - nodes[:-i])[None, :, None]
+        found[:, i:] = (found[:, i:] - found[:, i - 1 : -1]) / width
+    return found
+
+
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
     """One step of width ``h`` of the classical Runge-Kutta method from ``x``, an array or an expression.
 
@@ -110,6 +134,22 @@ def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
     k3 = slope(0.5, x + h / 2 * k2)
     k4 = slope(1.0, x + h * k3)
     return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> tuple[Any, Any]:
+    """One step of width ``h`` of order 5 from ``x``, and the estimate of its error of order 4 (Dormand, Prince 1980).
+
+    ``slope(place, x)`` is dx/dt at a place 0..1 of the step.
+    """
+    slopes: list[Any] = []
+    after = x
+    for place, weights in DORMAND_PRINCE:
+        after = x
+        for weight, value in zip(weights, slopes, strict=True):
+            after = after + h * weight * value if weight else after
+        slopes.append(slope(place, after))
+    error = sum(h * weight * value for weight, value in zip(DORMAND_PRINCE_ERROR, slopes, strict=True) if weight)
+    return after, error
 
 
 def integrator(

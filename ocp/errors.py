@@ -86,7 +86,7 @@ class AuditError(Detailed, RuntimeError):
 
 
 class RefinementWarning(Detailed, UserWarning):
-    """A refinement that stopped at its cap before its tolerance was reached."""
+    """A refinement that stopped where the audit does not pass; ``value`` is the share of its limit that a row is at."""
 
 
 @contextmanager

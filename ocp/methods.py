@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
+import numpy as np
+
+from ocp.audit.accessory import FLAT
+from ocp.audit.curvature import Curvature, curvature
 from ocp.console import interruptible, limited
-from ocp.errors import ProblemError, checked_time_limit
+from ocp.direct.guess import Samples
+from ocp.errors import ProblemError, SolveError, checked_time_limit
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
+
+MOST_DESCENTS = 3
+VISIBLE = 0.1
+"""By which share of its spread along the plan, or of its range, or by how much, a plan is moved to start beside it."""
 
 
 class PreparedProblem(Protocol):
@@ -26,7 +37,13 @@ class Method(Protocol):
     """What solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
-        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: ByName = None,
+        compiled: bool = False,
+        scaling: bool = True,
     ) -> PreparedProblem:
         """Build a problem once, to be solved many times; see :func:`prepare`."""
         ...
@@ -34,16 +51,25 @@ class Method(Protocol):
 
 @interruptible
 def prepare(
-    problem: Problem, method: Method, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+    problem: Problem,
+    method: Method,
+    *,
+    solver: str = "ipopt",
+    options: ByName = None,
+    compiled: bool = False,
+    scaling: bool = True,
 ) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
     Args:
         problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt`` or ``fatrop`` (faster on long horizons; takes no coupling of controls at the end). For the
-            indirect method, of the direct solution that seeds it.
+        solver: ``ipopt``, ``fatrop`` (faster on long horizons; takes no coupling of controls at the end) or ``sleqp``
+            (an active-set method, to confirm a plan, started there). For the indirect method, of the direct solution
+            that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
+        scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where
+            these are far from 1; all that is reported stays in the units of the problem.
 
     Raises:
         ProblemError: The problem is not complete, or the method or solver cannot take it.
@@ -53,7 +79,7 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    return method.prepare(problem, solver=solver, options=options, compiled=compiled)
+    return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
 @interruptible
@@ -66,26 +92,101 @@ def solve(
     options: ByName = None,
     guess: Guess = None,
     check: bool = True,
+    scaling: bool = True,
     time_limit: float | None = None,
 ) -> Solution:
     """Solve a problem by a method.
 
+    Where the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
+    from a roll-out of the dynamics with the controls of the guess, and from the plan that misses the constraints least;
+    the first two take at most ``max_iter`` iterations together. Where it stops at a plan that is stationary but no
+    minimum, it starts again beside it, on both sides along the variation that lowers the cost, and the cheaper plan
+    counts. ``Solution.start`` says what worked.
+
     Args:
         problem: What is asked. method: For example ``Collocation(intervals=20, degree=3)``.
         parameters: Value of every parameter by name.
-        solver, options: See :func:`prepare`.
+        solver, options, scaling: See :func:`prepare`.
         guess: An earlier solution (of any grid or method), or a dictionary by name of values, functions of time, or
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
-        check: Raise where the solver fails, after a second solve that finds what would have to give way; False returns
-            the unsuccessful solution with its status.
-        time_limit: After so many seconds, the build included, the solver is stopped between two iterations, which
-            counts as a failure. None for no limit.
+        check: Raise where the solver fails, after a second solve that finds what would have to give way; False runs it
+            once, from the guess, and returns the unsuccessful solution with its status.
+        time_limit: After so many seconds, the build and all starts included, the solver is stopped between two
+            iterations, which counts as a failure. None for no limit.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.
         KeyboardInterrupt: Ctrl-C; the exception's ``solution``, where it has one, is the last iterate.
-        SolveError: The solver failed; names the constraints that cannot hold together, by how much and when, and the
-            worst residuals by constraint, state and time.
+        SolveError: The solver failed from every start; names the constraints that cannot hold together, by how much and
+            when, and the worst residuals by constraint, state and time. Or what it found is no minimum, and beside it
+            there is none either.
     """
     with limited(checked_time_limit(time_limit)):
-        return prepare(problem, method, solver=solver, options=options).solve(parameters, guess, check)
+        prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
+        solution = prepared.solve(parameters, guess, check)
+        return lowered(prepared, solution) if check and solution.regularised else solution
+
+
+def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
+    """The plan, or a cheaper one beside it where its cost can be lowered along a feasible variation.
+
+    Raises:
+        SolveError: It can, but from beside it the solver finds no plan: the cost may have no least.
+    """
+    form = Formulation(solution.problem)
+    p = form.parameter_vector(solution.parameters)
+    bounds = form.bound_values(p)
+    for _ in range(MOST_DESCENTS):
+        if not solution.regularised:
+            break
+        found = curvature(form, solution, p, bounds)
+        if found.upwards or found.least > -FLAT:
+            break
+        others = [
+            prepared.solve(solution.parameters, beside(form, solution, found, bounds, sign), check=False)
+            for sign in (1.0, -1.0)
+        ]
+        plans = [other for other in others if other.success]
+        if not plans and found.upwards is False:
+            words = f"no minimum: the cost falls along a variation from {found.time or 0.0:.4g} s on"
+            beyond = "; ".join(other.status for other in others)
+            raise SolveError(
+                f"problem {form.name!r}: the plan found, of cost {solution.cost:.6g}, is stationary but {words}; from "
+                f"beside it the solver ended with {beyond}",
+                replace(solution, success=False, status=words),
+                name="cost",
+                value=solution.cost,
+                time=found.time,
+            )
+        best = min([solution, *plans], key=lambda plan: plan.cost)
+        if best is solution:
+            break
+        solution = replace(best, start="downhill")
+    return solution
+
+
+def beside(form: Formulation, solution: Solution, found: Curvature, bounds: Bounds, sign: float) -> dict[str, Any]:
+    """A guess: the plan moved along the variation that lowers its cost, as far as is visible in its own size.
+
+    Where the cost falls but no variation is told, all controls are pushed by seeded random amounts.
+    """
+    breaks = solution.control_interpolant.breaks * solution.horizon
+    times = np.union1d(breaks, found.t)
+    here = times / solution.horizon
+    plan = np.hstack([solution.state_interpolant(here), solution.control_interpolant(here)])
+    index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control")])
+    width = bounds[1][index] - bounds[0][index]
+    spread = np.ptp(plan, axis=0)
+    size = np.where(spread > 0, spread, np.where(np.isfinite(width) & (width > 0), width, np.inf))
+    if found.direction is None:
+        push = np.random.default_rng(0).normal(size=form.nu) * np.where(np.isfinite(size), size, 1.0)[form.nx :]
+        move = np.hstack([np.zeros((len(times), form.nx)), np.tile(push, (len(times), 1))])
+    else:
+        controls, states = found.direction
+        curves = [*((breaks, column) for column in states.T), *((found.t, column) for column in controls.T)]
+        move = np.column_stack([np.interp(times, at, column) for at, column in curves])
+    share = float((np.abs(move) / size).max(initial=0.0)) or float(np.abs(move).max(initial=0.0))
+    moved = plan + sign * VISIBLE / share * move
+    places = {**form.states, **{name: slice(s.start + form.nx, s.stop + form.nx) for name, s in form.controls.items()}}
+    guess: dict[str, Any] = {name: Samples(times, moved[:, place]) for name, place in places.items()}
+    return guess | {"horizon": solution.horizon}

@@ -1,23 +1,35 @@
-"""Mesh refinement by the audit's own integration error."""
+"""Mesh refinement by the audit: intervals are split where its rows are beyond their limits, until none is."""
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
+from inspect import Parameter, signature
+from typing import NamedTuple
 
 import numpy as np
 
+from ocp.audit.audit import Audit, Finding
+from ocp.audit.audit import audit as judge
 from ocp.direct.prepared import DirectMethod, check_meshed
-from ocp.errors import ProblemError, RefinementWarning, checked_count
+from ocp.errors import ProblemError, RefinementWarning, about, checked_count, checked_mapping, unknown_name
 from ocp.methods import solve
+from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import ByName, Guess, Refinement, Solution
+from ocp.problem.values import numeric
+from ocp.solution import ByName, Guess, Refinement, Solution, stack
 
 __all__ = ["refine", "split"]
 
-TARGET_SHARE = 0.5  # of the tolerance, which every interval is split for
+LIMITS = [name for name, given in signature(judge).parameters.items() if given.kind is Parameter.KEYWORD_ONLY]
+KINDS = ("integration", "equalities", "limits", "cost", "other")
+TARGET_SHARE = 0.5  # of its limit, which an interval is split for
 MOST_PIECES = 4  # that an interval is split into at once
-MOST_ROUNDS = 20
+LEAST_WIDTH = 1e-9  # of an interval, as a share of the horizon
+MOST_ROUNDS = 12
+PATIENCE = 2  # rounds that may pass without any row coming nearer to its limit
+NEARER = 0.8  # of what it was: a row that fell so much is falling
 
 
 def refine(
@@ -25,36 +37,54 @@ def refine(
     method: DirectMethod,
     *,
     tolerance: float = 1e-6,
+    limits: ByName = None,
+    breaks: Sequence[float] = (),
     max_intervals: int = 400,
     parameters: ByName = None,
     solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
 ) -> Solution:
-    """Solve, and split intervals by their error until the audit's integration error is under ``tolerance``.
+    """Solve, and split intervals until no row of the audit is beyond its limit.
 
-    The error of an interval is the distance of the plan from its re-integration over that interval alone. It falls with
-    the power of the width that is the method's order, which says into how many pieces the interval is split. Every
-    round starts from the plan before.
+    Looked at in every interval are the distance of the plan from its re-integration, what path equalities, bounds and
+    inequalities are missed by between the points, and the cost that the controls lose. Each falls with a power of the
+    width that the method sets, which says into how many pieces an interval is split. A row that no interval answers for
+    (the conditions at the ends) is met by splitting those that are worst in the others. Nodes stay nodes. Every round
+    starts from the plan before.
 
     Args:
         problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
         method: The mesh to start from.
-        tolerance: Largest integration error, relative to the size of each state.
+        tolerance: Largest integration error, relative to the size of each state: over the whole horizon, or summed over
+            the intervals where the motion is unstable and that over the horizon means nothing.
+        limits: Of the audit's other rows, as of :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. Its own
+            limits where none is given.
+        breaks: Times at which there have to be nodes, because something jumps or bends there, s. Of a fixed horizon
+            only; for a free one give ``method.with_nodes_at(fractions)``.
         max_intervals: Cap on the number of intervals.
 
     Returns:
-        The last solution; its ``refinement`` says how the mesh came about and whether the tolerance was reached.
+        The last solution; its ``refinement`` says how the mesh came about, and whether the audit passes in the end.
 
     Raises:
-        ProblemError: tolerance not positive, or cap below the first mesh.
+        ProblemError: tolerance not positive, a limit that the audit does not have, breaks outside the horizon or of a
+            free one, cap below the first mesh.
         SolveError: A round failed.
 
     Warns:
-        RefinementWarning: The cap (or the least width) stopped it before the tolerance was reached.
+        RefinementWarning: It stopped with a row beyond its limit, at the cap or where finer intervals do not help, and
+            names the worst; or with all rows within theirs where the audit does not decide whether it is an optimum.
     """
     check_meshed("refine", method, tolerance)
+    settings = checked_mapping("refine: limits", limits)
+    for name in settings:
+        if name not in LIMITS:
+            raise unknown_name("limit of the audit", name, LIMITS)
     max_intervals = checked_count("refine: max_intervals", max_intervals)
+    form = Formulation(problem)
+    p = form.parameter_vector(checked_mapping("parameters", parameters))
+    method = method.with_nodes_at(_fractions(form, p, breaks))
     if max_intervals < method.intervals:
         raise ProblemError(
             f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given",
@@ -63,40 +93,166 @@ def refine(
             limit=method.intervals,
         )
     intervals: list[int] = []
-    errors: list[float] = []
+    errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    best: dict[str, float] = {}
+    idle = 0
     while True:
         solution = solve(problem, method, parameters=parameters, solver=solver, options=options, guess=guess)
-        audit = solution.audit()
+        audit = judge(problem, solution, **settings)
+        rows = _rows(form, p, solution, audit, tolerance, method)
+        beyond = [row for row in rows if not row.value <= 1.0]
         intervals.append(method.intervals)
-        errors.append(audit.integration_error)
-        reached = audit.integration_error <= tolerance
-        finer = split(method.fractions, audit.local_errors, TARGET_SHARE * tolerance, method.order, max_intervals)
-        if reached or len(finer) == method.intervals + 1 or len(errors) == MOST_ROUNDS:
+        for kind, values in errors.items():
+            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+        nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
+        best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
+        idle = 0 if nearer else idle + 1
+        finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
+        if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
             break
         method = method.with_mesh(finer)
         guess = solution
-    if not reached:
-        words = (
-            f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals with an "
-            f"integration error of {errors[-1]:.2e}, above the tolerance {tolerance:.2e}; raise max_intervals"
-        )
-        told = RefinementWarning(words, name="integration error", value=errors[-1], limit=tolerance)
-        warnings.warn(told, stacklevel=2)
-    return dataclasses.replace(solution, refinement=Refinement(tuple(intervals), tuple(errors), tolerance, reached))
+    stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
+    if beyond:
+        worst = max(beyond, key=lambda row: row.value)
+        hint = "raise max_intervals"
+        if idle == PATIENCE:
+            hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
+        words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
+        warnings.warn(RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0), stacklevel=2)
+    elif not audit.passed:
+        words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
+        warnings.warn(RefinementWarning(words, name="undecided", value=audit.undecided), stacklevel=2)
+    told = {kind: tuple(values) for kind, values in errors.items()}
+    return dataclasses.replace(
+        solution, refinement=Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
+    )
 
 
-def split(mesh: np.ndarray, errors: np.ndarray, target: float, order: int, most: int) -> np.ndarray:
-    """A finer mesh of at most ``most`` intervals, the worst intervals split first. Shape (N' + 1,)."""
-    with np.errstate(over="ignore"):
-        wanted = np.ceil((np.where(np.isfinite(errors), errors, np.inf) / target) ** (1.0 / order))
-    pieces = np.clip(wanted, 1, MOST_PIECES).astype(int)
-    if np.all(pieces == 1):  # every interval is good, their sum is not: halve the worse half
-        pieces[errors >= np.median(errors)] = 2
-    room = most - len(errors)
-    for k in np.argsort(errors):  # the least bad give way first
+class _Row(NamedTuple):
+    """A row of the audit: its value, and what each interval adds to it (N,), both as shares of its limit.
+
+    ``order`` is the power of the width with which it falls; ``errors`` is None where no interval answers for it.
+    """
+
+    name: str
+    kind: str
+    value: float
+    errors: np.ndarray | None = None
+    order: int = 1
+
+
+class _Parts(NamedTuple):
+    """What each interval adds to a row (N,), in any unit; the row is their sum, or the largest of them."""
+
+    kind: str
+    values: np.ndarray
+    order: int
+    summed: bool = False
+
+    def shares(self, total: float) -> np.ndarray:
+        """Of a row that is so large, where an interval may have the same part of a sum as any other. Shape (N,)."""
+        values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
+        whole = values.mean() if self.summed else values.max()
+        return np.where(values > 0, total * (values / (whole or 1.0)), 0.0)
+
+
+def _rows(
+    form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
+) -> list[_Row]:
+    """What an audit says of a plan, row by row, and which intervals answer for it."""
+    # over the whole horizon an unstable motion runs away; what feedback would have to mend is the sum
+    slip = min(audit.integration_error, float(audit.local_errors.sum()))
+    asked = Finding(f"integration error, {tolerance:.0e} asked", slip, tolerance)
+    order = method.control_order
+    parts = {
+        name: _Parts("integration", audit.local_errors, method.order)
+        for name in (asked.name, "integration error, relative", "integration error of one interval")
+    }
+    parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
+    for name, (equal, misses) in _missed(form, p, solution, audit).items():
+        parts[name] = _Parts("equalities" if equal else "limits", misses, order)
+    rows = []
+    for finding in (asked, *audit.findings):
+        if finding.limit is None:
+            continue
+        value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
+        value = np.inf if np.isnan(value) else float(value)
+        part = parts.get(finding.name)
+        if part is None or not part.values.any():
+            rows.append(_Row(finding.name, "other", value))
+        else:
+            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order))
+    return rows
+
+
+def _missed(form: Formulation, p: np.ndarray, solution: Solution, audit: Audit) -> dict[str, tuple[bool, np.ndarray]]:
+    """Of each bounded state, control and path constraint by the name of its row in the audit: whether it is an
+    equality, and by how much it is missed most in every interval (N,)."""
+    n = len(audit.local_errors)
+    x, u = stack(audit.states), stack(audit.controls, len(audit.t))
+    g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
+    lower, upper = form.bound_values(p)
+    found = {}
+    for kind, pool, values in (
+        ("state", {f"bounds of {name}": place for name, place in form.states.items()}, x),
+        ("control", {f"bounds of {name}": place for name, place in form.controls.items()}, u),
+        ("path", {name: form.path.of(name) for name in form.path.names}, g),
+    ):
+        for name, place in pool.items():
+            index = form.bounds.places[kind][place]
+            miss = np.maximum(lower[index] - values[:, place], values[:, place] - upper[index]).clip(min=0.0)
+            miss = np.where(np.isnan(miss), np.inf, miss).max(axis=1)
+            found[name] = bool((lower[index] == upper[index]).all()), miss.reshape(n, -1).max(axis=1)
+    return found
+
+
+def _pieces(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Into how many pieces each interval is split for the rows beyond their limits, and how bad it is. Both (N,)."""
+    n = len(mesh) - 1
+    pieces, bad = np.ones(n, int), np.zeros(n)
+    for row in beyond:
+        if row.errors is not None:
+            with np.errstate(over="ignore"):
+                wanted = np.ceil((row.errors / TARGET_SHARE) ** (1.0 / row.order))
+            pieces = np.maximum(pieces, np.clip(wanted, 1, MOST_PIECES).astype(int))
+            bad = np.maximum(bad, row.errors)
+    if np.all(pieces == 1):  # no interval answers for what is beyond its limit
+        for row in rows:
+            bad = bad if row.errors is None else np.maximum(bad, row.errors)
+        far = max((row.value for row in beyond), default=0.0) > 2.0
+        pieces[far | (bad >= np.median(bad))] = 2
+    pieces[np.diff(mesh) < 2 * LEAST_WIDTH] = 1
+    return pieces, bad
+
+
+def split(mesh: np.ndarray, pieces: np.ndarray, bad: np.ndarray, most: int) -> np.ndarray:
+    """The mesh (N + 1,) with each interval cut into its number of pieces; shape (N' + 1,), at most ``most`` intervals.
+
+    Where there is no room for all, intervals that are less ``bad`` (N,) give way.
+    """
+    pieces = pieces.copy()
+    room = most - len(pieces)
+    for k in np.argsort(bad, kind="stable"):
         excess = int(np.sum(pieces - 1)) - room
         if excess <= 0:
             break
         pieces[k] = max(1, pieces[k] - excess)
     cuts = [np.linspace(mesh[k], mesh[k + 1], n + 1)[:-1] for k, n in enumerate(pieces)]
     return np.concatenate([*cuts, mesh[-1:]])
+
+
+def _fractions(form: Formulation, p: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
+    """Times of a fixed horizon as fractions of it."""
+    with about("breaks"):
+        times = numeric("refine: breaks", breaks)
+    if not times.size:
+        return times
+    if form.horizon_is_free:
+        words = "refine: breaks in s have no place on a free horizon; give method.with_nodes_at(fractions)"
+        raise ProblemError(words, name="breaks", value=times.tolist())
+    horizon = float(form.horizon_at(p))
+    if not np.all((times >= 0) & (times <= horizon)):
+        words = f"refine: breaks must lie within the horizon, 0 to {horizon:g} s, not {times.tolist()}"
+        raise ProblemError(words, name="breaks", value=times.tolist(), limit=(0.0, horizon))
+    return np.asarray(times / horizon)

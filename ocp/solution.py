@@ -45,6 +45,7 @@ HEAD = {
     "iterations": int,
     "horizon": float,
     "seconds": dict,
+    "start": str,
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
@@ -65,12 +66,15 @@ class Refinement:
     """How a mesh was refined.
 
     Attributes:
-        intervals, errors: Number of intervals and relative integration error of every round.
-        tolerance: What was asked. reached: Whether it was reached before the cap.
+        intervals: Number of intervals of every round.
+        errors: Of every round the worst error of each kind, as a share of its limit, so that 1 is what may be:
+            "integration", "equalities" and "limits" (bounds and inequalities) between the points, "cost" that is lost,
+            "other" rows of the audit.
+        tolerance: Of the integration, as asked. reached: Whether no error is beyond its limit and the audit passes.
     """
 
     intervals: tuple[int, ...]
-    errors: tuple[float, ...]
+    errors: dict[str, tuple[float, ...]]
     tolerance: float
     reached: bool
 
@@ -100,6 +104,10 @@ class Solution:
             controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
             jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
             was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
+        start: Where the solver started from when it found this: ``guess``, ``zeros``, ``roll-out`` (of the dynamics,
+            with the controls of the guess), ``elastic plan`` (that misses the constraints least) or ``downhill``
+            (beside a stationary plan that is no minimum).
+        regularised: Whether the solver saw the cost not curve upwards where it ended: the plan may be no minimum.
     """
 
     name: str
@@ -126,6 +134,8 @@ class Solution:
     problem_lost: str = field(default="", compare=False, repr=False)
     refinement: Refinement | None = None
     drawn_in: np.ndarray | None = None
+    start: str = "guess"
+    regularised: bool = False
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
@@ -255,7 +265,7 @@ class Solution:
             }
             past = head.pop("refinement", None)
             if past is not None:
-                rounds = tuple(past["intervals"]), tuple(past["errors"])
+                rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in past["errors"].items()}
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
             fields["drawn_in"] = arrays.pop("drawn_in", None)
             fields |= {name: arrays.pop(name) for name in PLAIN}

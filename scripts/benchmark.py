@@ -1,4 +1,4 @@
-"""How fast problems are built and solved, costates evaluated, and rigs, paths and robots computed, each beside peers.
+"""How fast problems are built, solved and audited, costates evaluated, rigs, paths and robots computed, beside peers.
 
 `python scripts/benchmark.py [--out results] [--only NAME ...] [--repeats 5]` writes OUT/benchmark/summary.json, tables
 and plots. All figures are of one run on one machine; what is claimed are ratios and growth, not seconds.
@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 
 from scripts.papers.run import Table, command, progress, write
 
-PARTS = ("build_and_solve", "costate_rate", "cts", "blend", "robots")
+PARTS = ("build_and_solve", "costate_rate", "audit", "cts", "blend", "robots")
 """Modules of scripts/timing, each with run(repeats) -> numbers, plot(path, numbers) and report(numbers) -> text."""
 TOGETHER = PARTS[:2]
 """Those whose numbers stand in summary.json; the others have a file NAME.json."""

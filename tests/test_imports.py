@@ -30,7 +30,7 @@ FLOORS = {
         ["direct", "audit", "local"],
         ["indirect"],
         ["methods"],
-        ["refinement", "tightening"],
+        ["confirmation", "refinement", "tightening"],
         ["builders"],
         ["planning"],
         ["batch", "files", "app"],

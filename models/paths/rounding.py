@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from models.arrays import Array, ArrayInput, checked_choice, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import cells
-from models.paths.blends import BlendKind, checked_shape, cubic, gamma, polynomial, quintic
+from models.paths.blends import BlendKind, checked_shape, cubic, polynomial, quintic
 from models.paths.path import Path
 from models.paths.smooth_path import SmoothPath
 from models.spatial import FULL_TURN
@@ -109,16 +109,15 @@ def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
 
 def _from_deviation(corners: _Corners, tolerance: Array, longest: Array) -> Array:
     found, path = longest.copy(), corners.path
-    angles = path.corner_angles()
     straight = (path.curvature[:-1] == 0) & (path.curvature[1:] == 0)
     # between two lines the deviation is proportional to the remaining distance: one trial tells the ratio
     lines = np.flatnonzero(straight)
     if lines.size:
         some = corners.some(lines)
-        legs = _deviations(some, longest[lines])[1] / longest[lines] * (1 + KEPT_BACK)
-        ratio = np.maximum([gamma(s, a, corners.kind) for s, a in zip(some.shape, angles[lines], strict=True)], legs)
+        corner, legs = _deviations(some, longest[lines])
+        largest = np.maximum(corner, legs * (1 + KEPT_BACK))
         with np.errstate(divide="ignore"):
-            found[lines] = np.minimum(longest[lines], tolerance[lines] / ratio)
+            found[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
     arcs = np.flatnonzero(~straight)
     if arcs.size:
         found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - KEPT_BACK), longest[arcs])

@@ -8,6 +8,7 @@ Both are curves of constant curvature k, and one formula, with the arc length s 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -53,7 +54,7 @@ class Line:
             )
             raise ModelError(message, name="length", value=self.length, limit=SHORTEST_SEGMENT)
 
-    @property
+    @cached_property
     def length(self) -> float:
         """m."""
         return float(np.linalg.norm(self.end - self.start))

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_array
-from models.errors import ModelError
+from models.arrays import checked_array, checked_each, checked_instance, checked_name
 from models.robot.kinematics import Placement, by_joint_vector, checked_vector, frames_and_axes, subtree_moments
 from models.robot.motion import LinkMotion, momentum_rates, motions_of
 from models.robot.robot import Robot
@@ -47,6 +46,7 @@ class Wrench:
     point: Expression = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        checked_name(self.link, "wrench", "link")
         for part in ("force", "moment", "point"):
             given = getattr(self, part)
             owner = f"wrench on link {self.link!r}"
@@ -134,14 +134,12 @@ def external_wrench(
 
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
     """`wrenches` as a tuple; ModelError unless it is a list of them."""
-    if not isinstance(wrenches, list | tuple) or not all(isinstance(one, Wrench) for one in wrenches):
-        message = f"wrenches must be a list of Wrench(...), not {wrenches!r}"
-        raise ModelError(message, name="wrenches", value=wrenches)
-    return tuple(wrenches)
+    return checked_each(wrenches, Wrench, "dynamics", "wrenches")
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
     """Moment, force and point of every wrench in a column of its own. Shape (9, k)."""
+    checked_instance(robot, Robot, "dynamics", "robot")
     columns = []
     for wrench in checked_wrenches(wrenches):
         robot.link(wrench.link)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.arrays import NOT_NUMBERS, Array, checked_instance
 from models.errors import ModelError
 from models.robot.parts import massless
 from models.robot.robot import Robot
@@ -62,6 +62,7 @@ class MassMoments(NamedTuple):
 
 def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
     """`q` as a column; ModelError unless it has one entry for each moving joint."""
+    checked_instance(robot, Robot, "kinematics", "robot")
     return checked_vector(q, robot.dof, what, f"one entry for each of the joints {list(robot.joint_names)}")
 
 
@@ -70,21 +71,41 @@ def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Exp
     name, limit = what.rpartition(" ")[2], (size, 1)
     try:
         value = expression(value)
-    except (TypeError, ValueError, NotImplementedError) as error:
+    except NOT_NUMBERS as error:
         message = f"{what} {value!r} is not numeric; {limit} expected: {meaning}"
         raise ModelError(message, name=name, value=value, limit=limit) from error
     if value.shape != limit and not (size == 0 and value.numel() == 0):
         message = f"{what} has shape {tuple(value.shape)}, expected {limit}: {meaning}"
         raise ModelError(message, name=name, value=tuple(value.shape), limit=limit)
+    if isinstance(value, ca.DM) and not value.is_regular():
+        raise ModelError(f"{what} {value} is not finite", name=name, value=np.array(value).ravel())
     return value
+
+
+def checked_placement(placement: Placement | None) -> Frame:
+    """A placement of the root link as a frame, the world's own if None; ModelError for anything else."""
+    if placement is None:
+        return Frame(ca.DM.eye(3), ca.DM(3, 1))
+    try:
+        turn, position = map(expression, placement)
+    except NOT_NUMBERS as error:
+        message = f"world_from_base must be (rotation, position), not {placement!r}"
+        raise ModelError(message, name="world_from_base", value=placement) from error
+    if turn.shape != (3, 3) or position.shape != (3, 1):
+        message = f"world_from_base has the shapes {turn.shape}, {position.shape}; (3, 3), (3, 1) expected"
+        raise ModelError(message, name="world_from_base", value=(turn.shape, position.shape), limit=((3, 3), (3, 1)))
+    if not all(part.is_regular() for part in (turn, position) if isinstance(part, ca.DM)):
+        message = f"world_from_base {placement!r} is not finite"
+        raise ModelError(message, name="world_from_base", value=placement)
+    return Frame(turn, position)
 
 
 def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
     """Rates or accelerations of all joints that move, followers included, by name, from those of the joint vector; of
     its positions, followers' lack their offsets. ModelError as of joint_vector.
     """
-    vector, drives = joint_vector(robot, vector, what), robot.drives.items()
-    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in drives}
+    vector = joint_vector(robot, vector, what)
+    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.drives.items()}
 
 
 def by_joint_vector(robot: Robot, given: Mapping[str, Expression]) -> list[Expression]:
@@ -124,9 +145,9 @@ def centers_of_mass(robot: Robot, q: Expression, world_from_base: Placement | No
 
 def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Centre of mass of the whole robot in the world. Shape (3, 1), m."""
+    frames = link_frames(robot, q, world_from_base)
     if robot.total_mass == 0:
         raise massless("hence no centre of mass")
-    frames = link_frames(robot, q, world_from_base)
     moment = sum(link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass)
     return ca.densify(moment / robot.total_mass)
 
@@ -151,7 +172,8 @@ def frame_jacobian(
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     robot.link(link)
-    return ca.densify(point_jacobian(robot, axes, link, frames[link].point(point)))
+    place = frames[link].point(checked_vector(point, 3, "point", "x, y and z in the frame of the link"))
+    return ca.densify(point_jacobian(robot, axes, link, place))
 
 
 def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
@@ -165,14 +187,16 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 
     Shape (6, dof).
     """
-    return frame_jacobian(robot, q, robot.tip_link, robot.tip_translation, world_from_base)
+    tip = checked_instance(robot, Robot, "kinematics", "robot").tip_link
+    return frame_jacobian(robot, q, tip, robot.tip_translation, world_from_base)
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
+    matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
         raise massless("hence no centre of mass")
-    return momentum_matrix(robot, q, world_from_base)[3:6, :] / robot.total_mass
+    return matrix[3:6, :] / robot.total_mass
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
@@ -238,8 +262,7 @@ def frames_and_axes(
     for name, drive in robot.drives.items():
         if drive.offset:
             positions[name] = positions[name] + drive.offset
-    base = Frame(ca.DM.eye(3), ca.DM(3, 1)) if world_from_base is None else Frame(*map(expression, world_from_base))
-    frames: dict[str, Frame] = {robot.root: base}
+    frames: dict[str, Frame] = {robot.root: checked_placement(world_from_base)}
     axes: dict[str, tuple[Expression, Expression]] = {}
     turns: dict[str, _Turn] = {}
     for joint in robot.joints:

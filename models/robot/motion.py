@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import casadi as ca
 
+from models.arrays import checked_instance
 from models.robot.kinematics import Placement, checked_vector, each_joint, frames_and_axes
 from models.robot.parts import Link, massless
 from models.robot.robot import Robot
-from models.spatial import Expression, Frame, cross, expression, on_scalars
+from models.spatial import Expression, Frame, cross, on_scalars
 
 
 class LinkMotion(NamedTuple):
@@ -53,7 +54,7 @@ def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
     """Position, velocity and acceleration of the centre of mass of the whole robot; ModelError if it has no mass."""
-    if robot.total_mass == 0:
+    if checked_instance(robot, Robot, "kinematics", "robot").total_mass == 0:
         raise massless("hence no centre of mass")
     return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))
 
@@ -69,12 +70,13 @@ def momentum(
     """(Moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = motions_of(robot, frames, axes, qd, ca.DM(robot.dof, 1))
+    place = checked_vector(about, 3, "about", "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
         motion, inertia = motions[link.name], inertia_in_world(link, frames)
         push = link.mass * motion.velocity
         spin = ca.mtimes(inertia, motion.angular_velocity)
-        total = total + ca.vertcat(spin + cross(motion.center - expression(about), push), push)
+        total = total + ca.vertcat(spin + cross(motion.center - place, push), push)
     return ca.densify(total)
 
 
@@ -93,8 +95,9 @@ def momentum_rate(
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     rates = momentum_rates(robot, frames, motions_of(robot, frames, axes, qd, qdd))
+    place = checked_vector(about, 3, "about", "a point of the world")
     total: Expression = sum(rates.values(), start=ca.DM(6, 1))
-    return ca.densify(ca.vertcat(total[0:3] - cross(about, total[3:6]), total[3:6]))
+    return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
 
 
 @on_scalars

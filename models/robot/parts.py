@@ -11,7 +11,20 @@ from typing import Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number, checked_rotation, frozen
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_each,
+    checked_flag,
+    checked_instance,
+    checked_name,
+    checked_number,
+    checked_rotation,
+    checked_text,
+    frozen,
+)
 from models.errors import ModelError
 from models.spatial import rotation
 
@@ -48,6 +61,7 @@ class CollisionShape:
 
     def __post_init__(self) -> None:
         numbers = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
+        checked_text(self.file, "collision shape", "file")
         owner, mesh = f"collision {self.kind}", self.kind == "mesh"
         size = checked_array(self.size, (numbers,), owner, "size", positive=not mesh)
         if mesh and not self.file:
@@ -60,8 +74,9 @@ class CollisionShape:
 
     def placed(self, rotation: Array, translation: Array) -> CollisionShape:
         """The same shape in a frame in which its link stands so. Shape (3, 3) and (3,)."""
-        shift = translation + rotation @ self.translation
-        return replace(self, translation=shift, rotation=rotation @ self.rotation)
+        turn = checked_rotation(rotation, "placed shape", "rotation")
+        shift = checked_array(translation, (3,), "placed shape", "translation") + turn @ self.translation
+        return replace(self, translation=shift, rotation=turn @ self.rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +104,8 @@ class Link:
     collisions: tuple[CollisionShape, ...] = ()
 
     def __post_init__(self) -> None:
-        owner = f"link {self.name!r}"
+        owner = f"link {checked_name(self.name, 'link', 'name')!r}"
+        checked_flag(self.any_inertia, owner, "any_inertia")
         mass = checked_number(self.mass, owner, "mass")
         if mass < 0:
             raise ModelError(f"{owner}: mass {mass} kg is negative", name="mass", value=mass, limit=0.0)
@@ -98,7 +114,7 @@ class Link:
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
         object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
-        object.__setattr__(self, "collisions", tuple(self.collisions))
+        object.__setattr__(self, "collisions", checked_each(self.collisions, CollisionShape, owner, "collisions"))
 
 
 @dataclass(frozen=True)
@@ -119,8 +135,9 @@ class Mimic:
     offset: float = 0.0
 
     def __post_init__(self) -> None:
+        owner = f"mimic of joint {checked_name(self.joint, 'mimic', 'joint')!r}"
         for what in ("multiplier", "offset"):
-            number = checked_number(getattr(self, what), f"mimic of joint {self.joint!r}", what)
+            number = checked_number(getattr(self, what), owner, what)
             object.__setattr__(self, what, number)
 
 
@@ -164,8 +181,12 @@ class Joint:
     mimic: Mimic | None = None
 
     def __post_init__(self) -> None:
-        owner = f"joint {self.name!r}"
+        owner = f"joint {checked_name(self.name, 'joint', 'name')!r}"
         checked_choice(self.kind, get_args(Kind), owner, "kind")
+        for role in ("parent", "child"):
+            checked_name(getattr(self, role), owner, role)
+        if self.mimic is not None:
+            checked_instance(self.mimic, Mimic, owner, "mimic")
         axis = checked_array(self.axis, (3,), owner, "axis")
         length = float(np.linalg.norm(axis))
         if not length > 0:
@@ -213,6 +234,7 @@ class Joint:
     def placed(self, position: float) -> tuple[Array, Array]:
         """Placement of the child link in the parent link at a joint position (rad or m): rotation, translation."""
         turn, shift = self.rotation, self.translation
+        position = checked_number(position, f"joint {self.name!r}", "position")
         if self.kind == "prismatic":
             return turn, shift + position * (turn @ self.axis)
         return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift

@@ -12,7 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_rotation
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_each,
+    checked_flag,
+    checked_instance,
+    checked_mapping,
+    checked_rotation,
+    checked_text,
+)
 from models.errors import ModelError
 from models.robot.mimicry import cut, held
 from models.robot.parts import Joint, Link
@@ -29,14 +39,16 @@ def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
     Raises:
         ModelError: A joint that is fixed already; a position that is not finite.
     """
-    return replace(robot, joints=held(robot.joints, {robot.joint(name).name: at for name, at in positions.items()}))
+    given = checked_mapping(positions, "locked", "positions")
+    joints = held(_robot(robot).joints, {robot.joint(name).name: at for name, at in given.items()})
+    return replace(robot, joints=joints)
 
 
 def retipped(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
     """The robot with its tip at a frame placed in the link `tip`."""
-    return replace(robot, tip=robot.link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
+    return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
 
 
 def with_load(
@@ -57,8 +69,9 @@ def with_load(
     Raises:
         ModelError: An impossible mass or inertia.
     """
+    carrier = _robot(robot).link(link)
     load = Link(f"load of {link}", mass, center_of_mass, np.zeros((3, 3)) if inertia is None else inertia)
-    whole = _welded(robot.link(link), [(load, np.eye(3), np.zeros(3))])
+    whole = _welded(carrier, [(load, np.eye(3), np.zeros(3))])
     return replace(robot, links=tuple(whole if each.name == link else each for each in robot.links))
 
 
@@ -85,7 +98,11 @@ def attached(
         prefix: Put before every name of the tool.
         keep_tip: The tip stays where it is; otherwise the tool's tip becomes that of the robot.
     """
-    added = renamed(tool if isinstance(tool, Robot) else Robot((tool,)), prefix)
+    added = renamed(
+        tool if isinstance(tool, Robot) else Robot((checked_instance(tool, Link, "attached", "tool"),)), prefix
+    )
+    robot = _robot(robot)
+    checked_flag(keep_tip, "attached tool", "keep_tip")
     shift = checked_array(translation, (3,), "attached tool", "translation")
     turn = checked_rotation(_turn(rotation), "attached tool", "rotation")
     if link is None:
@@ -118,25 +135,32 @@ def merged(
     Raises:
         ModelError: No arm; a placement of an arm that is not there.
     """
+    owner = "merged robots"
+    arms = checked_mapping(arms, owner, "arms")
     if not arms:
-        raise ModelError("merged robots: no arms are given", name="arms", value=arms)
-    given = [links or {}, translations or {}, rotations or {}]
+        raise ModelError(f"{owner}: no arms are given", name="arms", value=arms)
+    placed = {"links": links, "translations": translations, "rotations": rotations}
+    given = [{} if places is None else checked_mapping(places, owner, what) for what, places in placed.items()]
     if unknown := [prefix for places in given for prefix in places if prefix not in arms]:
         message = f"merged robots: {unknown} are no prefixes of the arms, which are {list(arms)}"
         raise ModelError(message, name=unknown[0], value=unknown, limit=tuple(arms))
-    whole = base if isinstance(base, Robot) else Robot((base,), name=base.name)
+    whole = base if isinstance(base, Robot) else Robot((checked_instance(base, Link, owner, "base"),), name=base.name)
     root, first = whole.root, True
     for prefix, arm in arms.items():
         carrier, shift, turn = (places.get(prefix) for places in given)
         shift = np.zeros(3) if shift is None else shift
-        whole = attached(whole, arm, carrier or root, shift, turn, prefix=prefix, keep_tip=not first)
+        checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
+        whole = attached(
+            whole, arm, root if carrier is None else carrier, shift, turn, prefix=prefix, keep_tip=not first
+        )
         first = False
     return whole
 
 
 def renamed(robot: Robot, prefix: str) -> Robot:
     """The robot with a prefix before the names of all links and joints."""
-    if not prefix:
+    robot = _robot(robot)
+    if not checked_text(prefix, "renamed robot", "prefix"):
         return robot
     links = tuple(replace(link, name=prefix + link.name) for link in robot.links)
     joints = []
@@ -153,7 +177,7 @@ def rerooted(robot: Robot, root: str) -> Robot:
 
     See `models.robot.tree.reroot` for the massless links that this takes.
     """
-    links, joints = reroot(robot.links, robot.joints, robot.root, root)
+    links, joints = reroot(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 
 
@@ -164,7 +188,7 @@ def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
         root: Name of the link.
         tip: Link whose frame is the tip. If None the robot's tip where it is among them, else the only leaf if any.
     """
-    kept = {robot.link(root).name}
+    kept = {_robot(robot).link(root).name}
     for joint in robot.joints:
         if joint.parent in kept:
             kept.add(joint.child)
@@ -183,7 +207,7 @@ def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     Raises:
         ModelError: No tip and nothing to keep.
     """
-    named = _names(keep)
+    robot, named = _robot(robot), _names(keep)
     ends = [*named] if robot.tip is None and named else [robot.tip_link, *named]
     stay = {robot.root, *(joint.child for name in ends for joint in robot.path_to(name))}
     links = tuple(link for link in robot.links if link.name in stay)
@@ -198,6 +222,7 @@ def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     Args:
         keep: Links on fixed joints whose frames are still wanted. They stay, without mass: that goes to the carrier.
     """
+    robot = _robot(robot)
     stay = {robot.link(name).name for name in _names(keep)}
     carrier = {robot.root: (robot.root, np.eye(3), np.zeros(3))}  # of the frame: placement in the link it is part of
     body = dict(carrier)  # of the mass
@@ -252,5 +277,9 @@ def _turn(rotation: ArrayInput | None) -> ArrayInput:
     return np.eye(3) if rotation is None else rotation
 
 
-def _names(names: Iterable[str]) -> list[str]:
-    return [names] if isinstance(names, str) else list(names)
+def _names(names: Iterable[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else checked_each(names, str, "links", "keep")
+
+
+def _robot(robot: Robot) -> Robot:
+    return checked_instance(robot, Robot, "rebuilt robot", "robot")

@@ -13,7 +13,17 @@ from warnings import warn
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_rotation
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_each,
+    checked_instance,
+    checked_mapping,
+    checked_rotation,
+    checked_text,
+)
 from models.errors import ModelError, ModelWarning
 from models.robot.mimicry import Drive, drives, held, joint_limits, ties_to_leaders
 from models.robot.parts import Joint, Link
@@ -51,7 +61,11 @@ class Robot:
     root: str = field(init=False)
 
     def __post_init__(self) -> None:
-        links, joints = tuple(self.links), tuple(self.joints)
+        links, joints = (
+            checked_each(self.links, Link, "robot", "links"),
+            checked_each(self.joints, Joint, "robot", "joints"),
+        )
+        checked_text(self.name, "robot", "name")
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = held(joints, {})
@@ -68,7 +82,7 @@ class Robot:
 
     def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
-        if self.tip is not None and self.tip not in names:
+        if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
             raise absent("tip link", self.tip, names)
         leaves = self._leaves
         return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
@@ -128,10 +142,11 @@ class Robot:
         found = read_urdf(source, inertia=inertia)
         joints = found.joints if mimic != "free" else tuple(replace(joint, mimic=None) for joint in found.joints)
         known = {joint.name: None for joint in joints}
-        for name in lock or {}:
+        positions = {} if lock is None else checked_mapping(lock, "URDF", "lock")
+        for name in positions:
             if name not in known:
                 raise absent("joint", name, known)
-        joints = held(joints, lock or {})
+        joints = held(joints, positions)
         if mimic == "lock":
             joints = held(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
         links = found.links
@@ -153,6 +168,8 @@ class Robot:
         place = np.asarray(self.tip_translation), np.asarray(self.tip_rotation)
         text = written_urdf(self.name, self.links, self.joints, self.tip, *place)
         if file is not None:
+            if not isinstance(file, str | os.PathLike):
+                raise ModelError(f"to_urdf: file must be a path, not {file!r}", name="file", value=file)
             part = Path(file).with_name(Path(file).name + ".part")
             part.write_text(text, encoding="utf-8")
             part.replace(file)
@@ -175,7 +192,7 @@ class Robot:
 
     def unit(self, per: str = "") -> str:
         """Unit of the joint vector, or with `per` "/s" of its rates: "rad", "m", or both, "rad, m", in its order."""
-        return ", ".join(dict.fromkeys(joint.unit + per for joint in self.moving_joints))
+        return ", ".join(dict.fromkeys(joint.unit + checked_text(per, "unit", "per") for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
@@ -230,13 +247,13 @@ class Robot:
 
     def link(self, name: str) -> Link:
         """The link of that name; ModelError, which says what names come near, when there is none."""
-        if name not in self._links_by_name:
+        if not isinstance(name, str) or name not in self._links_by_name:
             raise absent("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
         """The joint of that name, moving or fixed; ModelError, as for a link, when there is none."""
-        if name not in self._joints_by_name:
+        if not isinstance(name, str) or name not in self._joints_by_name:
             raise absent("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
 
@@ -315,12 +332,12 @@ def planar_chain(
         ModelError: Sizes that differ, no link, a mass or an inertia that is impossible.
     """
     owner = "planar chain"
-    lengths = checked_array(lengths, ("links",), owner, "lengths")
+    lengths = checked_array(lengths, ("links",), owner, "lengths", positive=True, unit="m")
     count = len(lengths)
     masses = checked_array(masses, (count,), owner, "masses")
     moments = checked_array(masses * lengths**2 / 12 if inertias is None else inertias, (count,), owner, "inertias")
     mount = checked_array(mount, (2,), owner, "mount")
-    root = base if base is not None else Link("base")
+    root = Link("base") if base is None else checked_instance(base, Link, owner, "base")
     links, joints = [root], []
     for i in range(count):
         # Only the moment about z matters to a planar machine; the others are those of a lamina.

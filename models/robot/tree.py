@@ -24,7 +24,7 @@ def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
     hint = f"did you mean {' or '.join(repr(each) for each in near)}? " if near else ""
     listed = f"{names[:MANY]} and {len(names) - MANY} more" if len(names) > MANY else f"{names}"
     message = f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
-    return ModelError(message, name=str(name), value=name, limit=tuple(names))
+    return ModelError(message, name=str(name) or what, value=name, limit=tuple(names))
 
 
 def require_unique(names: Iterable[str], what: str) -> None:

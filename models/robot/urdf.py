@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
+from math import cos, isfinite, sin
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 from warnings import warn
@@ -36,8 +37,15 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "axis": ("xyz",),
     "mass": ("value",),
     "inertia": MOMENTS,
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "mesh": ("filename", "scale"),
 }
 """Elements in which a misspelt attribute would go unseen, and the attributes that they have."""
+MISSPELT = 0.8
+"""Likeness to an attribute that is given too, from which another one is that, misspelt; `iyx` beside `ixy` is not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,13 +237,13 @@ def _contents(source: Source) -> str:
 
 def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
     links, refused = [], []
-    for element in tree.findall("link"):
-        link = _link(element)
+    for said in map(_said_of_link, tree.findall("link")):
         try:
-            link = replace(link, any_inertia=False)
+            links.append(Link(**said))
+            continue
         except ModelError as error:
             refused.append(str(error))
-        links.append(link)
+        links.append(Link(**said, any_inertia=True))  # raises what is wrong beside the inertia
     if refused and rule == "warn":
         warn(
             f"inertias that no body can have are taken as given: {'; '.join(refused)}. Correct the file, or have no "
@@ -248,19 +256,20 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
     return tuple(links)
 
 
-def _link(element: ElementTree.Element) -> Link:
+def _said_of_link(element: ElementTree.Element) -> dict[str, Any]:
+    """Attributes of Link, by name."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes = tuple(_shape(each, owner) for each in element.findall("collision"))
     body = _only(element, "inertial", owner)
     if body is None:
-        return Link(name, collisions=shapes)
+        return {"name": name, "collisions": shapes}
     center, turn = origin_of(body, owner)
     mass = number_of(child_of(body, "mass", owner), "value", owner)
     given = child_of(body, "inertia", owner)
     xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in MOMENTS)
     inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return Link(name, mass, center, inertia, any_inertia=True, collisions=shapes)
+    return {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia, "collisions": shapes}
 
 
 def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
@@ -317,19 +326,20 @@ def _unread(owner: ElementTree.Element) -> list[str]:
     """Attributes below a link or a joint that are none of URDF's, where one is lacking that they may stand for.
 
     Beside all of URDF's they are an extension, and passed over as unknown elements are. ModelError for an attribute
-    that looks like one that is lacking.
+    that looks like one that is lacking, or nearly is another one.
     """
     found = []
-    parts = [part for tag in ("inertial", "collision") for part in owner.findall(tag)]
+    parts = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
     for element in (each for part in (owner, *parts) for each in part):
         known = ATTRIBUTES.get(element.tag, ())
         lacking = [word for word in known if word not in element.attrib]
-        for key in [key for key in element.attrib if lacking and key not in known and "}" not in key]:
+        for key in [key for key in element.attrib if known and key not in known and "}" not in key]:
             where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
-            if near := get_close_matches(key.casefold(), lacking, n=1):
+            word = key.casefold()
+            if near := get_close_matches(word, lacking, 1) or get_close_matches(word, known, 1, MISSPELT):
                 message = f"{where} is no attribute of URDF; did you mean {near[0]!r}?"
                 raise ModelError(message, name=key, value=element.get(key), limit=known)
-            found.append(where)
+            found += [where] if lacking else []
     return found
 
 
@@ -340,7 +350,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
     if origin is not None:
         shift = numbers_of(origin, "xyz", owner, 3) if "xyz" in origin.attrib else shift
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)  # in numbers: a file has hundreds
+    (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in angles.tolist())  # a file has hundreds
     turn = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
@@ -380,23 +390,32 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """An attribute of one number; ModelError naming `owner` otherwise."""
-    return float(numbers_of(element, key, owner, 1)[0])
+    """An attribute of one number, inf and nan among them; ModelError naming `owner` otherwise."""
+    return _numbers(element, key, owner, 1)[0]
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """An attribute of `count` numbers, shape (count,); ModelError naming `owner` otherwise."""
+    """An attribute of `count` finite numbers, shape (count,); ModelError naming `owner` otherwise."""
+    values = _numbers(element, key, owner, count)
+    if not all(map(isfinite, values)):
+        raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))
+    return np.array(values)
+
+
+def _numbers(element: ElementTree.Element, key: str, owner: str, count: int) -> list[float]:
     text = text_of(element, key, owner)
-    words, where = text.split(), f"{owner}: {key}={text!r} of <{element.tag}>"
     try:
         if "_" in text:  # Python would read 1_0 as ten
             raise ValueError
-        values = np.array([float(word) for word in words])
+        values = [float(word) for word in text.split()]
     except ValueError:
         hint = f": {XACRO}" if "${" in text or "$(" in text else ""
-        raise ModelError(f"{where} is not numeric{hint}", name=key, value=text) from None
-    if count > 1 and not np.isfinite(values).all():
-        raise ModelError(f"{where} is not finite", name=key, value=text)
-    if values.size != count:
-        raise ModelError(f"{where} has {values.size} numbers, not {count}", name=key, value=text, limit=count)
+        raise ModelError(f"{_where(element, key, owner)} is not numeric{hint}", name=key, value=text) from None
+    if len(values) != count:
+        message = f"{_where(element, key, owner)} has {len(values)} numbers, not {count}"
+        raise ModelError(message, name=key, value=text, limit=count)
     return values
+
+
+def _where(element: ElementTree.Element, key: str, owner: str) -> str:
+    return f"{owner}: {key}={element.get(key)!r} of <{element.tag}>"

@@ -41,6 +41,7 @@ class AccessoryProblem:
         hessian: Of T H in (z, u). Shape (M, nz + nu, nz + nu).
         curved: Of T H in u alone, in their own units. Shape (M, nu, nu).
         rows: Constraints that hold the variations, (r, nz + nu) for every point: equalities and those that push.
+        node_rows: Those of the states at the ends of the intervals, (r, nz) each.
         weak: Those that are active and do not push, (r', nz + nu) for every point.
         moved: Controls that switch in an interval, (N, nu) bool. switching: What moving costs there, per squared
             area, in their own units. Shape (N, nu).
@@ -100,7 +101,7 @@ class AccessoryProblem:
         along, form, m = self.along, self.along.form, len(self.along.s)
         lam, mu = form.sym("lam", form.nx), form.sym("mu", len(form.path))
         multipliers = np.zeros((m, len(form.path)))
-        multipliers[:, along.mixed] = self.adjoint.holding[:, self.nu :]
+        multipliers[:, along.mixed] = self.adjoint.holding[:, self.nu : self.nu + along.mixed.size]
         multipliers[:, along.still] = self.adjoint.standing[:, self.nx :]
         cost, rate, path = along.scaled
         total = cost + ca.dot(lam, rate) + ca.dot(mu, path)
@@ -119,18 +120,30 @@ class AccessoryProblem:
         self.hessian *= self.unit * self.unit[:, None]
 
     @property
+    def flat(self) -> np.ndarray:
+        """Controls along which the Hamiltonian does not curve. Shape (nu,), bool."""
+        bends = np.abs(self.curved * self.range * self.range[:, None]).max(axis=(0, 2), initial=0.0)
+        pull = np.abs(slope(self.along, self.adjoint.costate) * self.range).max(initial=0.0)
+        return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
+
+    @property
     def spread(self) -> float:
         """What the cost curves by over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
+
+    @property
+    def magnitude(self) -> float:
+        """What the cost curves by over the whole controls, in units of cost."""
+        return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _hold(self) -> None:
         """Which limits take directions away: those that push, and those that are only touched."""
         along, m = self.along, len(self.along.s)
         into, z_of = self._into_z()
         size = self.nz + self.nu
-        normals = np.zeros((m, len(along.hold.equal) + len(along.stand.equal), size))
-        nu, nh = self.nu, len(along.hold.equal)
+        nu, nh = self.nu, self.nu + along.mixed.size
+        normals = np.zeros((m, nh + len(along.stand.equal), size))
         normals[:, :nu, self.nz :] = np.eye(nu)
         normals[np.ix_(range(m), range(nu, nh), z_of)] = along.row_y[:, along.mixed][:, :, into]
         normals[:, nh : nh + self.nx, : self.nx] = np.eye(self.nx)
@@ -140,16 +153,26 @@ class AccessoryProblem:
 
         def pushing(limits: Limits, multipliers: np.ndarray, place: slice) -> tuple[np.ndarray, np.ndarray]:
             force = np.abs(multipliers) * reach[:, place]
-            gap = np.minimum(limits.below, limits.above)
-            touched = (gap <= AT_BOUND * reach[:, place]) | limits.equal
+            gap, equal = np.minimum(limits.below, limits.above)[:, : force.shape[1]], limits.equal[: force.shape[1]]
+            touched = (gap <= AT_BOUND * reach[:, place]) | equal
             return force > FLAT * (force.max(initial=0.0) or 1.0), touched
 
-        strong, touched = pushing(along.hold, self.adjoint.holding, slice(0, nh))
+        strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], slice(0, nh))
         self.fixed = strong[:, :nu] & touched[:, :nu]
         at_rest, resting = pushing(along.stand, self.adjoint.standing, slice(nh, None))
-        strong = np.hstack([strong & touched | along.hold.equal, at_rest | along.stand.equal])
+        strong = np.hstack([strong & touched | along.hold.equal[:nh], at_rest | along.stand.equal])
         touched = np.hstack([touched, resting])
+        n, q = along.shape
         self.rows = [normals[k][strong[k]] for k in range(m)]
+        # on an arc the points alone leave the ends of the intervals free to go to and fro
+        pushed = (at_rest | along.stand.equal).reshape(n, q, -1)
+        arc = np.concatenate([pushed[:1, 0], pushed[:-1, -1] & pushed[1:, 0], pushed[-1:, -1]])
+        node = np.zeros((n + 1, len(along.stand.equal), self.nz))
+        node[:, :, : self.nx] = along.node_stand_x[:, :, :-1]
+        if self.free:
+            node[:, :, self.nx] = along.node_stand_x[:, :, -1]
+        node *= self.unit[: self.nz]
+        self.node_rows = [node[k][arc[k] & along.node_stand.near[k]] for k in range(n + 1)]
         self.weak = [normals[k][touched[k] & ~strong[k]] for k in range(m)]
 
     def _switch(self) -> None:
@@ -157,19 +180,14 @@ class AccessoryProblem:
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
-        largest = float(np.abs(self.curved * self.range * self.range[:, None]).max(initial=0.0))
         pull = slope(along, self.adjoint.costate).reshape(n, q, nu)
-        force = np.abs(pull * self.range).max(axis=(1, 2), initial=0.0).max(initial=0.0)
         fixed, u = self.fixed.reshape(n, q, nu), along.u.reshape(n, q, nu)
         at = along.s.reshape(n, q)
-        for i in range(nu):
-            bend = np.abs(self.curved[:, i] * self.range[i] * self.range).max(initial=0.0)
-            if bend > FLAT * max(largest, force):
-                continue
+        for i in np.flatnonzero(self.flat):
             step = along.high[0, i] - along.low[0, i]
             whole = fixed[:, :, i].all(axis=1)
             for k in np.flatnonzero(~whole):
-                before, after = (j for j in (max(k - 1, 0), min(k + 1, n - 1)))
+                before, after = max(int(k) - 1, 0), min(int(k) + 1, n - 1)
                 near = slice(before, after + 1)
                 steep = np.polynomial.polynomial.polyfit(at[near].ravel(), pull[near, :, i].ravel(), 1)[1]
                 rise = u[after, -1, i] - u[before, 0, i]

@@ -13,7 +13,9 @@ import numpy as np
 
 from ocp.audit.optimality import Optimality, optimality
 from ocp.audit.principle import FLAT
-from ocp.audit.reintegration import Reintegration, reintegrate, violations
+from ocp.audit.reintegration import Reintegration, reintegrate
+from ocp.audit.sizes import Sizes, fine_grid, sizes_along
+from ocp.audit.violations import Violation, violations
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
@@ -22,7 +24,6 @@ from ocp.solution import Solution, check_belongs, check_structure, in_order_of, 
 
 __all__ = ["Audit", "Finding", "audit"]
 
-GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which constraints are looked at
 HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
@@ -141,7 +142,9 @@ class Audit:
                     limit = "" if f.limit is None else f"{f.limit:.2e}"
                     time = "" if f.time is None else f"{f.time:.4f}"
                     ok = "" if f.limit is None else "ok" if f.passed else "FAILED"
-                    line = f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
+                    line = (
+                        f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
+                    )
                     lines.append(line.rstrip())
         return "\n".join([*lines, f"The plan {self.sentence}."])
 
@@ -161,11 +164,22 @@ def audit(
 ) -> Audit:
     """Check a plan independently of the solver that made it.
 
+    Sizes are those of each named thing along the plan (:class:`ocp.audit.sizes.Sizes`): its spread, and for a
+    constraint the spread of what it is made of. Multiplying anything by a power of ten, or moving its origin, changes
+    no verdict.
+
+    The plan is looked at on a grid ten times as fine as its own points. What is narrower than a step of it and is no
+    part of the dynamics, a wall thinner than the way between two samples say, is not seen; what pushes is met by the
+    steps of the integration, some four to a step of the grid.
+
+    Where unstable dynamics carry the re-integrated states away from a plan that every interval keeps, the row of the
+    whole horizon is only told, and bounds, constraints and cost are judged interval by interval.
+
     Args:
         problem: What was asked. solution: The plan.
-        integration: Largest relative distance from the re-integrated states, and relative error of the cost.
-        constraints: Largest violation of a bound or constraint, as a share of its scale: the width of its range, else
-            the size of its bound, else 1.
+        integration: Largest distance from the re-integrated states, relative to the size of each state, and relative
+            error of the cost.
+        constraints: Largest violation of a bound or constraint, as a share of its size.
         lost: What of its cost the plan may lose to the extremal beside it, as a share.
         costates: Largest error of the costates against their own equation, summed over the plan, and of the conditions
             at the ends, as a share of the cost.
@@ -191,38 +205,33 @@ def audit(
     solution = in_order_of(form, solution)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
-    points = max(solution.state_interpolant.values.shape[1] - 1, 1)
-    pieces = (len(solution.state_interpolant.breaks) - 1) // (len(solution.control_interpolant.breaks) - 1)
-    again = reintegrate(form, solution, p, GRID_FACTOR * points * max(pieces, 1))
+    grid = fine_grid(solution)
+    size = sizes_along(form, grid, solution.horizon, p, bounds)
+    again = reintegrate(form, solution, p, grid, size)
     found = optimality(form, solution, p, bounds)
 
-    scale = state_scale(form, again.plan)
-    errors = np.abs(again.states - again.plan) / scale
-    local = np.abs(again.local - again.plan) / scale
-    n = int(again.interval[-1]) + 1
-    local_errors = local.reshape(n, -1).max(axis=1)
     findings = []
-    note = "" if again.broke_down is None else f"the integration broke down at {again.broke_down:.6g} s"
-    findings.append(worst("integration error, relative", errors.max(axis=1), again.t, integration, note))
-    findings.append(worst("integration error of one interval", local.max(axis=1), again.t, integration))
-    findings.append(cost_finding(form, solution, again, p, integration))
-    findings.append(reported_finding(solution, integration))
+    off = again.carried_off(integration)
+    findings.append(integration_finding(again, integration, off))
+    findings.append(worst("integration error of one interval", again.local_errors, again.t, integration))
+    along, running = (again.local, again.local_cost) if off else (again.states, again.cost)
+    findings.append(cost_finding(form, solution, along, running, again.controls[0], size, p, integration))
+    findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
 
-    names = [*form.states, *form.controls, *[c for kind in (form.path, form.start, form.end) for c in kind.names]]
+    rows = (form.path, form.start, form.end, form.watch)
+    names = [*form.states, *form.controls, *[name for kind in rows for name in kind.names]]
     for name in limits:
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
-    checks = violations(form, again, bounds, p, solution.horizon)
     total: dict[str, float] = {}
-    for label, name, misses, times, size in checks:
-        limit = limits.get(name, constraints * size)
-        finding = worst(label, misses, times, limit)
-        findings.append(finding)
-        total[name] = max(total.get(name, 0.0), finding.value)
+    for check in violations(form, again, along, size, bounds, p, solution.horizon):
+        finding = violation_finding(check, constraints, limits.get(check.name))
+        findings.append(replace(finding, unit=form.units.get(check.name, "")))
+        total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))
 
-    findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, integration))
-    findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, None))
+    findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
+    findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     findings += optimality_findings(form, found, lost, costates, stationarity, drift)
     undecided = found.curvature.flat
     if not solution.success:
@@ -232,8 +241,8 @@ def audit(
         tuple(findings),
         undecided,
         total,
-        float(np.max(errors)) if np.all(np.isfinite(errors)) else np.inf,
-        np.where(np.isfinite(local_errors), local_errors, np.inf),
+        float(np.max(again.errors)),
+        again.local_errors.reshape(-1, grid.samples).max(axis=1),
         again.t,
         unstack(solution.states, again.states),
         unstack(solution.controls, again.controls),
@@ -250,12 +259,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 
 
 def optimality_findings(
-    form: Formulation,
-    found: Optimality,
-    lost: float,
-    costates: float,
-    stationarity: float | None,
-    drift: float | None,
+    form: Formulation, found: Optimality, lost: float, costates: float, stationarity: float | None, drift: float | None
 ) -> list[Finding]:
     """First and second order."""
     cost, errors = found.cost_size, found.error_size
@@ -282,13 +286,22 @@ def optimality_findings(
     return [replace(row, verdict="optimal") for row in rows]
 
 
-def state_scale(form: Formulation, plan: np.ndarray) -> np.ndarray:
-    """Size of each state: the largest entry of the named state it belongs to; 1 where it is all zero. Shape (nx,)."""
-    scale = np.ones(form.nx)
-    for place in form.states.values():
-        size = np.max(np.abs(plan[:, place]))
-        scale[place] = size if size > 0 else 1.0
-    return scale
+def integration_finding(again: Reintegration, limit: float, carried_off: bool) -> Finding:
+    """The distance from the plan over the whole horizon, which is only told where unstable dynamics explain it."""
+    notes = [] if again.broke_down is None else [f"the integration broke down at {again.broke_down:.6g} s"]
+    if carried_off:
+        notes.append(f"unstable: the intervals add {again.added[-1]:.2g}, which the dynamics let grow")
+    judged = None if carried_off else limit
+    return worst("integration error, relative", again.errors, again.t, judged, "; ".join(notes))
+
+
+def violation_finding(found: Violation, constraints: float, tolerance: float | None) -> Finding:
+    """A bound or constraint where it is missed most: for its size, or in its own unit where a tolerance is given."""
+    if tolerance is not None:
+        return worst(found.label, found.missed, found.t, tolerance)
+    k = int(np.argmax(found.shares))
+    size, share = float(found.sizes[k]), float(found.shares[k])
+    return Finding(found.label, share * size, constraints * size, float(found.t[k]) if share > 0 else None)
 
 
 def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
@@ -300,41 +313,47 @@ def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None,
     return Finding(name, float(clean[k]), limit, float(times[k]) if clean[k] > 0 else None, note)
 
 
-def cost_finding(form: Formulation, solution: Solution, again: Reintegration, p: np.ndarray, limit: float) -> Finding:
+def cost_finding(
+    form: Formulation,
+    solution: Solution,
+    states: np.ndarray,
+    running: float,
+    first: np.ndarray,
+    sizes: Sizes,
+    p: np.ndarray,
+    limit: float,
+) -> Finding:
     """The cost of the re-integrated plan against the one the solver reports."""
-    end = form.terminal_cost(again.states[-1], again.states[0], again.controls[0], solution.horizon, p)
-    cost = again.cost + end
-    # parts of the running cost may cancel: judge by their size
-    running = form.sampled([form.running], again.plan, again.controls, again.t, solution.horizon, p)[0]
-    parts = np.abs(running).ravel()
-    spent = float(np.sum(np.diff(again.t) * (parts[:-1] + parts[1:]) / 2))
-    size = max(abs(cost), abs(again.cost), abs(end), abs(solution.cost), spent)
+    end = form.terminal_cost(states[-1], states[0], first, solution.horizon, p)
+    cost = running + end
+    size = max(abs(cost), abs(end), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
     off = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
     return Finding("cost, relative", off, limit, None, f"reported {solution.cost:.8g}, integrated {cost:.8g}")
 
 
-def reported_finding(solution: Solution, limit: float) -> Finding:
+def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
     """The reported arrays against the interpolants, relative; at a break the value of either side will do."""
     off = np.zeros(len(solution.t))
-    for pool, curve in (
-        (solution.states, solution.state_interpolant),
-        (solution.controls, solution.control_interpolant),
-        (solution.costates, solution.costate_interpolant),
+    costates = float(np.max(np.abs(solution.costate_interpolant.values), initial=0.0)) or 1.0
+    for pool, curve, size in (
+        (solution.states, solution.state_interpolant, sizes.state),
+        (solution.controls, solution.control_interpolant, sizes.control),
+        (solution.costates, solution.costate_interpolant, costates),
     ):
         values = stack(pool, len(off))
-        sides = [curve(solution.t / solution.horizon + shift) - values for shift in (-1e-12, 1e-12)]
-        size = np.max(np.abs(curve.values), initial=0.0) or 1.0
-        off = np.maximum(off, np.min([np.abs(side).max(axis=1, initial=0.0) for side in sides], axis=0) / size)
+        sides = [np.abs(curve(solution.t / solution.horizon + shift) - values) / size for shift in (-1e-12, 1e-12)]
+        off = np.maximum(off, np.min([side.max(axis=1, initial=0.0) for side in sides], axis=0))
     return worst("reported values, relative", off, solution.t, limit)
 
 
-def jump(name: str, interpolant: PiecewisePolynomial, horizon: float, limit: float | None) -> Finding:
+def jump(
+    name: str, interpolant: PiecewisePolynomial, horizon: float, sizes: np.ndarray, limit: float | None
+) -> Finding:
     """Largest jump between two pieces, relative to the size of what jumps."""
     n = len(interpolant.breaks) - 1
     pieces = np.arange(n)
     left = interpolant.within(pieces[:-1], np.ones(n - 1))
     right = interpolant.within(pieces[1:], np.zeros(n - 1))
-    size = np.max(np.abs(interpolant.values), initial=0.0)
-    gaps = np.abs(right - left).max(axis=1, initial=0.0) / (size if size > 0 else 1.0)
-    note = f"{np.max(gaps, initial=0.0) * size:.3g} in its own unit"
-    return worst(name, gaps, interpolant.breaks[1:-1] * horizon, limit, note)
+    gaps = np.abs(right - left)
+    note = f"{np.max(gaps, initial=0.0):.3g} in its own unit"
+    return worst(name, (gaps / sizes).max(axis=1, initial=0.0), interpolant.breaks[1:-1] * horizon, limit, note)

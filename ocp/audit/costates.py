@@ -19,11 +19,11 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import DEPENDENT, holders
+from ocp.audit.principle import DEPENDENT, holders, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "Ends", "adjoint", "nonnegative"]
+__all__ = ["Adjoint", "Backwards", "Ends", "adjoint"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -74,25 +74,31 @@ class Adjoint:
     ends: Ends
 
 
-def adjoint(along: Linearisation, cost: float) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float) -> Adjoint:
     """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
 
     Args:
-        along: The plan. cost: A size of the cost, which errors are weighed by.
+        along: The plan.
+        curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
+        cost: A size of the cost, which errors are weighed by.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
-    near, at_node = along.stand.near.reshape(n, -1).any(axis=1), along.node_stand.near.any(axis=1)
+    near, at_node = (
+        np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
+    )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
-    holding = holders(along, costate)
+    holding, across = holders(along, costate, curved)
     for _ in range(ROUNDS):
-        back = _Backwards(along, holding)
-        for k in limited:
+        before = holding != 0
+        back = Backwards(along, holding, across)
+        for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
+        along.follow((inside != 0).any(axis=1) | (atoms != 0).any(axis=1))
         costate, start = back.integrate(last, inside, atoms)
-        holding = holders(along, costate)
-        if not (limited.size or along.mixed.size):
+        holding, across = holders(along, costate, curved)
+        if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():
             break
     size = along.sizes.state
     places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
@@ -102,9 +108,8 @@ def adjoint(along: Linearisation, cost: float) -> Adjoint:
     standing[:, 0] += atoms[:, 0] / places[:, 0]
     standing[:, -1] += atoms[:, 1] / places[:, -1]
     force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.stand_x[..., :-1].reshape(n, q, m, -1))) @ size
-    for e, k in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        push = np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[k, :, :-1])) @ size
-        force[:, 0] += push
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[nodes, :, :-1])) @ size
     return Adjoint(
         along.mesh * along.solution.horizon,
         costate,
@@ -127,16 +132,16 @@ def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
     return values[:-1], values[1:]
 
 
-class _Backwards:
+class Backwards:
     """The costate equation over every interval backwards, what holds the controls answering to the costates."""
 
-    def __init__(self, along: Linearisation, holding: np.ndarray) -> None:
+    def __init__(self, along: Linearisation, holding: np.ndarray, across: np.ndarray) -> None:
         self.along = along
         n, q = along.shape
         nx, nu = along.form.nx, along.form.nu
         rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
         feed, given = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
-        unit = along.sizes.control
+        unit, mixed = along.sizes.control, slice(nu, nu + along.mixed.size)
         pushing = holding != 0
         self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
         held = np.flatnonzero(pushing.any(axis=1))
@@ -145,8 +150,11 @@ class _Backwards:
             inverse = np.linalg.pinv(rows.transpose(0, 2, 1), rcond=DEPENDENT)
             self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
+                given += np.einsum("km,kmi->ki", holding[:, mixed] * across[:, None], along.row_y[:, along.mixed, :nx])
+                held, inverse = held[~across[held]], inverse[~across[held]]
                 # multipliers = - inverse (unit slope): the costate equation has them as a feedback of the costate
-                answer = np.einsum("kmi,kmu->kiu", along.row_y[held][:, along.mixed, :nx], inverse[:, nu:]) * unit
+                slopes = along.row_y[held][:, along.mixed, :nx]
+                answer = np.einsum("kmi,kmu->kiu", slopes, inverse[:, mixed]) * unit
                 feed[held] -= answer @ rate_u[held].transpose(0, 2, 1)
                 given[held] -= np.einsum("kiu,ku->ki", answer, along.cost_y[held, nx + 1 :])
         ahead = along.weight - along.matrix  # of the integral from a point to the end
@@ -176,9 +184,7 @@ class _Backwards:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
 
-def _pushes(
-    back: _Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Pushes of the limits of the states in interval k that explain its costates best: (q, m), (2, m)."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.stand.lower.shape[1]
@@ -186,15 +192,18 @@ def _pushes(
     size, unit = along.sizes.state, along.sizes.control
     limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
     slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
-    columns, charges, owners = [], [], []
+    columns, charges, owners, free = [], [], [], []
     for kind, (limit, slope_x) in enumerate(zip(limits, slopes, strict=True)):
-        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower, limit.below, -1.0)):
+        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower & ~limit.equal, limit.below, -1.0)):
             for j, i in zip(*np.nonzero(side), strict=True):
                 reach = float(np.abs(slope_x[j, i]) @ size)
-                if reach > 0:
+                # an equality pushes where a transcription holds it: one unknown for each of its own
+                elsewhere = limit.equal[i] and (kind, j) != (1, 0) if along.nodal else limit.equal[i] and kind == 1
+                if reach > 0 and not elsewhere:
                     columns.append((kind, j, sign * slope_x[j, i] / reach))
                     charges.append(gap[j, i] / reach)
                     owners.append((kind, j, i, sign / reach))
+                    free.append(bool(limit.equal[i]))
     inside, atoms = np.zeros((q, m)), np.zeros((2, m))
     if not columns:
         return inside, atoms
@@ -223,38 +232,10 @@ def _pushes(
     slopes_c = np.einsum("j,juv,cjv->cju", weight, held, unit * np.einsum("jiu,cji->cju", rate_u, answer))
     target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
     matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    found = nonnegative(matrix, target, TRUSTED * np.array(charges)) * cost
+    found = nonnegative(matrix, target, TRUSTED * np.array(charges), np.array(free, bool)) * cost
     for (kind, j, i, scale), value in zip(owners, found, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
-
-
-def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """The y >= 0 (m,) of least |matrix y - target|^2 / 2 + price . y, by active sets (Lawson, Hanson 1974, ch 23)."""
-    m = matrix.shape[1]
-    y, passive = np.zeros(m), np.zeros(m, bool)
-    normal, right = matrix.T @ matrix, matrix.T @ target - price
-    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
-    for _ in range(3 * m + 10):
-        pull = np.where(passive, -np.inf, right - normal @ y)
-        if not m or pull.max() <= small:
-            break
-        passive[int(np.argmax(pull))] = True
-        while True:
-            index = np.flatnonzero(passive)
-            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
-            if (best > 0).all():
-                y[:] = 0.0
-                y[index] = best
-                break
-            falling = best <= 0
-            share = np.min(y[index][falling] / (y[index][falling] - best[falling] + np.finfo(float).tiny))
-            y[index] += min(max(share, 0.0), 1.0) * (best - y[index])
-            drop = index[(y[index] <= 1e-15 * np.abs(y).max(initial=0.0)) & falling]
-            if not drop.size:
-                drop = index[falling][:1]
-            y[drop], passive[drop] = 0.0, False
-    return y
 
 
 def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -294,12 +275,14 @@ def _ends(
     value, slopes, gradient = (np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, along.p))
     # dT H/dT along the plan, what pushes included
     by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
-    by_horizon += np.einsum("km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu :])
+    by_horizon += np.einsum(
+        "km,km->k", along.row_y[:, along.mixed, nx], holding[:, form.nu : form.nu + along.mixed.size]
+    )
     lasting = float(along.share @ by_horizon)
     n, q = along.shape
     lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
-    for e, k in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        lasting += float(np.sum(atoms[:, e] * along.node_stand_x[k, :, nx]))
+    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
+        lasting += float(np.sum(atoms[:, e] * along.node_stand_x[nodes, :, nx]))
     target = np.concatenate([lam1 - gradient[:nx, 0], -lam0 - gradient[nx : 2 * nx, 0], [-lasting - gradient[-1, 0]]])
     unit = np.concatenate([sizes.state, sizes.state, [solution.horizon]])
 
@@ -311,7 +294,7 @@ def _ends(
     at_horizon = Limits(
         np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
     )
-    columns, charges, owners = [], [], []
+    columns, charges, owners, unsigned = [], [], [], []
     eye = np.eye(2 * nx + 1)
     node = along.node_stand
     into = [*range(nx), 2 * nx], [*range(nx, 2 * nx), 2 * nx]
@@ -322,25 +305,29 @@ def _ends(
         wide[:, where] = along.node_stand_x[k]
         parts.append((node.at(slice(k, k + 1)), wide, np.full(len(wide), -1)))
     for limit, slope_y, own in parts:
-        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (limit.lower[0], limit.below[0], -1.0)):
+        lower = limit.lower[0] & ~limit.equal
+        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (lower, limit.below[0], -1.0)):
             for i in np.flatnonzero(side):
                 reach = float(np.abs(slope_y[i]) @ unit)
                 if reach > 0:
                     columns.append(sign * slope_y[i] / reach)
                     charges.append(gap[i] / reach)
                     owners.append((int(own[i]), sign / reach))
+                    unsigned.append(bool(limit.equal[i]))
     free = np.ones(2 * nx + 1, bool)
     free[:nx] = low[places["terminal"]] < high[places["terminal"]]
     free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
     free[-1] = form.horizon_is_free
     matrix = (np.array(columns).reshape(len(columns), 2 * nx + 1) * unit).T[free]
-    found = nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges)) * cost
+    found = (
+        nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges), np.array(unsigned, bool)) * cost
+    )
     left = np.zeros(2 * nx + 1)
     left[free] = np.abs((target * unit)[free] - matrix @ found)
     multipliers = np.zeros(len(index))
-    for (own, scale), force in zip(owners, found, strict=True):
-        if own >= 0:
-            multipliers[own] += scale * force
+    for (owner, scale), force in zip(owners, found, strict=True):
+        if owner >= 0:
+            multipliers[owner] += scale * force
     charge = float(np.dot(charges, found)) if charges else 0.0
     cut = len(form.end)
     return Ends(float(left[:-1].sum()), float(left[-1]), charge, multipliers[:cut], multipliers[cut:])

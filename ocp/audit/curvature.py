@@ -16,6 +16,7 @@ import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
 from ocp.audit.principle import FLAT
+from ocp.problem.formulation import Formulation
 
 __all__ = ["Curvature", "curvature"]
 
@@ -127,6 +128,7 @@ def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
     for k in reversed(range(n)):
         joined = stage[k] + step[k].T @ cost @ step[k]
         own = [accessory.rows[k * q + j] @ whole[k, j] for j in range(q)]
+        own += [accessory.node_rows[k] @ np.eye(nz, step.shape[2]), accessory.node_rows[k + 1] @ step[k]]
         if weak:
             own += [accessory.weak[k * q + j] @ whole[k, j] for j in range(q)]
         for i in np.flatnonzero(accessory.moved[k]):  # a switch moves: one variation, of the mean

@@ -8,6 +8,7 @@ that dx/ds = T f, and a change of the horizon T is a change of the integrands.
 from __future__ import annotations
 
 from copy import copy
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,8 @@ __all__ = ["NEAR", "Limits", "Linearisation", "gauss"]
 
 POINTS = (3, 5)
 """Least and largest number of Gauss points of an interval."""
+MOST_DERIVATIVES = 3
+"""Of a limit of the states, looked at for a control."""
 NEAR = 1e-2
 """A limit nearer than this share of the size of what it limits may push; what it pushes over the gap is charged."""
 
@@ -51,7 +54,7 @@ class Limits:
     @property
     def near(self) -> np.ndarray:
         """Which may push on either side. Shape (M, m), bool."""
-        return self.lower | self.upper
+        return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
         """What multipliers (M, m) win over the gaps to their limits: at least zero. Shape (M, m)."""
@@ -66,13 +69,15 @@ class Linearisation:
         width, weight, places: Of the N intervals (N,) and of the Gauss points in one, (q,) each. matrix: Runge-Kutta
             matrix of these. shape: (N, q).
         s, t: Fractions of the horizon and times of the M = N q points, s. Shape (M,).
+        nodal: Whether the plan is reported at the ends of its intervals alone.
         x, u, costate: The plan at the points, as it reports them. Shape (M, n).
         cost, cost_y: T L, and its derivatives in y = (x, T, u). Shapes (M,), (M, ny).
         rate, rate_y: T f, (M, nx), and its derivatives, (M, nx, ny).
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
         sizes: Of all named things along the plan.
-        hold: Limits of the controls and of path rows with a control (``mixed``), in this order. Shape (M, nu + r).
-        hold_u: Their derivatives in the controls. Shape (M, nu + r, nu).
+        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs, in this order. Shape
+            (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
+        arc_of: Which limit of the states each arc follows. Shape (a,).
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
             derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
         low, high: Limits of the controls at the points. Shape (M, nu).
@@ -91,11 +96,13 @@ class Linearisation:
         self.matrix, self.weight = gauss(self.places)
         self.s = (mesh[:-1, None] + self.width[:, None] * self.places).ravel()
         self.t = self.s * solution.horizon
+        self.nodal = len(solution.t) == n + 1
         self.x = solution.state_interpolant(self.s)
         self.u = solution.control_interpolant.within(np.repeat(np.arange(n), q), np.tile(self.places, n))
         self.costate = solution.costate_interpolant(self.s)
         self._differentiate()
         self._limits()
+        self._arcs()
 
     def _differentiate(self) -> None:
         form, m = self.form, len(self.s)
@@ -112,7 +119,7 @@ class Linearisation:
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
 
     @property
-    def here(self) -> tuple[object, ...]:
+    def here(self) -> tuple[Any, ...]:
         """The arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
@@ -172,11 +179,49 @@ class Linearisation:
         self.node_stand_x[:, :nx, :nx] = np.eye(nx)
         self.node_stand_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
+    def _arcs(self) -> None:
+        """Limits of the states hold the controls too where a plan follows them: by the first derivative that has one.
+
+        On an arc the costates are known up to multiples of the gradients of the limit and its derivatives (Hartl,
+        Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of the last derivative.
+        """
+        form, nx, nu = self.form, self.form.nx, self.form.nu
+        low, high = (side[form.bounds.places["state"]] for side in self.bounds)
+        bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+        self.arc_of = np.concatenate([bounded, nx + np.arange(len(self.still))]).astype(int)
+        rows = ca.vertcat(*[form.x[int(i)] for i in bounded], *[form.path.expression[int(i)] for i in self.still])
+        m, count = len(self.s), len(self.arc_of)
+        self.hold_u = np.concatenate([self.hold_u, np.zeros((m, count, nu))], axis=1)
+        for limits in (self.hold,):
+            for name in ("below", "above", "lower", "upper"):
+                part = getattr(limits, name)
+                setattr(limits, name, np.hstack([part, np.zeros((m, count), part.dtype)]))
+            limits.equal = np.append(limits.equal, np.zeros(count, bool))
+        left = np.arange(count)
+        for _ in range(MOST_DERIVATIVES):
+            if not left.size or not nu:
+                break
+            rows = ca.mtimes(ca.jacobian(rows, form.x), form.f) + ca.jacobian(rows, form.t)
+            in_control = ca.jacobian(rows, form.u)
+            found = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
+            if found.any():
+                which = np.flatnonzero(found)
+                (slopes,) = form.sampled([in_control[which.tolist(), :]], *self.here[:5])
+                slopes = slopes.reshape(m, nu, len(which)).transpose(0, 2, 1)
+                self.hold_u[:, -count:][:, left[which]] = slopes
+                rows, left = rows[np.flatnonzero(~found).tolist()], left[~found]
+        self.follow(np.zeros((self.shape[0], len(self.stand.equal)), bool))
+
+    def follow(self, pushing: np.ndarray) -> None:
+        """Take the limits of the states that push in an interval, (N, nx + r') bool, and equalities for arcs there."""
+        count = len(self.arc_of)
+        if count:
+            arc = np.repeat(pushing[:, self.arc_of], self.shape[1], axis=0) | self.stand.equal[self.arc_of]
+            self.hold.lower[:, -count:] = self.hold.upper[:, -count:] = arc
+
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
     at, weight = np.polynomial.legendre.leggauss(len(places))
     matrix = [c / 2 * weight @ lagrange(places, c * (at + 1) / 2) for c in places]
     return np.array(matrix), quadrature_weights(places)
-
-

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import Adjoint, Ends, adjoint
 from ocp.audit.curvature import Curvature, curvature
+from ocp.audit.degeneracy import better_costates
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope
+from ocp.audit.principle import Hamiltonian, hamiltonian, holders, lost, reduced_slope
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
@@ -19,6 +21,12 @@ __all__ = ["Optimality", "optimality"]
 
 CONTROLS_KNOWN = 1e-3
 """Share of their sizes up to which controls are told apart, where the cost itself is nearly nothing."""
+
+
+DEGENERATE = 1e-5
+"""Share of the cost from which on it is worth looking for costates that fit the plan better than those reported."""
+ROUNDING = 1e-12
+"""Share of what the controls themselves would cost, below which costates are rounding."""
 
 
 @dataclass(frozen=True)
@@ -51,25 +59,40 @@ def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bou
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
     size = abs(solution.cost) or along.slope_size or 1.0
-    first = adjoint(along, size)
+    first = adjoint(along, _curved(along), size)
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
     cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
     cost = cost if cost > 0 else 1.0
-    by_point = lost(along, first.costate, first.holding, accessory.curved) * along.share
-    total = by_point.reshape(along.shape).sum(axis=1) + first.charge
+    total = lost(along, first.costate, first.holding, accessory.curved)
+    if accessory.flat.any() and total.sum() > DEGENERATE * cost:
+        costate = better_costates(along, first.costate, first.holding, accessory.flat)
+        less = lost(along, costate, holders(along, costate, accessory.curved)[0], accessory.curved)
+        total = min(total, less, key=np.sum)
+    total = np.maximum(total, 0.0) + first.charge
     total[0] += first.ends.charge
     second = curvature(accessory)
     return Optimality(
         total,
         cost,
-        float(np.sqrt(cost * max(cost, spread))),
+        max(float(np.sqrt(cost * max(cost, spread))), ROUNDING * accessory.magnitude),
         along.t,
         reduced_slope(along, first.costate, first.holding),
         first,
         hamiltonian(form, solution, p),
         second,
     )
+
+
+def _curved(along: Linearisation) -> np.ndarray | None:
+    """T H_uu at the points but for its path constraints, (M, nu, nu), where an inequality with a control needs it."""
+    form = along.form
+    if form.path.equality[along.mixed].all():
+        return None
+    lam = form.sym("lam", form.nx)
+    total = along.scaled[0] + ca.dot(lam, along.scaled[1])
+    (curved,) = form.sampled([ca.hessian(total, form.u)[0]], *along.here, (lam, along.costate))
+    return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
@@ -79,7 +102,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
     ends = Ends(np.inf, np.inf, np.inf, np.zeros(len(form.end)), np.zeros(len(form.start)))
     t = along.mesh * along.solution.horizon
     shapes = form.nx, along.hold_u.shape[1], along.stand_x.shape[1]
-    parts = [np.full((m, k), np.nan) for k in shapes]
+    costate, holding, standing = (np.full((m, k), np.nan) for k in shapes)
     curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
     return Optimality(
         nothing,
@@ -87,7 +110,7 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         1.0,
         along.t,
         np.full(m, np.inf),
-        Adjoint(t, *parts, error=nothing, between=nothing, charge=nothing, ends=ends),
+        Adjoint(t, costate, holding, standing, nothing, nothing, nothing, ends),
         values,
         curved,
     )

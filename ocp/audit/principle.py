@@ -10,17 +10,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Linearisation
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, stack
 
-__all__ = ["FLAT", "Hamiltonian", "balance", "groups", "hamiltonian", "holders", "lost", "reduced_slope", "slope"]
+__all__ = [
+    "DEPENDENT",
+    "FLAT",
+    "Hamiltonian",
+    "balance",
+    "groups",
+    "hamiltonian",
+    "holders",
+    "lost",
+    "nonnegative",
+    "reduced_slope",
+    "slope",
+]
 
 DEPENDENT = 1e-9
 """Singular values below this share of the largest are none."""
+STEEP = 1e-6
+"""Slope of the Hamiltonian, of the largest, above which it is worth looking for what holds it across a gap."""
 FLAT = 1e-7
 """Curvature, relative to the largest of the plan, below which the cost counts as not curved."""
 
@@ -55,14 +68,50 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
 
 
-def holders(along: Linearisation, costate: np.ndarray) -> np.ndarray:
-    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points. Shape (M, nu + r).
+def holders(
+    along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points.
 
-    Those that make T H most nearly stationary, controls in units of their sizes.
+    Those that make T H most nearly stationary, controls in units of their sizes. What a plan meets at single points of
+    an interval only, as with held controls, pushes over the gap elsewhere, where that loses less than the slope does.
+
+    Args:
+        along: The plan. costate: (M, nx).
+        curved: T H_uu, (M, nu, nu); None where it is not known yet, and nothing pushes over a gap.
+
+    Returns:
+        multipliers: Per unit of s. Shape (M, nu + r + a).
+        across: At which points some push over a gap. Shape (M,), bool.
     """
-    unit = along.sizes.control
-    hold = along.hold
-    return balance(slope(along, costate) * unit, along.hold_u * unit, hold.lower, hold.upper)
+    unit, hold, mixed = along.sizes.control, along.hold, along.mixed.size
+    gradient, directions = slope(along, costate) * unit, along.hold_u * unit
+    found = balance(gradient, directions, hold.lower, hold.upper)
+    across = np.zeros(len(found), bool)
+    if curved is None or not mixed:
+        return found, across
+    left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
+    steep = float(np.abs(gradient).max())
+    for k in np.flatnonzero(left > STEEP * steep):
+        bend = curved[k] * unit * unit[:, None]
+        values, vectors = np.linalg.eigh((bend + bend.T) / 2)
+        root = vectors / np.sqrt(np.maximum(values, np.abs(gradient[k]).max() * FLAT + FLAT * np.abs(values).max()))
+        sides = []
+        for i in range(len(found[k])):
+            both = hold.lower[k, i] and hold.upper[k, i]
+            if both:
+                sides.append((i, 1.0, 0.0, True))
+            elif i < len(unit) + mixed:
+                sides += [(i, 1.0, hold.above[k, i], False), (i, -1.0, hold.below[k, i], False)]
+        sides = [side for side in sides if np.isfinite(side[2]) and np.abs(directions[k, side[0]]).max() > 0]
+        which, sign, gap, free = (np.array(part) for part in zip(*sides, strict=True))
+        rows = directions[k, which] * sign[:, None]
+        size = np.abs(rows).max(axis=1)
+        pushed = nonnegative((rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool))
+        found[k] = 0.0
+        np.add.at(found[k], which, sign * pushed / size)
+        across[k] = True
+    return found, across
 
 
 def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
@@ -112,6 +161,43 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
     return np.asarray(np.abs(left).max(axis=1, initial=0.0) / size)
 
 
+def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The y (m,) of least |matrix y - target|^2 / 2 + price . y, at least zero but where it is ``free`` (m,), bool.
+
+    By active sets (Lawson, Hanson 1974, chapter 23); of the free ones the least that do it.
+    """
+    y = np.zeros(matrix.shape[1])
+    bound = ~free
+    if free.any():
+        inverse = np.linalg.pinv(matrix[:, free], rcond=DEPENDENT)
+        rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
+        left = target - matrix[:, free] @ (inverse @ target)
+        y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
+        y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
+        return y
+    normal, right = matrix.T @ matrix, matrix.T @ target - price
+    passive = np.zeros(len(y), bool)
+    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
+    for _ in range(3 * len(y)):
+        pull = np.where(passive, -np.inf, right - normal @ y)
+        if pull.max() <= small:
+            break
+        passive[np.argmax(pull)] = True
+        while True:
+            index = np.flatnonzero(passive)
+            best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
+            falling = best <= 0
+            if not falling.any():
+                y[index] = best
+                break
+            ratio = y[index][falling] / np.maximum(y[index][falling] - best[falling], np.finfo(float).tiny)
+            y[index] += float(np.clip(ratio.min(), 0.0, 1.0)) * (best - y[index])
+            drop = index[falling & (y[index] <= 1e-15 * np.abs(y).max())]
+            drop = drop if drop.size else index[falling][:1]
+            y[drop], passive[drop] = 0.0, False
+    return y
+
+
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Distinct rows of patterns (M, m), bool, each with the indices of its members."""
     if not len(patterns):
@@ -123,7 +209,7 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """What the controls at each point could win within their limits, to second order, in cost per unit of s. (M,).
+    """What the controls could win in each interval within their limits, to second order, in units of cost. (N,).
 
     Args:
         along: The plan. costate: (M, nx).
@@ -133,9 +219,9 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     A control moves within its limits, and by its size at most where the Hamiltonian does not curve along it. Rows that
     push stay where they are.
     """
-    nu = along.form.nu
+    nu, n = along.form.nu, along.shape[0]
     if not nu:
-        return np.zeros(len(along.s))
+        return np.zeros(n)
     unit = along.sizes.control
     won = along.hold.charge(multipliers).sum(axis=1)
     gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
@@ -145,7 +231,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
     size = np.abs(along.hold_u * unit).max(axis=2)
     pushes = (np.abs(multipliers) * size > FLAT * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
-    fixed = pushes.copy()
+    fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
     best = np.zeros(len(won))
     while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
         blocked = fixed.copy()
@@ -159,8 +245,35 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
             best[members] = np.maximum(best[members], -change)
             blocked[members, :nu] |= room <= DEPENDENT
         if (blocked == fixed).all():
-            return np.asarray(won + best)
+            break
         fixed = blocked
+    by_interval = ((won + best) * along.share).reshape(n, -1).sum(axis=1)
+    if along.mixed.size:
+        return np.asarray(by_interval)
+    free = slope(along, costate) * unit
+    flat = np.abs(curved).max(axis=(0, 2)) <= FLAT * max(scale, float(np.abs(free).max(initial=0.0)))
+    return np.asarray(by_interval + _kinks(along, free[:, flat], -low[:, flat], high[:, flat]))
+
+
+def _kinks(along: Linearisation, pull: np.ndarray, down: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """What the quadrature of max(pull, 0) down + max(-pull, 0) up (M, m) misses of intervals where pull turns. (N,)."""
+    (n, q), m = along.shape, pull.shape[1]
+    pull = pull.reshape(n, q, m)
+    turns = (pull.min(axis=1) < 0) & (pull.max(axis=1) > 0)
+    off = along.places - along.weight @ along.places
+    steep = np.einsum("j,kjm->km", along.weight * off, pull) / (along.weight @ off**2)
+    mean = np.einsum("j,kjm->km", along.weight, pull)
+    line = mean[:, None] + steep[:, None] * off[:, None]
+    first, last = mean + steep * (0.0 - along.weight @ along.places), mean + steep * (1.0 - along.weight @ along.places)
+    missed = np.zeros((n, m))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for sign, room in ((1.0, down), (-1.0, up)):
+            a, b = np.maximum(sign * first, 0.0), np.maximum(sign * last, 0.0)
+            exact = (b**2 - a**2) / (2 * sign * (last - first))
+            seen = np.einsum("j,kjm->km", along.weight, np.maximum(sign * line, 0.0))
+            width = np.minimum(room.reshape(n, q, m).mean(axis=1), 1.0)
+            missed += np.where(turns, width * (exact - seen), 0.0)
+    return np.asarray(along.width * missed.sum(axis=1))
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, rows: np.ndarray, scale: float) -> np.ndarray:

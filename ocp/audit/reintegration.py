@@ -1,29 +1,38 @@
-"""What the controls of a plan really do: integrated anew with tight tolerances, knowing nothing of the transcription.
+"""What the controls of a plan really do: integrated anew, knowing nothing of the transcription.
 
-And how far every bound and constraint of the problem is missed along the states that come out.
+Every interval is integrated in the steps of the fine grid, which are halved where the error of a step says so: what
+happens between the points of a plan, a push of a millisecond say, is met by a stage of some step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ocp.console import quiet
-from ocp.curves import integrator, lagrange_expressions
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.audit.sizes import FineGrid, Sizes
+from ocp.curves import dormand_prince_step, newton_coefficients
+from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
-__all__ = ["Reintegration", "reintegrate", "violations"]
+__all__ = ["Reintegration", "reintegrate"]
 
-Check = tuple[str, str, np.ndarray, np.ndarray, float]  # label, name, violations (K,), times (K,), scale
+TOLERANCE = 1e-11  # of the error of one step, relative to the size of each state
+ROUNDING = 1e-15  # of a state: its last digit
+ORDER = 5  # of the error of a step in its width
+MOST_PIECES = 32  # that a step is split into at once
+MOST_ROUNDS = 20  # of splitting
+MOST_STEPS = 1_000_000  # at once
+BLOCK = 512  # steps in one call
+INLINE = 1000  # instructions of the dynamics up to which a step is one flat SX function
+GROWN = 10.0  # times what every interval adds: a plan that is so far off has been carried off by its dynamics
 
 
 @dataclass(frozen=True)
 class Reintegration:
-    """What the controls of a plan really do.
+    """What the controls of a plan really do, on its fine grid.
 
     Attributes:
         t: Times, s; every interval from its start to its end, so that interior mesh times stand twice. Shape (M,).
@@ -32,7 +41,10 @@ class Reintegration:
         controls: Of the plan, from the side of the interval. Shape (M, nu).
         local: Integrated over each interval from the plan's own state at its start. Shape (M, nx).
         plan: The plan's interpolated states. Shape (M, nx).
-        cost: Running cost integrated along ``states``.
+        cost: Running cost integrated along ``states``. local_cost: along ``local``.
+        errors: Distance of ``states`` from the plan, relative to the sizes, the largest of all states. Shape (M,).
+        local_errors: The same of ``local``. Shape (M,).
+        added: Sum of what the intervals up to each one leave between their end and the plan's next start. Shape (N,).
         broke_down: Time at which the integration could not go on, s, or None.
     """
 
@@ -43,116 +55,186 @@ class Reintegration:
     local: np.ndarray
     plan: np.ndarray
     cost: float
+    local_cost: float
+    errors: np.ndarray
+    local_errors: np.ndarray
+    added: np.ndarray
     broke_down: float | None
 
+    def carried_off(self, limit: float) -> bool:
+        """Whether it is the growth of unstable dynamics that takes ``states`` further from the plan than ``limit``.
 
-def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, samples: int) -> Reintegration:
-    """Integrate the controls of ``solution`` with ``samples`` points in every interval."""
-    mesh, nodes = solution.control_interpolant.breaks, solution.control_interpolant.nodes
-    values = solution.control_interpolant.values  # (n, c, nu)
-    n = len(mesh) - 1
-    places = np.linspace(0.0, 1.0, samples + 1)
-    along = interval_integrator(form, nodes, places[1:])
-    shared = np.tile(np.append(solution.horizon, p)[:, None], (1, n))
-    constants = np.vstack([values.reshape(n, -1).T, mesh[:-1], np.diff(mesh), shared])
-    piece, place = np.repeat(np.arange(n), samples + 1), np.tile(places, n)
-    fractions = mesh[piece] + np.diff(mesh)[piece] * place
-    plan = solution.state_interpolant(fractions)
-    # at the end of an interval the plan's own value from the left, which differs where it jumps
-    at_end = place == 1.0
-    left = fractions[at_end] * (1 - 1e-15)
-    plan[at_end] = solution.state_interpolant(left)
-    starts = solution.state_interpolant(mesh[:-1])
+        Then they lose a plan that each interval keeps: what is left at the ends of the intervals, added up without
+        growing, is less than a tenth of the distance where that exceeds the limit.
+        """
+        beyond = ~(self.errors <= limit)
+        if not beyond.any():
+            return False
+        first = int(np.argmax(beyond))
+        k = int(self.interval[first])
+        here = self.local_errors[self.interval == k].max()
+        return bool(self.added[k] + here <= limit / GROWN)
 
-    local = np.full((n, samples + 1, form.nx), np.nan)
-    states = np.full((n, samples + 1, form.nx), np.nan)
-    state, cost, broke_down = starts[0], 0.0, None
-    for k in range(n):
-        local[k, 0], states[k, 0] = starts[k], state
-        try:
-            with quiet():
-                out = along(x0=starts[k], p=constants[:, k])
-            local[k, 1:] = out["xf"].full().T
-        except RuntimeError:
-            local[k, 1:] = np.nan
-        if broke_down is not None:
-            continue
-        try:
-            with quiet():
-                out = along(x0=state, p=constants[:, k])
-            states[k, 1:] = out["xf"].full().T
-            cost += float(out["qf"][-1])
-        except RuntimeError:
-            pass
-        state = states[k, -1]
-        if not np.all(np.isfinite(state)):
-            broke_down = float(mesh[k] * solution.horizon)
+
+def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, grid: FineGrid, sizes: Sizes) -> Reintegration:
+    """Integrate the controls of ``solution``, over every interval and over the whole horizon."""
+    n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
+    flow = Flow(form, solution, p, sizes)
+    by_interval = grid.states.reshape(n, cells + 1, form.nx)
+    starts = by_interval[:, 0]
+
+    def on_grid(start: np.ndarray, after: np.ndarray) -> np.ndarray:
+        return np.concatenate([start[:, None], after], axis=1).reshape(-1, form.nx)
+
+    after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
+    found = after.reshape(n, cells, -1)
+    local = on_grid(starts, found[:, :, :-1])
+    local_cost = float(found[:, -1, -1].sum())
+    found = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1], steps)[0].reshape(n, cells, -1)
+    states = on_grid(np.vstack([starts[:1], found[:-1, -1, :-1]]), found[:, :, :-1])
+    cost = float(found[-1, -1, -1])
+    lost = ~np.isfinite(states).all(axis=1)
+    left = np.abs(local.reshape(by_interval.shape)[:-1, -1] - starts[1:]) / sizes.state
     return Reintegration(
-        fractions * solution.horizon,
-        piece,
-        states.reshape(-1, form.nx),
-        solution.control_interpolant.within(piece, place),
-        local.reshape(-1, form.nx),
-        plan,
-        cost if broke_down is None else float("nan"),
-        broke_down,
+        grid.t,
+        grid.interval,
+        states,
+        grid.controls,
+        local,
+        grid.states,
+        cost,
+        local_cost,
+        _relative(states - grid.states, sizes.state),
+        _relative(local - grid.states, sizes.state),
+        np.concatenate([[0.0], np.cumsum(_worst(left))]),
+        float(grid.t[np.argmax(lost)]) if lost.any() else None,
     )
 
 
-def interval_integrator(form: Formulation, nodes: np.ndarray, places: np.ndarray) -> Any:
-    """Integrator over one interval, whose time is the place 0..1 in it; p = [control values, s, h, T, parameters]."""
-    sym = form.sym
-    nw = form.nu * len(nodes)
-    x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
-    controls = ca.reshape(q[:nw], form.nu, len(nodes))
-    s, h, horizon, p = q[nw], q[nw + 1], q[nw + 2], q[nw + 3 :]
-    u = ca.mtimes(controls, lagrange_expressions(nodes, place))
+def _relative(difference: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    return _worst(np.abs(difference) / sizes)
+
+
+def _worst(values: np.ndarray) -> np.ndarray:
+    """Largest of each row, infinite where one is not a number. Shape (M,)."""
+    return np.asarray(np.where(np.isnan(values), np.inf, values).max(axis=1, initial=0.0))
+
+
+class Steps(NamedTuple):
+    """Steps of an integration in their order: the cell of each, its place and its width in the interval. (S,) each."""
+
+    cell: np.ndarray
+    place: np.ndarray
+    width: np.ndarray
+
+    @classmethod
+    def even(cls, cells: int, each: int) -> Steps:
+        """One step a cell, of which an interval has ``each``."""
+        cell = np.arange(cells)
+        return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
+
+    @classmethod
+    def together(cls, parts: list[Steps]) -> Steps:
+        """The steps of several parts in order."""
+        cell, place, width = (np.concatenate(values) for values in zip(*parts, strict=True))
+        order = np.lexsort((place, cell))
+        return cls(cell[order], place[order], width[order])
+
+
+class Flow:
+    """The dynamics and the running cost under the controls of a plan, to be integrated from any states."""
+
+    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, sizes: Sizes) -> None:
+        curve = solution.control_interpolant
+        self._columns = np.vstack(
+            [
+                newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1).T,
+                curve.breaks[:-1],
+                np.diff(curve.breaks),
+            ]
+        )
+        self._tolerance = TOLERANCE * np.append(sizes.state, sizes.cost)
+        self._step = step_function(form, curve.nodes, solution.horizon, p).mapaccum("steps", BLOCK)
+        self._intervals = len(curve.values)
+
+    def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
+        """States and cost at the ends of all cells, which divide the intervals evenly; nan where it breaks down.
+
+        Args:
+            chain: Which cells follow each other, increasing. Shape (cells,). starts: State of each chain at its start,
+                where its cost is zero. Shape (chains, nx). steps: To begin with; None: one a cell.
+
+        Returns:
+            Shape (cells, nx + 1), and the steps that it took; where it breaks down, those that it tried last.
+        """
+        each = len(chain) // self._intervals
+        found = np.full((len(chain), starts.shape[1] + 1), np.nan)
+        cell, place, width = Steps.even(len(chain), each) if steps is None else steps
+        now = np.hstack([starts, np.zeros((len(starts), 1))])
+        taken: list[Steps] = []
+        for _ in range(MOST_ROUNDS):
+            own = chain[cell]
+            first, last = np.diff(own, prepend=-1) > 0, np.diff(cell, append=len(chain)) > 0
+            after, error = self._run(first, now[own], cell // each, place, width)
+            before = np.where(first[:, None], now[own], np.roll(after, 1, axis=0))
+            allowed = self._tolerance + ROUNDING * np.maximum(np.abs(before), np.abs(after))
+            good = (error <= allowed).all(axis=1)  # what is not a number is not
+            count = np.cumsum(~good)
+            kept = count == (count - ~good)[first][np.cumsum(first) - 1]  # nothing before it in its chain is bad
+            found[cell[kept & last]] = after[kept & last]
+            now[own[kept]] = after[kept]  # the last of each chain stays
+            taken.append(Steps(cell[kept], place[kept], width[kept]))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = (error / allowed).max(axis=1)
+            wanted = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / ORDER))
+            known = np.isfinite(before).all(axis=1)  # what begins nowhere waits
+            pieces = np.where(good | ~known, 1, np.clip(wanted, 2, MOST_PIECES)).astype(int)[~kept]
+            cell, place, width = cell[~kept], place[~kept], width[~kept]
+            if not pieces.size or pieces.sum() > MOST_STEPS:
+                break
+            cell, place, width = (np.repeat(part, pieces) for part in (cell, place, width))
+            number = np.arange(len(cell)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+            width = width / np.repeat(pieces, pieces)
+            place = place + number * width
+        return found, Steps.together([*taken, Steps(cell, place, width)])
+
+    def _run(
+        self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """States and cost behind each step, each from those before it or, where it is a first one, from its start."""
+        now, after, errors = starts[0], [], []
+        for at in range(0, len(first), BLOCK):
+            part = slice(at, at + BLOCK)
+            data = np.vstack([first[part], starts[part].T, place[part], width[part], self._columns[:, interval[part]]])
+            size = data.shape[1]
+            data = np.pad(data, ((0, 0), (0, BLOCK - size)))  # steps of no width
+            states, error = (np.asarray(out.full())[:, :size].T for out in self._step(now, data))
+            now = states[-1]
+            after.append(states)
+            errors.append(np.abs(error))
+        return np.vstack(after), np.vstack(errors)
+
+
+def step_function(form: Formulation, nodes: np.ndarray, horizon: float, p: np.ndarray) -> Any:
+    """One step (x, data) -> (x behind it, its error); x with the cost below it.
+
+    Data are: whether to start anew, from where, place and width of the step in its interval, the divided differences
+    of the control at ``nodes`` of the interval, and start and width of the interval in fractions of the horizon.
+    """
     function = form.function("f", [form.f, form.running], ["f", "running"])
-    rate, cost = function(x, u, (s + h * place) * horizon, horizon, p)
-    dae = {"x": x, "t": place, "p": q, "ode": h * horizon * rate, "quad": h * horizon * cost}
-    return integrator("reintegrate", dae, places.tolist())
+    flat = function.is_a("SXFunction") and function.n_instructions() <= INLINE
+    sym, size, nw = (ca.SX if flat else ca.MX).sym, form.nx + 1, form.nu * len(nodes)
+    x, data = sym("x", size), sym("data", 1 + size + 2 + nw + 2)
+    new, start, place, width = data[0], data[1 : 1 + size], data[1 + size], data[2 + size]
+    differences = ca.reshape(data[3 + size : 3 + size + nw], form.nu, len(nodes))
+    s, h = data[3 + size + nw], data[4 + size + nw]
 
+    def slope(within: float, state: Any) -> Any:
+        at = place + within * width
+        u = differences[:, -1]
+        for i in range(len(nodes) - 2, -1, -1):
+            u = differences[:, i] + (at - nodes[i]) * u
+        return ca.vertcat(*function(state[: form.nx], u, (s + h * at) * horizon, horizon, p))
 
-def violations(form: Formulation, again: Reintegration, bounds: Bounds, p: np.ndarray, horizon: float) -> list[Check]:
-    """How far every bound and constraint is missed, at every point of the fine grid."""
-    lower, upper = bounds
-    places = form.bounds.places
-    checks: list[Check] = []
-    states = np.where(np.isfinite(again.states), again.states, np.nan)
-    first, last = slice(0, 1), slice(-1, None)
-    for kind, pool, values, at, what in (
-        ("state", form.states, states, slice(None), "bounds of"),
-        ("control", form.controls, again.controls, slice(None), "bounds of"),
-        ("initial", form.states, states, first, "start of"),
-        ("terminal", form.states, states, last, "end of"),
-    ):
-        for name, place in pool.items():
-            index = places[kind][place]
-            low, high = lower[index], upper[index]
-            given = np.isfinite(low) | np.isfinite(high)
-            if kind in ("initial", "terminal"):
-                given = low == high
-            if np.any(given):
-                miss, size = missed(values[at][:, place][:, given], low[given], high[given])
-                checks.append((f"{what} {name}", name, miss, again.t[at], size))
-    starts = (form.x0, states[0]), (form.u0, again.controls[0])
-    for rows, at in ((form.path, slice(None)), (form.start, first), (form.end, last)):
-        if len(rows) == 0:
-            continue
-        g = form.sampled([rows.expression], states[at], again.controls[at], again.t[at], horizon, p, *starts)[0]
-        for name in rows.names:
-            mine = rows.of(name)
-            miss, size = missed(g[:, mine], lower[rows.bounds[mine]], upper[rows.bounds[mine]])
-            checks.append((name, name, miss, again.t[at], size))
-    return checks
-
-
-def missed(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
-    """Largest violation at each of K points (K,), and the scale of the bounds."""
-    over = np.maximum(lower - values, values - upper)
-    miss = np.where(np.isnan(values), np.inf, np.maximum(over, 0.0)).max(axis=1)
-    with np.errstate(invalid="ignore"):
-        width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-    bound = np.max(np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0), axis=0)
-    sizes = np.where(width > 0, width, bound)
-    return miss, float(np.min(np.where(sizes > 0, sizes, 1.0)))
+    after, error = dormand_prince_step(slope, ca.if_else(new, start, x), h * width * horizon)
+    return ca.Function("step", [x, data], [after, error], {"cse": True})

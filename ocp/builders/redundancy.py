@@ -175,6 +175,8 @@ def minimum_velocity_problem(
         residual = equations.residual(base, joints, rates, targets)
         base_rate, residual = ca.cse([base_rate, residual])  # both contain the kinematics
         problem.path("task", residual - closure, lower=0, upper=0, unit=equations.unit())
+        for name, stray in equations.strays(base, joints, rates, targets).items():
+            problem.watch(name, **stray)
     else:
         # local motion has no part there
         null = problem.control("null", machine.joint_size, guess=0.0, unit=per_second)

@@ -53,6 +53,10 @@ class Collocation(DirectMethod):
     def order(self) -> int:
         return self.degree + 1
 
+    @property
+    def control_order(self) -> int:
+        return 1 if self.control == "held" else self.degree
+
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         return transcribe(self, form, staged)
 

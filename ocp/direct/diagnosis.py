@@ -8,7 +8,8 @@ constraint, names the least that would have to give way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import casadi as ca
@@ -18,11 +19,12 @@ from ocp.console import time_left
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
+from ocp.direct.scaling import USUAL, Scales
 from ocp.errors import SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 
-__all__ = ["Conflict", "conflicts", "diagnosis"]
+__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan"]
 
 WORST = 6  # lines of one kind
 MISSED = 1e-6  # residual from which a plan counts as not feasible
@@ -30,39 +32,59 @@ ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
 LONGEST = 1e6  # s, in place of no time limit
 COST_SHARE = 1e-3  # of the problem's own cost, which makes the elastic plan unique
 EQUALITY_PRICE = 10.0  # how much dearer it is to miss an equality, which is what is asked for, than a limit
+REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
 HELD = 1e-5  # amount below which a constraint holds, relative to its size
 
 
 class Built(Protocol):
-    """What was built of a problem."""
+    """What was built of a problem; ``scaled`` is its program as it is solved."""
 
     problem: Problem
     solver_name: str
     formulation: Formulation
     fragment: Fragment
     program: Program
+    scaled: Program
 
 
 def diagnosis(
-    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], horizon: float, solution: Any = None
+    built: Built,
+    outcome: Outcome,
+    arguments: dict[str, np.ndarray],
+    horizon: float,
+    solution: Any,
+    elastic: Elastic | None,
+    attempts: Sequence[str],
+    badly_scaled: str,
 ) -> SolveError:
-    """The error that says what cannot hold together, and the worst residuals by constraint, state and time."""
+    """The error that says what cannot hold together, and the worst residuals by constraint, state and time.
+
+    Args:
+        outcome, arguments, horizon, solution: Of the first attempt.
+        elastic: The plan that misses the constraints least, or None where there is none.
+        attempts: What became of every start, one line each. badly_scaled: What is, or "".
+    """
     labels, at, value, miss = residuals(built, outcome.variables, arguments)
-    lines = [f"problem {built.problem.name!r}: {built.solver_name} ended with {outcome.status}"]
-    found: list[Conflict] | None = None
-    if time_left() > 0 and np.all(np.isfinite(value)) and np.any(miss > MISSED):
-        found = conflicts(built.formulation, built.fragment, built.program, arguments, horizon)
+    status = outcome.status
+    found = () if elastic is None or badly_scaled else elastic.conflicts
+    if badly_scaled:
+        status = f"{status.partition(':')[0]}: badly scaled: {badly_scaled}; {REMEDY}"
+    elif elastic is not None and not found:  # it is not the constraints
+        status = status.partition(":")[0]
+    lines = [f"problem {built.problem.name!r}: {built.solver_name} ended with {status}"]
     if found:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
         lines += [f"  {conflict}" for conflict in found[:WORST]]
-    elif found is not None:
+    elif elastic is not None and not badly_scaled:
         lines.append(
             "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
             "another guess or grid, or raise max_iter"
         )
+    if len(attempts) > 1:
+        lines += attempts
     lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
     worst: list[dict[str, Any]] = [
-        {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in (found or ())[:1]
+        {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in found[:1]
     ]
     broken = np.flatnonzero(~np.isfinite(value))
     for i in broken[:WORST]:
@@ -79,7 +101,7 @@ def diagnosis(
     lines += at_bounds(built, outcome.variables, arguments, horizon)
     if not seen and not broken.size:
         lines.append("  all constraints are met; the plan is feasible but not optimal")
-    return SolveError("\n".join(lines), solution, found or (), **(worst[0] if worst else {}))
+    return SolveError("\n".join(lines), solution, found, **(worst[0] if worst else {}))
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
@@ -168,23 +190,40 @@ class Conflict:
         return f"{self.label} would have to go {self.amount:.3g} beyond its {self.side} bound {self.bound:.4g}{time}"
 
 
-def conflicts(
-    form: Formulation, fragment: Fragment, program: Program, arguments: dict[str, np.ndarray], horizon: float
-) -> list[Conflict] | None:
-    """What has to give way, the largest share first; [] where all can hold; None where no answer is found.
+@dataclass(frozen=True)
+class Elastic:
+    """The plan that misses the constraints least: its variables (n,), and what it misses, the largest share first."""
+
+    plan: np.ndarray
+    conflicts: tuple[Conflict, ...]
+
+
+def elastic_plan(
+    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, horizon: float
+) -> Elastic | None:
+    """The plan with the dynamics and the given ends held that misses the constraints least.
+
+    None where the last iterate misses nothing or is not finite, so that it is not the constraints that are in the way,
+    and where no plan is found.
 
     Args:
-        arguments: Of the solver: x0, p and the bounds lbx, ubx, lbg, ubg.
+        outcome: Of the solver that failed.
+        arguments: Of the solver: x0, p and the bounds lbx, ubx, lbg, ubg. scales: What the program is scaled by.
         horizon: The fixed final time, s; not used where it is free.
     """
-    soft = _Soft(form, fragment, arguments)
+    _, _, value, miss = residuals(built, outcome.variables, arguments)
+    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > MISSED)):
+        return None
+    form, fragment, program = built.formulation, built.fragment, built.scaled
+    own = scales.inside(arguments)
+    soft = _Soft(form, fragment, own)
     n, m, k = fragment.size, fragment.n_rows, len(soft.labels)
     x, p = ca.MX.sym("x", n + k), program.nlp["p"]
     v, slack = x[:n], x[n:]
     rows, columns = soft.picks(n, m, k)
     with np.errstate(all="ignore"):
-        size = float(program.values(arguments["x0"], arguments["p"])[0])
-    share = COST_SHARE / max(1.0, abs(size)) if np.isfinite(size) else 0.0
+        size = float(program.values(own["x0"], own["p"])[0])
+    share = COST_SHARE / max(1.0 if scales.cost <= 1 else USUAL, abs(size)) if np.isfinite(size) else 0.0
     lam, sigma = ca.MX.sym("lam", rows.shape[0]), ca.MX.sym("sigma")
     cost, slope = program.gradient(v, p)
     values, jacobian = program.jacobian(v, p)
@@ -201,12 +240,12 @@ def conflicts(
         "show_eval_warnings": False,
         "ipopt": {**ELASTIC_IPOPT, "max_wall_time": min(time_left(), LONGEST)},
     }
-    lower, upper = soft.limits(arguments)
+    lower, upper = soft.limits(own)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
         result = solver(
-            x0=np.concatenate([arguments["x0"], np.zeros(k)]),
-            p=arguments["p"],
+            x0=np.concatenate([own["x0"], np.zeros(k)]),
+            p=own["p"],
             lbx=np.concatenate([soft.low, np.zeros(k)]),
             ubx=np.concatenate([soft.high, np.full(k, np.inf)]),
             lbg=lower,
@@ -217,9 +256,11 @@ def conflicts(
     if not solver.stats()["success"]:
         return None
     plan = np.asarray(result["x"].full()).ravel()[:n]
-    found = np.asarray(program.values(plan, arguments["p"])[1].full()).ravel()
-    end = horizon if fragment.horizon is None else float(plan[fragment.horizon])
-    return soft.read(np.concatenate([found, plan]), arguments, end)
+    found = np.asarray(program.values(plan, own["p"])[1].full()).ravel()
+    plan_of_problem = plan * scales.variables
+    end = horizon if fragment.horizon is None else float(plan_of_problem[fragment.horizon])
+    units = np.concatenate([scales.rows, scales.variables])
+    return Elastic(plan_of_problem, tuple(soft.read(np.concatenate([found, plan]), own, end, units)))
 
 
 class _Soft:
@@ -272,9 +313,13 @@ class _Soft:
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
-    def read(self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[Conflict]:
+    def read(
+        self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
+    ) -> list[Conflict]:
+        """What is missed, the largest share first, in ``units`` of rows and variables."""
         low, high = both_bounds(arguments)
         found: dict[int, Conflict] = {}
+        by: dict[int, float] = {}
         for side, index, slack in (
             ("lower", self.lower, self.slack_of_lower),
             ("upper", self.upper, self.slack_of_upper),
@@ -286,6 +331,7 @@ class _Soft:
                 if miss[i] <= HELD * self.sizes[j]:
                     break
                 if j not in found or miss[i] > found[j].amount:
-                    at = float(self.fractions[index[i]])
+                    at, by[j] = float(self.fractions[index[i]]), float(units[index[i]])
                     found[j] = Conflict(str(self.labels[j]), float(miss[i]), float(bound[i]), side, at, horizon)
-        return [found[j] for j in sorted(found, key=lambda j: -found[j].amount / self.sizes[j])]
+        order = sorted(found, key=lambda j: -found[j].amount / self.sizes[j])
+        return [replace(found[j], amount=found[j].amount * by[j], bound=found[j].bound * by[j]) for j in order]

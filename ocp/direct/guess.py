@@ -14,7 +14,7 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 
-__all__ = ["Samples", "initial_point"]
+__all__ = ["Samples", "initial_point", "names_told"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
@@ -73,6 +73,16 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
                 raise ProblemError(words, name=name, value=table[i, place], time=float(where[i] * horizon))
         point[mine] = table[slot, fragment.variable_entry[mine]]
     return point
+
+
+def names_told(form: Formulation, guess: Guess) -> set[str]:
+    """Names of states, controls and ``horizon`` of which a guess, or the problem's own, says something."""
+    told = {name for name, value in form.guesses.items() if value is not None}
+    if form.horizon_guess is not None:
+        told.add("horizon")
+    if isinstance(guess, Solution):
+        return told | {*guess.states, *guess.controls, "horizon"}
+    return told | {*(guess or {})}
 
 
 def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ocp.console import LOG, Progress, Watch, listening
+from ocp.console import LOG, Progress, Watch, listening, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, SolveError, checked_choice
 
-__all__ = ["SOLVERS", "Outcome", "build_solver", "call_solver"]
+__all__ = ["ADVICE", "ROUNDING", "SOLVERS", "Outcome", "build_solver", "call_solver", "largest_number_of_iterations"]
 
 IPOPT = {
     "tol": 1e-10,
@@ -32,7 +33,9 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-SOLVERS = ("ipopt", "fatrop")
+SLEQP = {"print_level": 0, "max_iter": 1000}
+DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp": SLEQP}
+SOLVERS = tuple(DEFAULTS)
 
 ADVICE = {
     "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
@@ -56,7 +59,11 @@ SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word."""
+    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word.
+
+    ``regularised``: whether the cost did not curve upwards where it ended, as far as the solver saw: its last step was
+    made with a Hessian that it had changed, or it made none.
+    """
 
     variables: np.ndarray
     cost: float
@@ -66,6 +73,7 @@ class Outcome:
     status: str
     iterations: int
     seconds: float
+    regularised: bool = False
 
 
 def build_solver(
@@ -80,16 +88,19 @@ def build_solver(
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-    defaults = IPOPT if solver == "ipopt" else FATROP
-    own = {**defaults, **options}
-    if not own["print_level"] and "max_iter" in own:
+    own = {**DEFAULTS[solver], **options}
+    if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
     nlp = program.nlp
-    progress: Progress | Watch
+    progress: Progress | Watch = Progress(n, m, n_p, title, not own.get("print_level", 0))
     if solver == "ipopt":
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
-        progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
+    elif solver == "sleqp":
+        settings["iteration_callback"] = progress
+        # like fatrop's, its interface looks for ready-made derivatives in its cache
+        settings["cache"] = {"nlp_grad_f": program.gradient, "nlp_jac_g": program.jacobian}
+        settings |= {key: own.pop(key) for key in SLEQP if key in own}  # its interface asks for these outside
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
@@ -109,6 +120,12 @@ def build_solver(
     except RuntimeError as error:
         words = f"{solver} does not take these options {options!r}: {last_line(error)}"
         raise ProblemError(words, name="options", value=options) from error
+
+
+def largest_number_of_iterations(solver: str, options: dict[str, Any]) -> int:
+    """After how many iterations a solver gives up, by its options; 0 where these make no sense."""
+    most = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
+    return int(most) if isinstance(most, int | float | np.number) else 0
 
 
 def check_loaded(solver: str) -> None:
@@ -158,15 +175,15 @@ def finite(expression: Any) -> Any:
 def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
-    watched = isinstance(progress, Watch)
     progress.open(arguments["lbg"], arguments["ubg"])
     tell(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
-        with listening():
-            result = solver(**(tightened(arguments) if watched else arguments))
+        # SLEQP tells of each subproblem that it gives up
+        with listening(), quiet() if solver.class_name() == "SLEQPInterface" else nullcontext():
+            result = solver(**(tightened(arguments) if isinstance(progress, Watch) else arguments))
     except RuntimeError as error:
         words = str(error).lower()
-        if isinstance(progress, Watch) and progress.stopped:
+        if progress.stopped:  # in the only way that fatrop and SLEQP know
             return stopped(solver, progress, arguments, began)
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
@@ -189,16 +206,17 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     iterations, seconds = int(stats.get("iter_count", 0)), time.monotonic() - began
     cost, status = float(values["f"][0]), word if success else advised(word)
     tell(f"solved {progress.title!r}: {word}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
-    return Outcome(values["x"], cost, values["g"], values["lam_g"], success, status, iterations, seconds)
+    found = values["x"], cost, values["g"], values["lam_g"]
+    return Outcome(*found, success, status, iterations, seconds, regularised(stats))
 
 
-def stopped(solver: Any, watch: Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
-    """The iterate at which a watched solver was stopped; its multipliers are not known."""
-    cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(watch.iterate, arguments["p"]))
+def stopped(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
+    """The iterate at which a solver was stopped that returns none; its multipliers are not known."""
+    cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(progress.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
-    tell(f"stopped {watch.title!r}: {watch.stopped}, {watch.iterations} iterations, {seconds:.3g} s")
-    status = advised(watch.stopped)
-    return Outcome(watch.iterate, float(cost[0]), rows, unknown, False, status, watch.iterations, seconds)
+    tell(f"stopped {progress.title!r}: {progress.stopped}, {progress.iterations} iterations, {seconds:.3g} s")
+    status = advised(progress.stopped)
+    return Outcome(progress.iterate, float(cost[0]), rows, unknown, False, status, progress.iterations, seconds)
 
 
 def advised(word: str) -> str:
@@ -211,6 +229,12 @@ def tell(words: str) -> None:
     """One line for a log, where there is no terminal that shows progress."""
     if not sys.stderr.isatty():
         LOG.info(words)
+
+
+def regularised(stats: dict[str, Any]) -> bool:
+    """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
+    sizes = stats.get("iterations", {}).get("regularization_size", ())
+    return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:

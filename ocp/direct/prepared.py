@@ -9,6 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -16,16 +17,31 @@ import numpy as np
 from ocp.console import INTERRUPTED, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import assemble
-from ocp.direct.diagnosis import diagnosis
+from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
-from ocp.direct.guess import initial_point
-from ocp.direct.nlp import Outcome, build_solver, call_solver
-from ocp.errors import Interrupted, ProblemError, checked_count, checked_mapping, checked_positive, checked_time_limit
-from ocp.problem.formulation import Formulation
+from ocp.direct.guess import initial_point, names_told
+from ocp.direct.known import Known
+from ocp.direct.nlp import Outcome, build_solver, call_solver, largest_number_of_iterations
+from ocp.direct.scaling import Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
+from ocp.direct.starts import ELASTIC, GUESS, other_starts
+from ocp.errors import (
+    Interrupted,
+    ProblemError,
+    about,
+    checked_count,
+    checked_mapping,
+    checked_positive,
+    checked_time_limit,
+)
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
+from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
 
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
+
+SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
+STOPPED = ("User_Requested_Stop", "Maximum_WallTime_Exceeded")  # words of a solver that did not fail
 
 
 class DirectMethod(ABC):
@@ -46,16 +62,27 @@ class DirectMethod(ABC):
     def order(self) -> int:
         """Power of the width with which the integration error of one interval falls."""
 
+    @property
+    @abstractmethod
+    def control_order(self) -> int:
+        """Power of the width with which a smooth control is missed between its points."""
+
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
 
     @interruptible
     def prepare(
-        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: ByName = None,
+        compiled: bool = False,
+        scaling: bool = True,
     ) -> Prepared:
         """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
-        return Prepared(problem, self, solver, options, compiled)
+        return Prepared(problem, self, solver, options, compiled, scaling)
 
     @property
     def fractions(self) -> np.ndarray:
@@ -65,6 +92,32 @@ class DirectMethod(ABC):
     def with_mesh(self, mesh: np.ndarray) -> Self:
         """The same method on another mesh (N + 1,)."""
         return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
+
+    def with_nodes_at(self, fractions: Any) -> Self:
+        """The same method with nodes at some fractions 0..1 of the horizon too, where something jumps or bends.
+
+        A mesh that was given keeps its nodes. Without one the intervals between the fractions are equal, as many as
+        make none wider than it was.
+
+        Raises:
+            ProblemError: Fractions that are no numbers from 0 to 1.
+        """
+        told: dict[str, Any] = {"name": "fractions", "value": fractions}
+        with about("fractions"):
+            asked = numeric("with_nodes_at: fractions", fractions)
+        if not np.all((asked >= 0.0) & (asked <= 1.0)):
+            raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **told)
+        if not asked.size:
+            return self
+        nodes = np.array([0.0, 1.0]) if self.mesh is None else self.fractions
+        own = np.abs(asked[:, None] - nodes).min(axis=1) < SAME_NODE
+        asked = np.unique(asked[~own])
+        nodes = np.union1d(nodes, asked[np.diff(asked, prepend=-1.0) >= SAME_NODE])
+        if self.mesh is None:
+            counts = np.maximum(np.ceil(np.diff(nodes) * self.intervals - SAME_NODE), 1).astype(int)
+            pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], counts, strict=True)]
+            nodes = np.concatenate([*pieces, [1.0]])
+        return self.with_mesh(nodes)
 
     def _settle(self, count: str, most: int | None = None) -> None:
         """Check the mesh and the whole number by the name ``count``; turn them into plain Python, as is saved.
@@ -103,18 +156,25 @@ class Prepared:
     """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
-        formulation, fragment, program: What was built. seconds: Wall time of the build.
+        formulation, fragment, program: What was built. scaled: The program as it is solved, see
+            :func:`ocp.direct.scaling.scaled_program`.
+        seconds: Wall time of the build.
     """
 
-    def __init__(self, problem: Problem, method: DirectMethod, solver: str, options: ByName, compiled: bool) -> None:
+    def __init__(
+        self, problem: Problem, method: DirectMethod, solver: str, options: ByName, compiled: bool, scaling: bool = True
+    ) -> None:
         began = time.monotonic()
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         own = checked_mapping("options", options)
-        self._solver, self._progress = build_solver(self.program, solver, own, self.fragment.stages, problem.name)
-        self._made_of = problem, method, solver, own, compiled
+        self.scaled = scaled_program(self.program)
+        self._solver, self._progress = build_solver(self.scaled, solver, own, self.fragment.stages, problem.name)
+        self._scaling, self._known = scaling, Known(self.formulation, self.fragment, self.program)
+        self._most = largest_number_of_iterations(solver, own)
+        self._made_of = problem, method, solver, own, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
@@ -131,8 +191,11 @@ class Prepared:
         tighter: Mapping[str, np.ndarray] | None = None,
         time_limit: float | None = None,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`solve`. Another thread's solve is waited for.
+        """Solve with these parameters from this guess; see :func:`ocp.methods.solve`. Another thread's solve is
+        waited for.
 
+        With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
+        and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
         with limited(checked_time_limit(time_limit)), self._lock:
@@ -155,26 +218,76 @@ class Prepared:
         if tighter is not None:
             draw_in(arguments, tighter)
         point = initial_point(form, fragment, guess, bounds)
-        arguments["x0"] = np.clip(point, arguments["lbx"], arguments["ubx"])
-        outcome = call_solver(self._solver, self._progress, arguments)
+        told = names_told(form, guess)
+        first = self._attempt(GUESS, point, told, arguments, bounds)
+        if first.solution is not None and (first.outcome.success or not check):
+            return first.solution
+        attempts, left = [first], self._most
+        if check and not first.is_final:
+            limits = arguments["lbx"], arguments["ubx"]
+            for start, other in other_starts(form, fragment, first.arguments["x0"], p, limits):
+                if left <= 0 or np.array_equal(other, first.arguments["x0"]):
+                    continue
+                attempts.append(self._attempt(start, other, told, arguments, bounds))
+                if attempts[-1].is_final:
+                    break
+                left -= attempts[-1].outcome.iterations
+            if attempts[-1].found is not None:
+                return attempts[-1].found
+        found = None
+        if not attempts[-1].is_final:
+            found = elastic_plan(self, first.outcome, first.arguments, first.scales, self._horizon(first.outcome, p))
+        if found is not None and check and left > 0:
+            names = {*form.states, *form.controls, "horizon"}
+            attempts.append(self._attempt(ELASTIC, found.plan, names, arguments, bounds))
+            if attempts[-1].found is not None:
+                return attempts[-1].found
+        raise diagnosis(
+            self,
+            first.outcome,
+            first.arguments,
+            self._horizon(first.outcome, p),
+            first.solution,
+            found,
+            [str(attempt) for attempt in attempts],
+            self._badness(first, bounds),
+        ) from first.error
+
+    def _attempt(
+        self, start: str, point: np.ndarray, told: set[str], limits: dict[str, np.ndarray], bounds: Bounds
+    ) -> Attempt:
+        """Run the solver once from a start, scaled by the sizes along it; see :func:`sizes_along` for ``told``."""
+        arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
+        p, x0 = arguments["p"], arguments["x0"]
+        scales = unscaled(self.fragment)
+        if self._scaling:
+            sizes = sizes_along(self.formulation, self.fragment, self.program, x0, told, bounds, p)
+            scales = fitting_scales(self.fragment, self.program, sizes, x0, p)
+        relaxed = self._known.relaxed(arguments)
+        outcome = scales.outside(call_solver(self._solver, self._progress, scales.inside(relaxed)))
+        outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
         try:
-            solution = self._solution(outcome, p)
+            solution = self._solution(outcome, p, start)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
             if outcome.status.startswith(INTERRUPTED):
                 raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
-            raise diagnosis(self, outcome, arguments, self._horizon(outcome, p)) from error
+            return Attempt(start, arguments, told, scales, outcome, None, error)
         if outcome.status.startswith(INTERRUPTED):
             words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
             raise Interrupted(words, solution)
-        if check and not outcome.success:
-            raise diagnosis(self, outcome, arguments, solution.horizon, solution)
-        return solution
+        return Attempt(start, arguments, told, scales, outcome, solution)
+
+    def _badness(self, attempt: Attempt, bounds: Bounds) -> str:
+        """What was badly scaled to the solver, in words; "" where nothing was."""
+        x0, p = attempt.arguments["x0"], attempt.arguments["p"]
+        built = self.formulation, self.fragment, self.program
+        return badness(*built, x0, p, attempt.scales, sizes_along(*built, x0, attempt.told, bounds, p))
 
     def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
         index = self.fragment.horizon
         return float(self.formulation.horizon_at(p) if index is None else outcome.variables[index])
 
-    def _solution(self, outcome: Outcome, p: np.ndarray) -> Solution:
+    def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
         form, fragment = self.formulation, self.fragment
         v = outcome.variables
         horizon = self._horizon(outcome, p)
@@ -209,6 +322,8 @@ class Prepared:
             multipliers=outcome.multipliers,
             seconds={"build": self.seconds, "solve": outcome.seconds},
             problem=self.problem,
+            start=start,
+            regularised=outcome.regularised,
         )
 
     def _costates(self, outcome: Outcome, p: np.ndarray) -> np.ndarray:
@@ -222,7 +337,8 @@ class Prepared:
         inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
         jacobian = self.program.jacobian(outcome.variables, p)[1]
         rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
-        terms = np.array(jacobian.nonzeros()) * inner[rows]
+        with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
+            terms = np.array(jacobian.nonzeros()) * inner[rows]
         running = np.asarray(self.program.inside(outcome.variables, p).full()).reshape(-1)
 
         node_of = np.full(fragment.size, -2)
@@ -248,6 +364,39 @@ class Prepared:
             np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound
             np.add.at(push[1], index, np.maximum(force, 0.0))
         return np.asarray(direct - form.bounds.pull(p, push))
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One run of the solver.
+
+    Attributes:
+        start: Where it started from. arguments: x0, p and the bounds. told: What the start says something of.
+        scales: What it was scaled by. outcome: What the solver returned.
+        solution: The same as a plan; None where it is none, because of ``error``.
+    """
+
+    start: str
+    arguments: dict[str, np.ndarray]
+    told: set[str]
+    scales: Scales
+    outcome: Outcome
+    solution: Solution | None
+    error: RuntimeError | None = None
+
+    @property
+    def found(self) -> Solution | None:
+        """The plan, where the solver succeeded."""
+        return self.solution if self.outcome.success else None
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no other start is to be tried: it succeeded, or it was stopped from outside."""
+        return self.found is not None or self.outcome.status.startswith(STOPPED)
+
+    def __str__(self) -> str:
+        word = self.outcome.status.partition(":")[0]
+        return f"from the {self.start}: {word} after {self.outcome.iterations} iterations"
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

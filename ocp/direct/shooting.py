@@ -56,6 +56,10 @@ class MultipleShooting(DirectMethod):
     def order(self) -> int:
         return 4
 
+    @property
+    def control_order(self) -> int:
+        return 1 if self.control == "held" else 2
+
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
         return transcribe(self, form, staged)
 

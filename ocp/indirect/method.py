@@ -76,14 +76,25 @@ class Indirect:
 
     @interruptible
     def prepare(
-        self, problem: Problem, *, solver: str = "ipopt", options: ByName = None, compiled: bool = False
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: ByName = None,
+        compiled: bool = False,
+        scaling: bool = True,
     ) -> PreparedIndirect:
         """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
 
-        ``solver``, ``options`` and ``compiled`` are for the direct solution that seeds it.
+        ``solver``, ``options``, ``compiled`` and ``scaling`` are for the direct solution that seeds it.
         """
         checked_choice("solver", solver, SOLVERS)
-        how = {"solver": solver, "options": checked_mapping("options", options), "compiled": compiled}
+        how = {
+            "solver": solver,
+            "options": checked_mapping("options", options),
+            "compiled": compiled,
+            "scaling": scaling,
+        }
         return PreparedIndirect(problem, self, how)
 
 

@@ -74,7 +74,7 @@ class BoundTable:
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
         places: Index of every entry by what it bounds: ``free``, ``zero``, ``state``, ``initial``, ``terminal``,
-            ``control``, ``horizon``, ``path``, ``start``, ``end``.
+            ``control``, ``horizon``, ``path``, ``start``, ``end``, ``watch``.
     """
 
     function: Any
@@ -96,7 +96,9 @@ class Formulation:
         x0, u0: Symbols of states and controls at the start, for what ties both ends.
         f: State derivative. Shape (nx, 1).
         running, terminal: Cost densities, scalars.
-        path, start, end: Constraint rows.
+        path, start, end: Constraint rows. watch: Rows that the audit judges and no method holds.
+        watch_integral: Which of these mean the integral over time. Shape (rows,), bool.
+        watch_way: Rates of the ways that they are judged against, zero where none is. Shape (rows, 1).
         states, controls, parameters: Slices of the vectors by name. state_labels,
             control_labels: A name for every entry.
         units: Of states, controls and constraints by name, as declared; empty where none is, or where a constraint
@@ -139,6 +141,11 @@ class Formulation:
         self.path = self._rows("path", declared.path)
         self.start = self._rows("start", declared.start)
         self.end = self._rows("end", declared.end)
+        self.watch = self._rows("watch", declared.watch)
+        watched = declared.watch.values()
+        self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
+        ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
+        self.watch_way = self._flat(ca.vertcat(problem.symbols(0, 1), *ways))
         inner = ca.vertcat(self.f, self.running, self.path.expression)
         self.autonomous = not ca.depends_on(inner, self.t)
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
@@ -228,7 +235,7 @@ class Formulation:
                         fixed = places[end][part]
                         values = np.where(lower[fixed] == upper[fixed], lower[fixed], np.nan)
                         check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
-        for rows in (self.path, self.start, self.end):
+        for rows in (self.path, self.start, self.end, self.watch):
             for owner, label, index in zip(rows.owners, rows.labels, rows.bounds, strict=True):
                 with about(owner):
                     check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
@@ -305,7 +312,7 @@ class Formulation:
             )
         assert d.horizon is not None
         parts["horizon"] = (d.horizon.lower, d.horizon.upper)
-        for kind in ("path", "start", "end"):
+        for kind in ("path", "start", "end", "watch"):
             pool = getattr(d, kind).values()
             parts[kind] = (stack(pool, "lower"), stack(pool, "upper"))
         offset, places = 0, {}
@@ -349,7 +356,7 @@ def labels(pool: dict[str, Any]) -> tuple[str, ...]:
 def units(declared: Declarations) -> dict[str, str]:
     """Of states, controls and constraints by name; a name that two bear in different units has none."""
     found: dict[str, set[str]] = {}
-    for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end):
+    for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end, declared.watch):
         for name, item in pool.items():
             found.setdefault(name, set()).update([item.unit] if item.unit else [])
     return {name: next(iter(given)) if len(given) == 1 else "" for name, given in found.items()}

@@ -97,6 +97,8 @@ class Constraint:
         expression: Shape (m, 1).
         lower, upper: casadi expressions of parameters. Shape (m, 1).
         unit: As of a variable.
+        integral: Whether it is the integral of the expression over time that is meant. Of what is watched only.
+        way: Rate of the way that it is judged against, shape (m, 1), or None. Of what is watched only.
     """
 
     name: str
@@ -104,6 +106,8 @@ class Constraint:
     lower: Any
     upper: Any
     unit: str = ""
+    integral: bool = False
+    way: Any = None
 
     @property
     def size(self) -> int:
@@ -111,7 +115,8 @@ class Constraint:
 
     def __str__(self) -> str:
         low, high = _column_text(self.lower), _column_text(self.upper)
-        return f"{self.name} ({self.size}): {low} <= {_short(self.expression)} <= {high} {self.unit}".rstrip()
+        what = f"integral of {_short(self.expression)} dt" if self.integral else _short(self.expression)
+        return f"{self.name} ({self.size}): {low} <= {what} <= {high} {self.unit}".rstrip()
 
 
 @dataclass
@@ -136,6 +141,7 @@ class Declarations:
     path: dict[str, Constraint] = field(default_factory=dict)
     start: dict[str, Constraint] = field(default_factory=dict)
     end: dict[str, Constraint] = field(default_factory=dict)
+    watch: dict[str, Constraint] = field(default_factory=dict)
     at_start: dict[str, Any] = field(default_factory=dict)
     horizon: Horizon | None = None
     running: Any = None
@@ -306,6 +312,43 @@ class Problem:
         """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
         self._constrain("end", name, expression, lower, upper, unit, list(self.declared.at_start.values()))
 
+    @_about_its_name
+    def watch(
+        self,
+        name: str,
+        expression: Value,
+        lower: Value = None,
+        upper: Value = None,
+        *,
+        integral: bool = False,
+        way: Value = None,
+        unit: str = "",
+    ) -> None:
+        """Declare that the audit judges ``lower <= expression <= upper`` at every time, which no method holds.
+
+        For what follows from the other constraints but for small errors that add up: the place of a tip whose velocity
+        is held.
+
+        Args:
+            name: Unique among the constraints.
+            expression: May use ``at_start`` symbols.
+            lower, upper: Bounds; may be expressions of parameters.
+            integral: Whether the integral of the expression from the start to each time is meant.
+            way: Rate of the way that is judged against, of the expression's size: a miss is relative to how far the
+                integral of ``way`` goes along the plan. None: to what the expression is made of.
+            unit: Of the expression, or of its integral.
+        """
+        if not isinstance(integral, bool):
+            raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
+        known = list(self.declared.at_start.values())
+        self._constrain("watch", name, expression, lower, upper, unit, known)
+        found = self.declared.watch.pop(name)
+        rate = None if way is None else self._expression(f"watch {name!r}: way", way, [*self._inner(), *known])
+        if rate is not None and rate.numel() != found.size:
+            words = f"watch {name!r}: way has {rate.numel()} entries, the expression has {found.size}"
+            raise ProblemError(words, value=rate.numel(), limit=found.size)
+        self.declared.watch[name] = replace(found, integral=integral, way=rate)
+
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
         if self.declared.running is not None:
@@ -351,7 +394,7 @@ class Problem:
         lines += [f"  control      {control}" for control in d.controls.values()]
         lines += [f"  parameter    {p.name} ({p.size})" for p in d.parameters.values()]
         lines += [f"  d{state}/dt = {_short(rate)}" for state, rate in d.dynamics.items()]
-        for kind in ("path", "start", "end"):
+        for kind in ("path", "start", "end", "watch"):
             lines += [f"  {kind:<12} {constraint}" for constraint in getattr(d, kind).values()]
         if d.running is not None:
             lines.append(f"  minimize     integral of {_short(d.running)} dt + {_short(d.terminal)}")
@@ -516,7 +559,8 @@ class Problem:
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} constraint: its name must be a non-empty string, not {name!r}")
         checked_text(f"{what}: unit", unit)
-        for other in (self.declared.path, self.declared.start, self.declared.end):
+        d = self.declared
+        for other in (d.path, d.start, d.end, d.watch):
             if name in other:
                 raise ProblemError(f"{what}: a constraint of this name exists already")
         vector = self._expression(what, expression, [*self._inner(), *known])

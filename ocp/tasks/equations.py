@@ -141,6 +141,45 @@ class TaskEquations:
                 rows.append(rows_of(part, base, joints, twist - wanted_twist(part, base, joints, wanted)))
         return ca.densify(ca.vertcat(*rows))
 
+    @on_scalars
+    def twist(self, base: Any, joints: Any, rates: Any) -> Any:
+        """What the tips do in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
+        rows = []
+        for part in self.bound:
+            moving = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            rows.append(rows_of(part, base, joints, moving))
+        return ca.densify(ca.vertcat(*rows))
+
+    def strays(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
+        """How far the tips stray from their tasks, to be watched: arguments of `Problem.watch` by name.
+
+        Errors of poses, "task position" and "task orientation"; of velocities the integral of what they are missed by,
+        "task way" and "task turn"; each judged by the way of the tips. Where a task is held as an equation of
+        velocities or accelerations, errors too small for that equation may add up.
+        """
+        error, missed = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
+        moving, found = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
+        for posed, turning, name, unit in (
+            (True, False, "task position", "m"),
+            (True, True, "task orientation", "rad"),
+            (False, False, "task way", "m"),
+            (False, True, "task turn", "rad"),
+        ):
+            rows = np.flatnonzero((self.posed == posed) & (self._turning == turning)).tolist()
+            if rows:
+                what = (error if posed else missed)[rows]
+                bounds = {"lower": 0.0, "upper": 0.0, "integral": not posed, "unit": unit}
+                found[name] = {"expression": what, "way": moving[rows], **bounds}
+        return found
+
+    @property
+    def _turning(self) -> NDArray[np.bool_]:
+        """Which rows turn, rather than move. Shape (size,), bool."""
+        found: list[bool] = []
+        for task in (part.task for part in self.bound):
+            found += [*([True, True] if task.direction is not None else []), *(row in ANGULAR for row in task.chosen)]
+        return np.array(found, dtype=bool)
+
     def acceleration(
         self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
     ) -> Any:

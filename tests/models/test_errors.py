@@ -32,7 +32,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
     assert checked_array(2.0, ("times",), "motion", "t").tolist() == [2.0]
     assert np.isnan(checked_array([np.nan, 1], (2,), "a", "b", nan=True)[0])
     assert one_for_each(0.5, 3, "path", "speed", "segments").tolist() == [0.5] * 3
-    assert checked_number("1e-3", "rig", "length", positive=True, unit="m") == 1e-3
+    assert checked_number(1e-3, "rig", "length", positive=True, unit="m") == 1e-3
     assert checked_choice("left", ("left", "right"), "scara", "elbow") == "left"
 
 
@@ -48,6 +48,8 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         (lambda: checked_number(-1, "a", "b", positive=True, unit="m"), "a: b -1.0 m is not positive", "b", 0.0),
         (lambda: one_for_each([1, 2], 3, "a", "b", "joints"), "or one for each of the 3 joints", "b", (3,)),
         (lambda: checked_rotation(2 * np.eye(3), "a", "b"), "is not a rotation matrix", "b", None),
+        (lambda: checked_rotation(np.diag([1, 1, -1]), "a", "b"), "is not a rotation matrix", "b", None),
+        (lambda: checked_rotation(np.eye(3)[[1, 0, 2]], "a", "b"), "is not a rotation matrix", "b", None),
         (lambda: checked_choice("c", "de", "a", "b"), r"'c' is unknown; use one of \['d', 'e'\]", "b", ("d", "e")),
     ],
 )  # fmt: skip
@@ -55,3 +57,22 @@ def test_a_check_names_what_is_wrong(check: Callable[[], Any], message: str, nam
     with pytest.raises(ModelError, match=message) as caught:
         check()
     assert (caught.value.name, caught.value.limit) == (name, limit)
+
+
+NUMBERS: tuple[Any, ...] = (1, 0, -2, True, 0.0, -0.0, 2.5, -1e-300, np.inf, -np.inf, np.nan)
+NUMBERS += ("3", "x", None, [1.0], np.float64(4), np.float32(np.nan), np.array(7.0))
+
+
+@pytest.mark.parametrize("finite", [True, False])
+@pytest.mark.parametrize("positive", [True, False])
+@pytest.mark.parametrize("value", NUMBERS, ids=repr)
+def test_a_number_is_checked_as_an_array_without_dimensions_is(value: Any, positive: bool, finite: bool) -> None:
+    def outcome(check: Callable[..., Any], *shape: Any) -> tuple[type, str]:
+        try:
+            return float, repr(float(check(value, *shape, "rig", "length", positive=positive, finite=finite, unit="m")))
+        except ModelError as error:
+            return ModelError, str(error)
+
+    assert outcome(checked_number) == outcome(checked_array, ())
+    if outcome(checked_number)[0] is float:
+        assert type(checked_number(value, "rig", "length", positive=positive, finite=finite)) is float

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from models import FixedBase, planar_chain
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
 from ocp.direct.prepared import Prepared
 from ocp.problem.formulation import Formulation
@@ -205,12 +206,28 @@ def hurried() -> Problem:
     return problem
 
 
+def slow_elbow() -> Problem:
+    """An arm of three joints that draws an arc, its joint rates limited: path equalities beside limits of controls."""
+    machine = FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
+    problem = Problem("slow elbow")
+    joints = problem.state("joints", 3, initial=np.deg2rad([30.0, 40.0, 50.0]))
+    rates = problem.control("rates", 3, lower=-0.18, upper=0.18)
+    problem.dynamics(joints, rates)
+    problem.horizon(2.0)
+    tip = ca.mtimes(machine.tip_jacobian(np.zeros(0), joints)[[3, 4], :], rates)
+    speed = 0.4 * ca.sin(np.pi * problem.time / 2)
+    problem.path("task", tip - ca.vertcat(-speed, 0.3 * speed), 0, 0)
+    problem.minimize(running=ca.sumsqr(rates) / 2)
+    return problem
+
+
 PANEL: dict[str, Callable[[], Problem]] = {
     "walled": walled,
     "limited control": lambda: van_der_pol(lower=-0.5, upper=0.3, horizon=4.0),
     "round a disc": round_a_disc,
     "weak motor": weak_motor,
     "hurried": hurried,
+    "slow elbow": slow_elbow,
 }
 PANEL_METHODS = [
     Collocation(30),
@@ -223,13 +240,14 @@ PANEL_METHODS = [
 
 @pytest.mark.parametrize("method", PANEL_METHODS, ids=str)
 @pytest.mark.parametrize("name", PANEL)
-def test_a_tightened_plan_with_an_active_limit_does_what_is_asked(name: str, method: Any) -> None:
-    tight = tighten(PANEL[name](), method)
-    audit = tight.audit()
-    asked = ("solver", "integration", "cost, relative", "reported", "horizon", "bounds", "start", "end", "state jump")
-    rows = [f for f in audit.findings if f.name.startswith(asked) or f.name in audit.constraints]
-    assert not [f for f in rows if not f.passed]
-    assert max(audit.constraints.values()) < 2e-6 + 10 * audit.integration_error
+def test_a_tightened_plan_does_what_is_asked_and_is_judged_under_its_own_bounds(name: str, method: Any) -> None:
+    """Where the plan was an optimum before its limits were drawn in, it is one under these."""
+    plain, tight = solve(PANEL[name](), method).audit(), tighten(PANEL[name](), method).audit()
+    missed = {finding.name for finding in tight.failures if finding.verdict == "feasible"}
+    equalities = {"task"}  # are not touched, and held controls miss them between the points
+    assert missed <= equalities & {finding.name for finding in plain.failures}, str(tight)
+    if plain.passed or method.control == "points":
+        assert tight.passed, str(tight)
 
 
 def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:

@@ -209,6 +209,8 @@ def standing_problem(
             problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
         gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
         problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
+        for name, stray in equations.strays(none, joints, velocities, equations.targets(*progress[:2])).items():
+            problem.watch(name, **stray)
     else:
         gap = equations.gap(none, joints, velocities, equations.targets(*progress[:2]))
         problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""))

@@ -93,7 +93,7 @@ def hamiltonians(found: Agreement) -> dict[str, tuple[Array, Array]]:
     curves = {}
     for form, pool in pools.items():
         for name, solution in pool.items():
-            value = found.certificates[form].audits[name].optimality.hamiltonian
+            value = found.certificates[form].audits[name].optimality.hamiltonian.values
             curves[f"{name} ({form})"] = (solution.t, value)
     return curves
 
@@ -110,7 +110,7 @@ def certificate_rows(found: Agreement) -> list[Row]:
             "control_difference": c.control,
             "costate_difference": c.costate,
             "hamiltonian_difference": c.hamiltonian,
-            "hamiltonian_drift": one.audits[c.name].optimality.drift,
+            "hamiltonian_drift": one.audits[c.name].optimality.hamiltonian.drift,
             "audit": c.passed,
             "agrees": c.worst <= one.tolerance,
         }
@@ -135,8 +135,8 @@ def indirect_summary(found: Agreement, start: Array) -> dict[str, Any]:
             "segments": solution.method["segments"],
             "cost": solution.cost,
             "newton_steps": solution.iterations,
-            "hamiltonian": audits[names[id(solution)]].optimality.hamiltonian.mean(),
-            "hamiltonian_drift": audits[names[id(solution)]].optimality.drift,
+            "hamiltonian": audits[names[id(solution)]].optimality.hamiltonian.values.mean(),
+            "hamiltonian_drift": audits[names[id(solution)]].optimality.hamiltonian.drift,
             "costate_at_end": np.abs(costates(solution)[-1]).max(),
             "start_error": np.abs(first - start).max(),
             "costate_difference_from_direct": np.abs(costate_difference(found.plan, solution)).max(),

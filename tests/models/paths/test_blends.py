@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from models import Arc, Line, ModelError, Path, SmoothPath, smooth
 from models.paths import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.arc_length import arc_length
-from models.paths.blends import polynomial
+from models.paths.blends import LARGEST_SHAPE, polynomial
 from tests.models.paths.task_paths import random_path, seeds
 
 ANGLES = (5.0, 11.0, 30.0, 45.0, 77.0, 90.0, 120.0, 150.0, 175.0, 179.0)
@@ -116,6 +116,21 @@ def test_random_paths_stay_within_the_deviation(seed: int, count: int, kind: Any
         for a, b, step in ((points, task, blend.remaining), (task, points, blend.length)):
             largest = cKDTree(b).query(a)[0].max()
             assert largest**2 <= (1.0005 * deviation) ** 2 + (step / 2000) ** 2
+
+
+@few
+@given(st.floats(5, 175), st.sampled_from(["cubic", "quintic"]), st.floats(0.1, 0.95), st.floats(-6, -2.5))
+def test_a_blend_between_long_lines_takes_all_of_the_deviation(
+    degrees: float, kind: Any, share: float, exponent: float
+) -> None:
+    shape, deviation, angle = share * LARGEST_SHAPE[kind], 10**exponent, np.radians(degrees)
+    rays = np.array([(-1, 0, 0), (-np.cos(angle), np.sin(angle), 0)])
+    smoothed = smooth(Path.through([rays[0], (0, 0, 0), rays[1]]), deviation=deviation, kind=kind, shape=shape)
+    points = polynomial(smoothed.coefficients[0], np.linspace(0, 1, 8001))
+    along = np.clip(points @ rays.T, 0, smoothed.remaining[0])
+    away = np.linalg.norm(points[:, None] - along[..., None] * rays, axis=2).min(axis=1).max()
+    taken = max(np.linalg.norm(points, axis=1).min(), away) / deviation
+    assert smoothed.remaining[0] == 1 or 0.998 <= taken <= 1 + 1e-6
 
 
 @few

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -13,8 +13,8 @@ from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 
-Curve: TypeAlias = Callable[[Array], Any] | float | list[float]
-"""Of time (M,), s: values (M,) or (M, n); or a constant."""
+Curve: TypeAlias = Any
+"""A function of times (M,), s: values (M,) or (M, n); or a constant, a number or a list of n."""
 
 LOBATTO = np.array([0.0, 0.5 - np.sqrt(5) / 10, 0.5 + np.sqrt(5) / 10, 1.0])
 
@@ -65,7 +65,7 @@ def drawn(
     running = form.sampled([form.running], curves[0](fine), curves[1](fine), fine * horizon, horizon, p)[0]
     spent = float(np.dot(np.outer(np.diff(breaks), weight / 2).ravel() * horizon, running[:, 0]))
     ends = [curves[0](np.array([end]))[0] for end in (1.0, 0.0)]
-    cost = spent + form.terminal_cost(*ends, curves[1](np.zeros(1))[0], horizon, p)
+    cost = spent + form.terminal_cost(ends[0], ends[1], curves[1](np.zeros(1))[0], horizon, p)
     keep = np.tile(np.arange(d) < d - 1, n)
     keep[-1] = True
     return Solution(
@@ -99,20 +99,28 @@ def of(plan: Solution, problem: Problem) -> Solution:
 
 
 def holds(audit: Audit) -> None:
-    """The plan is sound: nothing fails."""
-    assert audit.passed, str(audit)
+    """The plan does what is asked and is a local minimum."""
+    assert audit.feasible, str(audit)
+    assert audit.optimal is True, str(audit)
+    assert audit.passed
 
 
 def is_no_minimum(audit: Audit) -> None:
     """The motion does what is asked, and some other one beside it costs less."""
-    assert not audit.passed, str(audit)
+    assert audit.feasible, str(audit)
+    assert audit.optimal is False, str(audit)
+    assert not audit.passed
 
 
 def is_no_proven_minimum(audit: Audit) -> None:
-    """The motion does what is asked; whether it is a minimum is denied or left open, never granted."""
-    assert not audit.passed, str(audit)
+    """The motion does what is asked; whether it is a minimum is denied or left open with a reason, never granted."""
+    assert audit.feasible, str(audit)
+    assert audit.optimal is not True, str(audit)
+    assert audit.optimal is False or audit.undecided
+    assert not audit.passed
 
 
 def does_not_do_what_is_asked(audit: Audit) -> None:
     """The motion is not the one that the problem asks for."""
-    assert not audit.passed, str(audit)
+    assert not audit.feasible, str(audit)
+    assert not audit.passed

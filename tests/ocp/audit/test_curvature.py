@@ -11,18 +11,29 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
+from ocp.audit.accessory import AccessoryProblem
+from ocp.audit.costates import adjoint
 from ocp.audit.curvature import Curvature, curvature
+from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import balance
+from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
 
 METHOD = Collocation(intervals=20, degree=3)
 
 
-def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
-    solution = solve(problem, method, **how)
+def second_order(problem: Problem, solution: Solution) -> Curvature:
+    """Of a plan for a problem that it need not have been made for."""
     form = Formulation(problem)
     p = form.parameter_vector(solution.parameters)
-    return solution, curvature(form, solution, p, form.bound_values(p))
+    bounds = form.bound_values(p)
+    along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
+    return curvature(AccessoryProblem(along, adjoint(along, abs(solution.cost) or 1.0)))
+
+
+def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
+    solution = solve(problem, method, **how)
+    return solution, second_order(problem, solution)
 
 
 def oscillator(horizon: float, stiffness: float = 1.0, unit: float = 1.0, price: float = 1.0) -> Problem:
@@ -145,15 +156,20 @@ def double_integrator(**bounds: Any) -> Problem:
     ids=str,
 )
 def test_the_lost_cost_is_what_a_held_control_costs_more(method: Any) -> None:
-    solution, found = look(double_integrator(), method)
-    assert found.upwards
-    assert found.lost == pytest.approx(solution.cost - 6.0, rel=5e-3, abs=1e-9)  # the costates are those of the plan
+    solution = solve(double_integrator(), method)
+    audit = solution.audit()
+    assert audit.optimality.curvature.upwards
+    excess = solution.cost - 6.0
+    assert audit.lost.sum() == pytest.approx(excess, rel=5e-3, abs=1e-9)  # the costates are those of the plan
+    assert audit.passed is (excess < 6e-3)
 
 
 def test_what_pushes_against_a_bound_is_not_lost() -> None:
-    _, found = look(double_integrator(lower=-5.0, upper=5.0), Collocation(40, mesh=None))
-    assert found.upwards
-    assert 0 <= found.lost < 1e-4
+    audit = solve(double_integrator(lower=-5.0, upper=5.0), Collocation(40)).audit()
+    assert audit.optimality.curvature.upwards
+    assert (audit.lost >= 0).all()
+    assert audit.lost.sum() < 1e-4
+    assert audit.passed, str(audit)
 
 
 def test_a_maximum_in_the_control_is_named_where_it_is() -> None:
@@ -163,9 +179,11 @@ def test_a_maximum_in_the_control_is_named_where_it_is() -> None:
     problem.dynamics(x, u)
     problem.horizon(1.0)
     problem.minimize(-(u**2))
-    _, found = look(problem)
-    assert found.upwards is False
-    assert found.lost == pytest.approx(1.0)  # u = 1, then -1
+    audit = solve(problem, METHOD).audit()
+    assert audit.optimality.curvature.upwards is False
+    assert [finding.name for finding in audit.failures] == ["curvature downwards, relative"]
+    assert audit.feasible
+    assert audit.optimal is False
 
 
 def hurried(bend: float) -> Problem:
@@ -184,9 +202,7 @@ def test_a_free_horizon_may_turn_a_minimum_into_a_saddle() -> None:
     plan = solve(hurried(0.0), METHOD)
     assert plan.horizon == pytest.approx(1.0, abs=1e-6)
     for bend, verdict in ((0.0, True), (0.9, True), (1.1, False)):
-        form = Formulation(hurried(bend))
-        found = curvature(form, plan, np.zeros(0), form.bound_values(np.zeros(0)))
-        assert found.upwards is verdict
+        assert second_order(hurried(bend), plan).upwards is verdict
 
 
 def test_a_closed_way_may_drift_where_an_open_one_may_not() -> None:
@@ -221,11 +237,31 @@ def test_the_conditions_at_the_end_count_with_their_multipliers() -> None:
 
 
 def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
-    eye, yes, no = np.eye(2), np.array([True, True]), np.array([False, False])
-    gradient = np.array([-2.0, 3.0])
-    np.testing.assert_allclose(balance(gradient, eye, no, yes), [2.0, 0.0])  # an upper bound pushes back only
-    np.testing.assert_allclose(balance(gradient, eye, yes, no), [0.0, -3.0])
-    np.testing.assert_allclose(balance(gradient, eye, yes, yes), [2.0, -3.0])
+    """Three points at once: held from above, from below, from both sides."""
+    gradient, eye = np.tile([-2.0, 3.0], (3, 1)), np.tile(np.eye(2), (3, 1, 1))
+    lower = np.array([[False, False], [True, True], [True, True]])
+    upper = np.array([[True, True], [False, False], [True, True]])
+    expected = [[2.0, 0.0], [0.0, -3.0], [2.0, -3.0]]  # an upper bound pushes back only
+    np.testing.assert_allclose(balance(gradient, eye, lower, upper), expected)
+
+
+def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
+    """Against all subsets of the limits, each with the multipliers that least squares give it."""
+    rng = np.random.default_rng(5)
+    gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
+    upper = rng.random((200, 2)) < 0.7
+    found = balance(gradient, rows, np.zeros_like(upper), upper)
+    assert (found >= 0).all()
+    assert (found[~upper] == 0).all()
+    for k in range(200):
+        best = np.inf
+        for pattern in ([], [0], [1], [0, 1]):
+            if not upper[k][pattern].all():
+                continue
+            y = np.linalg.lstsq(rows[k, pattern].T, -gradient[k], rcond=None)[0] if pattern else np.zeros(0)
+            if (y >= 0).all():
+                best = min(best, float(np.linalg.norm(gradient[k] + rows[k, pattern].T @ y)))
+        assert np.linalg.norm(gradient[k] + rows[k].T @ found[k]) == pytest.approx(best, abs=1e-9)
 
 
 METHODS = (METHOD, Collocation(20, 3, "legendre"), MultipleShooting(40, control="linear"), Indirect())
@@ -236,7 +272,9 @@ def test_no_method_passes_its_audit_with_a_plan_past_the_conjugate_point(method:
     assert solve(oscillator(3.0), method).audit().passed
     audit = solve(oscillator(3.3), method).audit()
     assert [finding.name for finding in audit.failures] == ["curvature downwards, relative"]
-    assert audit.curvature.upwards is False
+    assert audit.optimality.curvature.upwards is False
+    assert audit.feasible
+    assert audit.optimal is False
 
 
 def test_methods_that_agree_on_a_saddle_get_no_certificate() -> None:

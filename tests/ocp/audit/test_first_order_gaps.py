@@ -15,7 +15,7 @@ from ocp import Collocation, MultipleShooting, Problem, Solution, minimum_veloci
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum, of
 from tests.ocp.problems import Array, double_integrator
 
-METHODS = {
+METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "legendre": Collocation(20, scheme="legendre"),
     "held": MultipleShooting(60),
@@ -173,16 +173,9 @@ def test_a_control_at_its_bound_beside_a_path_equality_hides_no_made_up_costates
         bw = bounded.control("w")
         bounded.path("tie", bw - bv, 0.0, 0.0)
         bounded.minimize(bu**2 / 2)
-        along = {name: (lambda t, n=name: bare.at(t)[n][:, 0]) for name in ("q", "v", "u")}
-        costates = {n: (lambda t, n=n: np.interp(t, bare.t, bare.costate(n)[:, 0])) for n in ("q", "v")}
-        plan = drawn(
-            bounded,
-            {n: along[n] for n in ("q", "v")},
-            {"u": along["u"], "w": along["v"]},
-            costates,
-            1.0,
-            40,
-        )
+        along = {name: (lambda t, n=name, b=bare: b.at(t)[n][:, 0]) for name in ("q", "v", "u")}
+        costates = {n: (lambda t, n=n, b=bare: np.interp(t, b.t, b.costate(n)[:, 0])) for n in ("q", "v")}
+        plan = drawn(bounded, {n: along[n] for n in ("q", "v")}, {"u": along["u"], "w": along["v"]}, costates, 1.0, 40)
         is_no_minimum(plan.audit())
 
 
@@ -196,7 +189,7 @@ def planar(lengths: Any) -> FixedBase:
         links.append(Link(f"link{i}", 1.0, (length / 2, 0, 0), np.diag([0.01, 0.1, 0.1])))
         mount = (0.0 if i == 0 else lengths[i - 1], 0, 0)
         joints.append(Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, mount, axis=(0, 0, 1)))
-    return FixedBase(Robot(links, joints, tip_translation=(lengths[-1], 0, 0)))
+    return FixedBase(Robot(tuple(links), tuple(joints), tip_translation=(lengths[-1], 0, 0)))
 
 
 MOTIONS = {  # start, rad, and direction of the tip; what the pseudo-inverse costs more than the optimum
@@ -307,7 +300,9 @@ def test_each_of_several_multipliers_has_its_own_sign() -> None:
     problem.end("walls", x, [-9.0, -9.0, 1.0], [1.0, 9.0, 9.0])
     for last, verdict in ((2.0, holds), (1.0, is_no_minimum)):
         ends = np.array([1.0, 2.0, last])
-        plan = drawn(problem, {"x": lambda t, e=ends: np.outer(t, e)}, {"u": ends.tolist()}, {"x": (-ends).tolist()}, 1.0)
+        plan = drawn(
+            problem, {"x": lambda t, e=ends: np.outer(t, e)}, {"u": ends.tolist()}, {"x": (-ends).tolist()}, 1.0
+        )
         verdict(plan.audit())
 
 
@@ -392,7 +387,9 @@ def test_parts_of_the_cost_that_cancel_hide_no_loss(slope: float) -> None:
     holds(drawn(problem, {"x": 0.0}, {"u": 0.0}, {"x": -slope}, 1.0).audit())
 
 
-@pytest.mark.parametrize("make", [MultipleShooting, lambda n: Collocation(n, control="held")], ids=["shooting", "radau"])
+@pytest.mark.parametrize(
+    "make", [MultipleShooting, lambda n: Collocation(n, control="held")], ids=["shooting", "radau"]
+)
 def test_held_controls_on_a_coarse_mesh_do_not_pass_for_the_optimum(make: Callable[[int], Any]) -> None:
     """Least effort with N held controls costs 6 N^2 / (N^2 - 1): 7 % too much on 4 intervals, 0.03 % on 60."""
     problem, _, _, u = double_integrator("held")
@@ -404,7 +401,7 @@ def test_held_controls_on_a_coarse_mesh_do_not_pass_for_the_optimum(make: Callab
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_held_controls_pass_where_they_cost_less_than_a_thousandth_too_much(seed: float) -> None:
+def test_held_controls_pass_where_they_cost_less_than_a_thousandth_too_much(seed: int) -> None:
     """A random regulator by ever finer held controls: dearer than 1.003 never passes, nearer than 1.0003 does."""
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(2, 2)), rng.normal(size=(2, 1))

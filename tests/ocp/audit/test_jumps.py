@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.audit.costates import costates_at_samples
-from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 
 METHODS = [
@@ -40,14 +38,12 @@ def chase(
 def test_a_bound_that_is_active_at_a_free_end_is_no_fault(method: Any, sign: float) -> None:
     audit = solve(chase(sign), method).audit()
     assert audit.passed, str(audit)
-    assert audit["stationarity, relative"].value < 1e-2
+    assert audit["cost lost, relative"].value < 1e-4
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_final_cost_that_presses_on_the_bound_is_no_fault(method: Any) -> None:
     """The costate before the end is that of the bound's own force, far from the gradient of the final cost."""
-    if method.control == "held":  # a held control is judged in the middle of its interval, to first order of its width
-        method = replace(method, intervals=120)
     audit = solve(chase(gain=1.0), method).audit()
     assert audit.passed, str(audit)
 
@@ -64,9 +60,12 @@ def test_the_plan_of_another_problem_does_not_pass(method: Any, other: dict[str,
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_plan_forced_to_the_bound_does_not_pass_where_the_end_is_free(method: Any) -> None:
     """The ramp is left behind on the way to 0.6: the bound would have to pull."""
+    if method.control == "held":  # 40 held controls cost 2.3e-3 more than the optimum, 120 cost 2.6e-4
+        method = replace(method, intervals=120)
     plan = solve(chase(rate=0.2, terminal=0.6), method)
     assert plan.audit().passed
-    assert not plan.audit(chase(rate=0.2)).passed
+    audit = plan.audit(chase(rate=0.2))
+    assert {finding.name for finding in audit.failures} == {"transversality, relative"}
 
 
 def shifted(plan: Solution, amount: float) -> Solution:
@@ -118,17 +117,14 @@ def pushed(sign: float, gain: float) -> tuple[Problem, Any]:
     return problem, costate
 
 
-def sampled(plan: Solution, problem: Problem) -> tuple[Array, Array, Array]:
-    """Times and costates of q at the samples of the controls, (N, samples), and which intervals are beside a jump."""
-    form = Formulation(problem)
-    p = form.parameter_vector({})
-    costates, beside = costates_at_samples(form, plan, p, form.bound_values(p))
-    mesh = plan.control_interpolant.breaks
-    return (
-        (mesh[:-1, None] + np.diff(mesh)[:, None] * plan.control_interpolant.nodes) * HORIZON,
-        costates[..., 0],
-        beside,
-    )
+def means(plan: Solution) -> tuple[Array, Array, Array]:
+    """Starts of the intervals, s (N,); the audit's costates of q against falling and rising hats there. Both (N,)."""
+    optimality = plan.audit().optimality
+    n = len(plan.control_interpolant.breaks) - 1
+    costate = optimality.adjoint.costate.reshape(n, -1)
+    nodes, weights = np.polynomial.legendre.leggauss(costate.shape[1])
+    places, weights = (nodes + 1) / 2, weights / 2
+    return optimality.adjoint.t[:-1], costate @ (weights * (1 - places)), costate @ (weights * places)
 
 
 @pytest.mark.parametrize("gain", [0.0, 0.3])
@@ -139,9 +135,12 @@ def test_costates_up_to_a_free_end_at_a_bound_are_those_of_the_closed_form(
 ) -> None:
     problem, costate = pushed(sign, gain)
     plan = solve(problem, Collocation(40, scheme=scheme))
-    times, found, beside = sampled(plan, problem)
-    assert found == pytest.approx(costate(times), abs=3e-5)
-    assert not beside.any()
+    audit = plan.audit()
+    assert audit.passed, str(audit)
+    off = (audit.optimality.adjoint.costate[:, 0] - costate(audit.optimality.t)).reshape(40, -1)
+    contact = round(40 * CONTACT / HORIZON)  # the solver knows the multiplier of its first point to its tolerance only
+    assert off[np.arange(40) != contact] == pytest.approx(0, abs=2e-6)
+    assert off[contact] == pytest.approx(0, abs=3e-4)
     assert abs(plan.costates["q"][-1, 0] - costate(np.array(HORIZON))) > 1e-3  # as reported it has the atom of the end
 
 
@@ -149,14 +148,26 @@ def test_costates_up_to_a_free_end_at_a_bound_are_those_of_the_closed_form(
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("control", ["held", "linear"])
 def test_costates_between_nodes_at_a_bound_are_those_of_the_closed_form(control: Any, sign: float, gain: float) -> None:
+    """In the mean over what a held control, or a node of a linear one, has a say in."""
     problem, costate = pushed(sign, gain)
     plan = solve(problem, MultipleShooting(60, control=control))
-    times, found, beside = sampled(plan, problem)
-    if control == "linear":  # between atoms it is a sawtooth, about the closed form in the mean over each hat
-        found = (2 * found[1:, :1] + found[1:, 1:] + 2 * found[:-1, 1:] + found[:-1, :1]) / 6
-        times, beside = times[1:, :1], beside[1:]
+    times, falling, rising = means(plan)
+    if control == "held":
+        times, found = times + HORIZON / 120, falling + rising
+    else:
+        times, found = times[1:], falling[1:] + rising[:-1]
     assert found == pytest.approx(costate(times), abs=LARGEST / 50)
-    assert beside[times[:, 0] > CONTACT + HORIZON / 60].all()
-    assert not beside[times[:, 0] < CONTACT - HORIZON / 60].any()
     on_bound = plan.t[:-1] > CONTACT + HORIZON / 60
     assert np.abs(plan.costates["q"][:-1, 0] - costate(plan.t[:-1]))[on_bound].max() > LARGEST / 5  # as reported
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.3])
+@pytest.mark.parametrize("control", ["held", "linear"])
+def test_what_a_plan_by_shooting_loses_along_a_bound_is_its_true_excess(control: Any, gain: float) -> None:
+    """Atoms at the nodes are the transcription's own and lose nothing."""
+    problem, _ = pushed(1.0, gain)
+    best = solve(problem, Collocation(120, scheme="legendre")).cost
+    plan = solve(problem, MultipleShooting(60, control=control))
+    audit = plan.audit()
+    assert audit.passed, str(audit)
+    assert audit.lost.sum() == pytest.approx(plan.cost - best, abs=1e-4 * abs(best))

@@ -12,7 +12,7 @@ from models import FixedBase, Joint, Link, Robot
 from ocp import Collocation, Indirect, MultipleShooting, Problem, certificate, solve
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum
 
-METHODS = {
+METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "radau-held": Collocation(40, control="held"),
     "legendre": Collocation(20, scheme="legendre"),
@@ -50,12 +50,8 @@ def test_a_plan_past_its_conjugate_point_does_not_pass(
     first = np.pi if order == 1 else 4.730040744862704
     for factor, verdict in ((share, is_no_minimum), (0.97, holds)):
         problem = to_rest(factor * first / stiffness ** (1 / (2 * order)), stiffness, unit, price, order)
-        try:
-            plan = solve(problem, METHODS[method], check=False)
-        except Exception as error:  # a method may see for itself that there is no minimum
-            assert factor > 1, error
-            continue
-        if plan.success or factor < 1:
+        plan = solve(problem, METHODS[method], check=False)
+        if plan.success or factor < 1:  # a method may see for itself that there is no minimum
             verdict(plan.audit())
 
 
@@ -68,7 +64,7 @@ def test_no_agreement_of_methods_certifies_a_plan_past_its_conjugate_point() -> 
 @pytest.mark.parametrize("bounds", [{}, {"lower": -1.0, "upper": 1.0}], ids=["free", "bounded"])
 @pytest.mark.parametrize("end", [0.0, None], ids=["to zero", "free end"])
 @pytest.mark.parametrize("size", [1, 3])
-def test_the_greatest_cost_is_not_the_least(bounds: dict[str, float], end: float | None, size: int) -> None:
+def test_the_greatest_cost_is_not_the_least(bounds: dict[str, Any], end: float | None, size: int) -> None:
     """min int -u^2 standing still: every other motion is cheaper."""
     problem = Problem("greatest effort")
     x = problem.state("x", size, initial=0.0, terminal=end)
@@ -107,12 +103,13 @@ def test_a_hamiltonian_that_is_a_saddle_in_two_controls_is_no_minimum() -> None:
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("bounds", [{}, {"lower": -1.0, "upper": 1.0}], ids=["free", "bounded"])
-def test_standing_on_a_hilltop_is_no_minimum(unit: float, bounds: dict[str, float]) -> None:
+def test_standing_on_a_hilltop_is_no_minimum(unit: float, bounds: dict[str, Any]) -> None:
     """v' = u from rest, cost -x(T)^2 and a price of u that is worth it, or none at all."""
     for price in (0.1, 0.0):
         problem = Problem("hilltop")
         x, v = problem.state("x", initial=0.0), problem.state("v", initial=0.0)
-        u = problem.control("u", **{side: value * unit for side, value in bounds.items()})
+        scaled: dict[str, Any] = {side: value * unit for side, value in bounds.items()}
+        u = problem.control("u", **scaled)
         problem.dynamics(x, v)
         problem.dynamics(v, u)
         problem.horizon(1.0)
@@ -238,7 +235,7 @@ def head(length: float) -> FixedBase:
         Joint("pan", "continuous", "stand", "yoke", axis=(0, 0, 1)),
         Joint("tilt", "continuous", "yoke", "camera", axis=(0, 1, 0)),
     ]
-    return FixedBase(Robot(links, joints, tip_translation=(length, 0, 0)))
+    return FixedBase(Robot(tuple(links), tuple(joints), tip_translation=(length, 0, 0)))
 
 
 @pytest.mark.parametrize("length", [0.01, 1.0, 1e3])

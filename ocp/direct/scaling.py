@@ -1,0 +1,265 @@
+"""Sizes of states, controls, horizon, constraints and cost, by which a program is scaled before it is solved.
+
+A solver's tolerances are absolute: they suit numbers near 1. Each variable is divided by its size, each row and the
+cost by how far they move when the variables move by theirs. Scaling is linear, so the optimum stays the same; sizes are
+powers of two, so nothing is rounded; and what lies within :data:`USUAL` of 1 is left alone, so that plans in usual
+units do not depend on it at all.
+
+Sizes are those of given ends and guesses. What has none of these takes the size that the dynamics give it, since a
+state moves by its derivative times the horizon, in the least-squares sense over all couplings (Curtis, Reid 1972), then
+that of its bounds, then 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.direct.assembly import Program
+from ocp.direct.fragment import Fragment
+from ocp.direct.nlp import Outcome
+from ocp.problem.formulation import Bounds, Formulation
+
+__all__ = ["USUAL", "Scales", "Sizes", "badness", "fitting_scales", "scaled_program", "sizes_along", "unscaled"]
+
+USUAL = 1e3
+"""Sizes from 1/USUAL to USUAL are left alone: the tolerances of 1e-10 leave seven digits there."""
+BAD = 1e6
+"""From which factor on between sizes, or between a state and what drives it, a program counts as badly scaled."""
+WEAK = 1e-3
+"""Weight of the bounds against the dynamics where a size is sought, and of the size 1 against the bounds."""
+SIDES = ("lbx", "ubx", "lbg", "ubg")
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What the variables (n,), the rows (m,) and the cost of a program are divided by."""
+
+    variables: np.ndarray
+    rows: np.ndarray
+    cost: float
+
+    def inside(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Arguments of a solver (x0, p and bounds) for the scaled program."""
+        units = {"x": self.variables, "g": self.rows}
+        own = {key: arguments[key] / units[key[-1]] for key in SIDES}
+        p = np.concatenate([arguments["p"], self.variables, self.rows, [self.cost]])
+        return {**own, "x0": arguments["x0"] / self.variables, "p": p}
+
+    def outside(self, outcome: Outcome) -> Outcome:
+        """What a solver returned of the scaled program, in the units of the problem."""
+        return replace(
+            outcome,
+            variables=outcome.variables * self.variables,
+            rows=outcome.rows * self.rows,
+            cost=outcome.cost * self.cost,
+            multipliers=outcome.multipliers * self.cost / self.rows,
+        )
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the entries of the states (nx,) and controls (nu,), and of the horizon, s."""
+
+    states: np.ndarray
+    controls: np.ndarray
+    horizon: float
+
+    def of_variables(self, fragment: Fragment) -> np.ndarray:
+        """The size of each variable of a program; 1 of a copy that a stage carries of nothing declared."""
+        found = np.ones(fragment.size)
+        for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
+            mine = fragment.variable_role == role
+            found[mine] = sizes[fragment.variable_entry[mine]]
+        return found
+
+
+def unscaled(fragment: Fragment) -> Scales:
+    """Scales of one: the program as it is."""
+    return Scales(np.ones(fragment.size), np.ones(fragment.n_rows), 1.0)
+
+
+def scaled_program(program: Program) -> Program:
+    """The program in variables x / a with rows g / b and cost f / c, where its parameters are (p, a, b, c).
+
+    Of the functions only those that solvers ask for are made anew.
+    """
+    n, m, k = (program.nlp[key].numel() for key in ("x", "g", "p"))
+    x, q = ca.MX.sym("x", n), ca.MX.sym("p", k + n + m + 1)
+    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
+    p, a, b, c = q[:k], q[k : k + n], q[k + n : k + n + m], q[k + n + m]
+    v = x * a
+    f, slope = program.gradient(v, p)
+    g, jacobian = program.jacobian(v, p)
+    hessian = program.hessian(v, p, sigma / c, lam / b)
+    value, rows = program.values(v, p)
+    row, column = jacobian.sparsity().get_triplet()
+    first, second = hessian.sparsity().get_triplet()
+    scaled_jacobian = ca.MX(jacobian.sparsity(), jacobian.nz[:] * a[column] / b[row])
+    scaled_hessian = ca.MX(hessian.sparsity(), hessian.nz[:] * a[first] * a[second])
+    names = ["x", "p", "lam_f", "lam_g"]
+    return replace(
+        program,
+        nlp={"x": x, "p": q, "f": value / c, "g": rows / b},
+        gradient=ca.Function("nlp_grad_f", [x, q], [f / c, slope * a / c], ["x", "p"], ["f", "grad_f_x"]),
+        jacobian=ca.Function("nlp_jac_g", [x, q], [g / b, scaled_jacobian], ["x", "p"], ["g", "jac_g_x"]),
+        hessian=ca.Function("nlp_hess_l", [x, q, sigma, lam], [scaled_hessian], names, ["triu_hess_gamma_x_x"]),
+        values=ca.Function("values", [x, q], [value / c, rows / b]),
+    )
+
+
+# ---- sizes -------------------------------------------------------------------------------------------------------
+
+
+def sizes_along(
+    form: Formulation,
+    fragment: Fragment,
+    program: Program,
+    point: np.ndarray,
+    given: Collection[str],
+    bounds: Bounds,
+    p: np.ndarray,
+) -> Sizes:
+    """Sizes of what varies along a start.
+
+    Args:
+        point: Values of the variables.
+        given: Names of states, controls and ``horizon`` whose values there are meant, not filled in; given ends count
+            anyhow.
+        bounds, p: At the parameters.
+    """
+    nx, nu, places = form.nx, form.nu, form.bounds.places
+    low, high = bounds
+    seen = np.zeros(nx + nu + 1)
+    for role, offset, pool in (("state", 0, form.states), ("control", nx, form.controls)):
+        mine = fragment.variable_role == role
+        np.maximum.at(seen, offset + fragment.variable_entry[mine], np.abs(point[mine]))
+        for name, place in pool.items():
+            if name not in given:
+                seen[offset + place.start : offset + place.stop] = 0.0
+    for end in ("initial", "terminal"):
+        index = places[end]
+        seen[:nx] = np.maximum(seen[:nx], np.where(low[index] == high[index], np.abs(low[index]), 0.0))
+    horizon = float(form.horizon_at(p) if fragment.horizon is None else point[fragment.horizon])
+    if fragment.horizon is None or "horizon" in given:
+        seen[-1] = horizon
+    known = seen > 0
+    if known.all():
+        return Sizes(seen[:nx], seen[nx:-1], horizon)
+
+    # log s_i = log a_ij + log s_j + log T / T_0 of every coupling a_ij at the horizon T_0
+    pull = couplings(form, fragment, program, point, p)
+    to, source = np.nonzero(pull)
+    equations = np.zeros((len(to), len(seen)))
+    equations[np.arange(len(to)), to] += 1.0
+    equations[np.arange(len(to)), source] -= 1.0
+    equations[:, -1] -= 1.0
+    logs = np.log(np.where(known, seen, 1.0))
+    right = np.log(pull[to, source]) - np.log(horizon) - equations @ logs
+    index = np.concatenate([places["state"], places["control"], places["horizon"]])
+    ends = np.abs([low[index], high[index]])
+    ends[0, -1] = 0.0  # the least horizon is a fence, no size
+    reach = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+    bounded = np.flatnonzero((reach > 0) & ~known)
+    eye = np.eye(len(seen))
+    rows = np.vstack([equations, WEAK * eye[bounded], WEAK**2 * eye[~known]])[:, ~known]
+    values = np.concatenate([right, WEAK * np.log(reach[bounded]), np.zeros(int(np.sum(~known)))])
+    logs[~known] = np.linalg.lstsq(rows, values, rcond=None)[0]
+    sizes = np.exp(logs)
+    return Sizes(sizes[:nx], sizes[nx:-1], float(sizes[-1]))
+
+
+def couplings(form: Formulation, fragment: Fragment, program: Program, point: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Horizon times the largest derivative of each state's rate in each other state and control. (nx, nx + nu)."""
+    found = np.zeros((form.nx, form.nx + form.nu))
+    jacobian = _second_output(program.jacobian, point, p)
+    if jacobian is None:
+        return found
+    rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
+    entries = np.abs(np.array(jacobian.nonzeros()))
+    states = {
+        f"{kind} of {label}": i for kind in ("dynamics", "continuity") for i, label in enumerate(form.state_labels)
+    }
+    zero = form.bounds.places["zero"][0]
+    owner = np.array([states.get(label, -1) for label in fragment.row_labels])
+    to = np.where(fragment.row_bounds == zero, owner, -1)[rows]
+    role = fragment.variable_role[columns]
+    source = fragment.variable_entry[columns] + np.where(role == "control", form.nx, 0)
+    keep = (to >= 0) & ((role == "state") | (role == "control")) & (to != source) & np.isfinite(entries) & (entries > 0)
+    # a row sees the rate over its interval
+    width = np.diff(fragment.mesh)[np.clip(fragment.row_stages[rows], 0, len(fragment.mesh) - 2)]
+    np.maximum.at(found, (to[keep], source[keep]), entries[keep] / width[keep])
+    return found
+
+
+def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
+    """Scales of a program for variables of these sizes; rows and cost by how far they move from a start."""
+    by = sizes.of_variables(fragment)
+    rows = np.zeros(fragment.n_rows)
+    jacobian = _second_output(program.jacobian, point, p)
+    if jacobian is not None:
+        at, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
+        with np.errstate(invalid="ignore"):
+            entries = np.abs(np.array(jacobian.nonzeros())) * by[columns]
+        np.maximum.at(rows, at, np.where(np.isfinite(entries), entries, 0.0))
+    _, label = np.unique(fragment.row_labels, return_inverse=True)  # the same at all times
+    largest = np.zeros(len(rows))
+    np.maximum.at(largest, label, rows)
+    moves = []
+    for place in (point, point + by):  # where a start rests on the least of the cost, beside it
+        slope = _second_output(program.gradient, place, p)
+        if slope is not None:
+            with np.errstate(invalid="ignore"):
+                moves.append(float(np.abs(np.asarray(slope.full()).ravel() * by).sum()))
+    usual = [move for move in moves if np.isfinite(move) and move > 0]
+    cost = min(usual, default=1.0)
+    # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
+    cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
+    return Scales(_powers(by), _powers(largest[label]), float(2.0 ** np.round(np.log2(cost))))
+
+
+def badness(
+    form: Formulation,
+    fragment: Fragment,
+    program: Program,
+    point: np.ndarray,
+    p: np.ndarray,
+    scales: Scales,
+    sizes: Sizes,
+) -> str:
+    """What makes a program badly scaled as it was solved, in words; "" where nothing does."""
+    by = sizes.of_variables(fragment) / scales.variables
+    off = np.abs(np.log(by))
+    if by.size and off.max() > np.log(BAD):
+        k = int(np.argmax(off))
+        role, entry = str(fragment.variable_role[k]), int(fragment.variable_entry[k])
+        label = {"state": form.state_labels, "control": form.control_labels}.get(role, ("",))[entry]
+        return f"{role} {label}".strip() + f" is of size {by[k]:.1g} to the solver, not near 1"
+    pull = couplings(form, fragment, program, point, p)
+    inner = np.concatenate([sizes.states, sizes.controls])
+    drive = (pull * inner / sizes.states[:, None]).max(axis=1, initial=0.0)
+    if form.horizon_is_free:
+        drive *= sizes.horizon / point[fragment.horizon]
+    off = np.abs(np.log(np.where(drive > 0, drive, 1.0)))
+    if off.max(initial=0.0) > np.log(BAD):
+        i = int(np.argmax(off))
+        return f"state {form.state_labels[i]} moves by {drive[i]:.1g} times its size {sizes.states[i]:.1g}"
+    return ""
+
+
+def _powers(sizes: np.ndarray) -> np.ndarray:
+    """The nearest powers of two of sizes out of the usual; 1 of the others."""
+    odd = (sizes > 0) & ((sizes < 1 / USUAL) | (sizes > USUAL))
+    return np.where(odd, np.exp2(np.round(np.log2(np.where(odd, sizes, 1.0)))), 1.0)
+
+
+def _second_output(function: Any, point: np.ndarray, p: np.ndarray) -> Any:
+    """The second output of a function of the program; None where an integrator breaks down."""
+    try:
+        return function(point, p)[1]
+    except RuntimeError:
+        return None

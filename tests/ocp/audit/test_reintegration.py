@@ -1,0 +1,226 @@
+"""What the controls really do: integrated in steps that see what happens between the points of a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import process_time
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, MultipleShooting, Problem, Solution, solve
+from ocp.audit.reintegration import Reintegration, reintegrate
+from ocp.audit.sizes import fine_grid, sizes
+from ocp.problem.formulation import Formulation
+from tests.ocp.audit.drawn import drawn, of
+from tests.ocp.problems import Array, van_der_pol
+
+METHODS = {
+    "radau": Collocation(20),
+    "legendre": Collocation(20, scheme="legendre"),
+    "held": MultipleShooting(50),
+    "linear": MultipleShooting(50, control="linear"),
+}
+every_method = pytest.mark.parametrize("method", METHODS)
+
+
+def again(problem: Problem, solution: Solution) -> Reintegration:
+    form = Formulation(problem)
+    p = form.parameter_vector(solution.parameters)
+    found = sizes(form, solution, p, form.bound_values(p))
+    return reintegrate(form, solution, p, fine_grid(solution), found)
+
+
+def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: Any = 0.0) -> tuple[Problem, Solution]:
+    """x' = rate(x, u, t) from 0, and a plan drawn at rest, whatever the dynamics say."""
+    problem = Problem("driven")
+    x, u = problem.state("x", initial=0.0, lower=-1.0), problem.control("u")
+    problem.dynamics(x, rate(x, u, problem.time))
+    problem.horizon(horizon)
+    problem.minimize(u**2)
+    return problem, drawn(problem, {"x": lambda t: t}, {"u": control}, {"x": 0.0}, horizon)
+
+
+# ---- the integration itself ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rate", "exact"),
+    [
+        (lambda x, u, t: u - x, lambda t: 1 - np.exp(-t)),
+        (lambda x, u, t: 50 * ca.cos(50 * t) * u, lambda t: np.sin(50 * t)),
+        (lambda x, u, t: 1 + x**2, np.tan),
+        (lambda x, u, t: ca.if_else(t < 0.3337, 1.0, -1.0), lambda t: np.where(t < 0.3337, t, 0.6674 - t)),
+        (lambda x, u, t: 1e4 * (ca.sin(t) - x) + ca.cos(t), np.sin),
+    ],
+    ids=["exponential", "fast", "nonlinear", "discontinuous", "stiff"],
+)
+def test_states_are_those_of_the_closed_form(rate: Any, exact: Callable[[Array], Array]) -> None:
+    problem, plan = driven(rate, control=1.0)
+    found = again(problem, plan)
+    np.testing.assert_allclose(found.states[:, 0], exact(found.t), atol=1e-9)
+    assert found.broke_down is None
+
+
+def test_a_motion_that_leaves_for_infinity_breaks_down_where_it_does() -> None:
+    problem, plan = driven(lambda x, u, t: 1 + (2 * x) ** 2)  # x = tan(2 t) / 2
+    found = again(problem, plan)
+    assert found.broke_down == pytest.approx(np.pi / 4, abs=4e-3)
+    assert np.isfinite(found.states[found.t < np.pi / 4 - 4e-3]).all()
+    assert not plan.audit().feasible
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("time", [1e-6, 1.0, 1e5])
+def test_the_integration_is_as_exact_in_any_unit(unit: float, time: float) -> None:
+    problem = Problem("in other units")
+    x, u = problem.state("x", initial=0.0), problem.control("u")
+    problem.dynamics(x, (unit * ca.cos(9 * problem.time / time) * 9 - x) / time)
+    problem.horizon(time)
+    problem.minimize(u**2)
+    plan = drawn(problem, {"x": lambda t: unit * t / time}, {"u": 1.0}, {"x": 0.0}, time)
+    found = again(problem, plan)
+    s = found.t / time
+    exact = 9 * (np.cos(9 * s) + 9 * np.sin(9 * s) - np.exp(-s)) / 82
+    np.testing.assert_allclose(found.states[:, 0] / unit, exact, atol=1e-9)
+
+
+@every_method
+def test_the_running_cost_is_integrated_along(method: str) -> None:
+    plan = solve(van_der_pol(), METHODS[method])
+    found = again(van_der_pol(), plan)
+    assert found.cost == pytest.approx(plan.cost, rel=1e-3)
+    assert found.local_cost == pytest.approx(found.cost, rel=1e-3)
+
+
+# ---- between the points ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [0.2503, 0.5125, 0.7777])
+@pytest.mark.parametrize("shape", ["box", "bump"])
+@every_method
+def test_a_push_of_a_millisecond_between_the_nodes_is_felt(method: str, shape: str, at: float) -> None:
+    """1 N s in 1 ms: the mass of 1 kg leaves with 1 m/s; the plan without it stands on another problem."""
+    width = 1e-3
+
+    def build(pushed: bool) -> Problem:
+        problem = Problem("pushed")
+        x, v = problem.state("x", initial=0.0, terminal=1.0), problem.state("v", initial=0.0, terminal=0.0)
+        u = problem.control("u")
+        place = (problem.time - at) / width
+        form = ca.if_else(ca.fabs(place) < 0.5, 1, 0) * (1 if shape == "box" else 2 * ca.cos(np.pi * place) ** 2)
+        problem.dynamics(x, v)
+        problem.dynamics(v, u + (form / width if pushed else 0))
+        problem.horizon(1.0)
+        problem.minimize(u**2)
+        return problem
+
+    plan = solve(build(False), METHODS[method])
+    assert plan.audit().feasible
+    audit = of(plan, build(True)).audit()
+    assert not audit["integration error of one interval"].passed
+    assert audit.states["v"][-1, 0] == pytest.approx(1.0, abs=1e-6)
+
+
+# ---- unstable dynamics -----------------------------------------------------------------------------------------------
+
+
+def unstable(growth: float, horizon: float = 2.0) -> Problem:
+    problem = Problem("unstable")
+    x, u = problem.state("x", initial=1.0, terminal=0.0), problem.control("u")
+    problem.dynamics(x, growth * x + u)
+    problem.horizon(horizon)
+    problem.minimize((x**2 + u**2) / 2)
+    return problem
+
+
+def test_what_unstable_dynamics_carry_off_is_told_and_the_intervals_are_judged() -> None:
+    plan = solve(unstable(15.0), Collocation(60))
+    audit = plan.audit()
+    assert audit.feasible
+    assert audit["integration error, relative"].value > 1e-3
+    assert audit["integration error, relative"].limit is None
+    assert "unstable" in audit["integration error, relative"].note
+    assert audit["integration error of one interval"].limit == 1e-3
+
+
+def test_errors_that_only_add_up_are_not_excused() -> None:
+    """Each of 50 intervals leaves 4e-4 of the way; no dynamics make it grow."""
+    problem = Problem("drifting")
+    x, u = problem.state("x", initial=0.0, terminal=1.0), problem.control("u")
+    problem.dynamics(x, 0.98 * u)
+    problem.horizon(1.0)
+    problem.minimize(u**2)
+    plan = drawn(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": 0.0}, 1.0, 50)
+    audit = plan.audit()
+    assert audit["integration error of one interval"].value == pytest.approx(4e-4, rel=1e-3)
+    assert audit["integration error of one interval"].passed
+    assert audit["integration error, relative"].value == pytest.approx(0.02, rel=1e-3)
+    assert not audit["integration error, relative"].passed
+
+
+@pytest.mark.parametrize("growth", [6.0, 15.0])
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_wrong_control_of_unstable_dynamics_is_not_excused(growth: float, share: float) -> None:
+    plan = solve(unstable(growth), Collocation(60))
+    curve = plan.control_interpolant
+    wrong = replace(plan, control_interpolant=replace(curve, values=share * curve.values))
+    assert not wrong.audit().feasible
+
+
+def test_a_jump_of_unstable_dynamics_is_not_excused() -> None:
+    plan = solve(unstable(15.0), Collocation(60))
+    curve = plan.state_interpolant
+    values = curve.values.copy()
+    values[30:] += 0.01
+    assert not replace(plan, state_interpolant=replace(curve, values=values)).audit().feasible
+
+
+# ---- constraints -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["square", "distance", "shifted square"])
+@pytest.mark.parametrize("thick", [0.1, 0.01])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_the_middle_of_an_obstacle_is_as_bad_however_its_distance_is_written(
+    form: str, thick: float, unit: float
+) -> None:
+    def build(wall: bool) -> Problem:
+        problem = Problem("wall")
+        x, u = problem.state("x", initial=0.0, terminal=unit), problem.control("u")
+        problem.dynamics(x, u)
+        problem.horizon(1.0)
+        if wall:
+            square, room = (x - 0.52 * unit) ** 2, (thick * unit / 2) ** 2
+            if form == "square":
+                problem.path("wall", square, lower=room)
+            elif form == "shifted square":
+                problem.path("wall", square - room, lower=0.0)
+            else:
+                problem.path("wall", ca.sqrt(square + 1e-12 * unit**2), lower=np.sqrt(room))
+        problem.minimize((u / unit) ** 2)
+        return problem
+
+    plan = solve(build(False), Collocation(10))
+    assert plan.audit().feasible
+    assert not of(plan, build(True)).audit()["wall"].passed
+
+
+# ---- how long it takes -----------------------------------------------------------------------------------------------
+
+
+def test_the_time_grows_no_faster_than_the_intervals() -> None:
+    seconds = []
+    for intervals in (100, 400):
+        plan = solve(van_der_pol(), Collocation(intervals))
+        again(van_der_pol(), plan)
+        tries = []
+        for _ in range(3):
+            began = process_time()
+            again(van_der_pol(), plan)
+            tries.append(process_time() - began)
+        seconds.append(min(tries))
+    assert seconds[1] < 1.2 * 4 * seconds[0]
