@@ -7,8 +7,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ocp.audit.accessory import FLAT
-from ocp.audit.curvature import Curvature, curvature
+from ocp.audit.curvature import Curvature
+from ocp.audit.optimality import optimality
+from ocp.audit.principle import FLAT
 from ocp.console import interruptible, limited
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_time_limit
@@ -139,8 +140,8 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     for _ in range(MOST_DESCENTS):
         if not solution.regularised:
             break
-        found = curvature(form, solution, p, bounds)
-        if found.upwards or found.least > -FLAT:
+        found = optimality(form, solution, p, bounds).curvature
+        if not found.least < -FLAT:
             break
         others = [
             prepared.solve(solution.parameters, beside(form, solution, found, bounds, sign), check=False)

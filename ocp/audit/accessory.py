@@ -11,8 +11,6 @@ step of the control (Maurer, Osmolovskii 2003).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import casadi as ca
 import numpy as np
 
@@ -24,8 +22,8 @@ __all__ = ["AccessoryProblem", "dependent", "end_conditions", "rows_of_length_on
 
 RANK = 1e-9
 """Size of a singular value, relative to the largest, from which on constraints count as dependent."""
-STILL = 1e-3
-"""Least unit of an entry of a state or control, of the greatest of its entries."""
+NOISE = 1e-14
+"""Curvature along a control of its size, of the largest, below which it is rounding."""
 AT_BOUND = 1e-5
 """A value nearer to its bound than this share of its spread or range is held by it."""
 
@@ -45,7 +43,7 @@ class AccessoryProblem:
         weak: Those that are active and do not push, (r', nz + nu) for every point.
         moved: Controls that switch in an interval, (N, nu) bool. switching: What moving costs there, per squared
             area, in their own units. Shape (N, nu).
-        unit: Of (z, u): spread along the plan. Shape (nz + nu,).
+        unit: Of (z, u), in which the sweep is well conditioned. Shape (nz + nu,).
         obstacle: Why the second variation is not known, or "".
     """
 
@@ -56,7 +54,6 @@ class AccessoryProblem:
         self.free, self.tied = form.horizon_is_free, form.ties_ends
         self.nz = self.nx * (1 + self.tied) + self.free
         self.obstacle = self._obstacle()
-        self._units()
         self._second_order()
         self._hold()
         self._switch()
@@ -70,25 +67,18 @@ class AccessoryProblem:
         return ""
 
     def _units(self) -> None:
-        """Spreads along the plan, which condition the sweep and judge nothing."""
-        along, form = self.along, self.along.form
-        (low, high), places = along.bounds, form.bounds.places
+        """Units in which a sweep is well conditioned: they judge nothing.
 
-        def spreads(values: np.ndarray, kind: str, parts: Mapping[str, slice]) -> np.ndarray:
-            spread, size = np.ptp(values, axis=0), np.abs(values).max(axis=0, initial=0.0)
-            with np.errstate(invalid="ignore"):
-                width = high[places[kind]] - low[places[kind]]
-            size = np.where(size > 0, size, 1.0)
-            other = np.where(np.isfinite(width) & (width > 0), width, size)
-            unit = np.where(spread > AT_BOUND * size, spread, other)
-            for part in parts.values():  # an entry that stands still moves by rounding
-                unit[part] = np.maximum(unit[part], STILL * unit[part].max())
-            return np.asarray(unit)
-
-        x_unit = spreads(along.x, "state", form.states)
-        self.range = spreads(along.u, "control", form.controls)
-        horizon = [along.solution.horizon] if self.free else []
-        self.unit = np.concatenate([x_unit, horizon, *([x_unit] if self.tied else []), self.range])
+        States and horizon by their sizes. Controls so that the Hamiltonian curves alike along each, however little it
+        moves; by their sizes where it does not curve.
+        """
+        sizes, horizon = self.along.sizes, [self.along.solution.horizon] if self.free else []
+        bend = np.abs(np.einsum("kii->ki", self.curved)).mean(axis=0)
+        weight = bend * sizes.control**2
+        largest = float(weight.max(initial=0.0))
+        curves = weight > NOISE * largest
+        self.range = np.where(curves, np.sqrt(largest / np.where(curves, bend, 1.0)), sizes.control)
+        self.unit = np.concatenate([sizes.state, horizon, *([sizes.state] if self.tied else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
         """Entries of y = (x, T, u), and where each stands in (z, u)."""
@@ -111,6 +101,7 @@ class AccessoryProblem:
         hessian = hessian.reshape(m, ny, ny)
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
         self._curves = np.einsum("kii->ki", hessian)
+        self._units()
         into, z_of = self._into_z()
         size, z_unit = self.nz + self.nu, self.unit[: self.nz]
         self.rate, self.hessian = np.zeros((m, self.nz, size)), np.zeros((m, size, size))
@@ -151,15 +142,23 @@ class AccessoryProblem:
         normals *= self.unit
         reach = np.abs(normals).max(axis=2)
 
-        def pushing(limits: Limits, multipliers: np.ndarray, place: slice) -> tuple[np.ndarray, np.ndarray]:
+        sizes = along.sizes
+
+        def pushing(
+            limits: Limits, multipliers: np.ndarray, place: slice, own: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray]:
             force = np.abs(multipliers) * reach[:, place]
             gap, equal = np.minimum(limits.below, limits.above)[:, : force.shape[1]], limits.equal[: force.shape[1]]
-            touched = (gap <= AT_BOUND * reach[:, place]) | equal
+            touched = (gap <= AT_BOUND * own) | equal
             return force > FLAT * (force.max(initial=0.0) or 1.0), touched
 
-        strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], slice(0, nh))
+        strong, touched = pushing(
+            along.hold, self.adjoint.holding[:, :nh], slice(0, nh), np.append(sizes.control, sizes.path[along.mixed])
+        )
         self.fixed = strong[:, :nu] & touched[:, :nu]
-        at_rest, resting = pushing(along.stand, self.adjoint.standing, slice(nh, None))
+        at_rest, resting = pushing(
+            along.stand, self.adjoint.standing, slice(nh, None), np.append(sizes.state, sizes.path[along.still])
+        )
         strong = np.hstack([strong & touched | along.hold.equal[:nh], at_rest | along.stand.equal])
         touched = np.hstack([touched, resting])
         n, q = along.shape

@@ -25,7 +25,7 @@ CONTROLS_KNOWN = 1e-3
 
 DEGENERATE = 1e-5
 """Share of the cost from which on it is worth looking for costates that fit the plan better than those reported."""
-ROUNDING = 1e-12
+ROUNDING = 1e-10
 """Share of what the controls themselves would cost, below which costates are rounding."""
 
 
