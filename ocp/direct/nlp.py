@@ -87,7 +87,8 @@ def build_solver(
     """
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+    # multipliers of the parameters are not read; where an integrator breaks down they could not be found
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     own = {**DEFAULTS[solver], **options}
     if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
@@ -168,8 +169,8 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """The same with a huge number for every entry that is not a number."""
-    return ca.MX(expression.sparsity(), ca.fmin(expression.nz[:], HUGE))
+    """The same with a huge number for every entry that is infinite, of its sign, or is not a number."""
+    return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], HUGE), -HUGE))
 
 
 def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:

@@ -77,10 +77,10 @@ def interrupted(name, call, after=0.3):
 
 DIRECT = """
 long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
-ipopt = prepare(long, Collocation(300, 4), options=NEVER)
+ipopt = prepare(long, Collocation(100, 4), options=NEVER)
 interrupted("ipopt", ipopt.solve)
 interrupted("ipopt without check", lambda: ipopt.solve(check=False))
-fatrop = prepare(long, Collocation(500, 4), solver="fatrop", options={"max_iter": 1000000})
+fatrop = prepare(long, Collocation(300, 4), solver="fatrop", options={"max_iter": 1000000})
 interrupted("fatrop", fatrop.solve, 0.1)
 interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
 interrupted("refine", lambda: refine(long, Collocation(150), tolerance=1e-13, max_intervals=4000))
