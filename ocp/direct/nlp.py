@@ -87,8 +87,7 @@ def build_solver(
     """
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
-    # multipliers of the parameters are not read; where an integrator breaks down they could not be found
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     own = {**DEFAULTS[solver], **options}
     if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
