@@ -169,8 +169,8 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """The same with a huge number for every entry that is not a number."""
-    return ca.MX(expression.sparsity(), ca.fmin(expression.nz[:], HUGE))
+    """The same with a huge number for every entry that is infinite, of its sign, or is not a number."""
+    return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], HUGE), -HUGE))
 
 
 def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:

@@ -79,7 +79,7 @@ def interrupted(name, call, after=0.3):
 
 DIRECT = """
 long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
-ipopt = prepare(long, Collocation(300, 4), options=NEVER)
+ipopt = prepare(long, Collocation(100, 4), options=NEVER)
 interrupted("ipopt", ipopt.solve)
 interrupted("ipopt without check", lambda: ipopt.solve(check=False))
 fatrop = prepare(long, Collocation(1000, 4), solver="fatrop", options={"max_iter": 1000000})
@@ -92,8 +92,8 @@ interrupted("what conflicts", conflicts.solve, 2.0)
 sleqp = prepare(long, Collocation(60, 4), solver="sleqp")
 interrupted("sleqp", sleqp.solve, 1.0)
 interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
-interrupted("refine", lambda: refine(van_der_pol(), Collocation(50), options=NEVER))
-interrupted("tighten", lambda: tighten(long, Collocation(200), options=NEVER))
+interrupted("refine", lambda: refine(long, Collocation(150), tolerance=1e-13, max_intervals=4000))
+interrupted("tighten", lambda: tighten(long, Collocation(1500)))
 plan = solve(long, Collocation(300))
 print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success)
 """
