@@ -100,7 +100,7 @@ def solve(
 
     Where the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
     from a roll-out of the dynamics with the controls of the guess, and from the plan that misses the constraints least;
-    the first two take at most ``max_iter`` iterations together. Where it stops at a plan that is stationary but no
+    each with at most 200 iterations and ``max_iter`` together. Where it stops at a plan that is stationary but no
     minimum, it starts again beside it, on both sides along the variation that lowers the cost, and the cheaper plan
     counts. ``Solution.start`` says what worked.
 

@@ -16,7 +16,16 @@ from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, SolveError, checked_choice
 
-__all__ = ["ADVICE", "ROUNDING", "SOLVERS", "Outcome", "build_solver", "call_solver", "largest_number_of_iterations"]
+__all__ = [
+    "ADVICE",
+    "ROUNDING",
+    "SOLVERS",
+    "Outcome",
+    "broken_down",
+    "build_solver",
+    "call_solver",
+    "largest_number_of_iterations",
+]
 
 IPOPT = {
     "tol": 1e-10,
@@ -87,7 +96,7 @@ def build_solver(
     """
     checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     own = {**DEFAULTS[solver], **options}
     if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
@@ -238,6 +247,13 @@ def regularised(stats: dict[str, Any]) -> bool:
     """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
+
+
+def broken_down(arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
+    """The outcome of a solver that a function of the program threw out, as an integrator does: its start."""
+    rows = np.full(arguments["lbg"].shape, np.nan)
+    word = f"Invalid_Number_Detected: {last_line(error)}"
+    return Outcome(arguments["x0"], np.nan, rows, rows, False, word, 0, 0.0)
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:

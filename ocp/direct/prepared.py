@@ -21,8 +21,8 @@ from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
 from ocp.direct.known import Known
-from ocp.direct.nlp import Outcome, build_solver, call_solver, largest_number_of_iterations
-from ocp.direct.scaling import Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
+from ocp.direct.nlp import Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
+from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.direct.starts import ELASTIC, GUESS, other_starts
 from ocp.errors import (
     Interrupted,
@@ -41,6 +41,7 @@ from ocp.solution import ByName, Guess, Solution
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
+MOST_ELSEWHERE = 200  # iterations from each other start
 
 
 class DirectMethod(ABC):
@@ -171,6 +172,7 @@ class Prepared:
         own = checked_mapping("options", options)
         self.scaled = scaled_program(self.program)
         self._solver, self._progress = build_solver(self.scaled, solver, own, self.fragment.stages, problem.name)
+        self._own_options, self._pattern = own, Pattern(self.formulation, self.fragment, self.program)
         self._scaling, self._known = scaling, Known(self.formulation, self.fragment, self.program)
         self._most = largest_number_of_iterations(solver, own)
         self._made_of = problem, method, solver, own, compiled, scaling
@@ -223,13 +225,14 @@ class Prepared:
             return first.solution
         attempts, left = [first], self._most
         if check and not first.is_final:
+            solver = self._solver_of_other_starts()
             limits = arguments["lbx"], arguments["ubx"]
             for start, other in other_starts(form, fragment, first.arguments["x0"], p, limits):
                 if left <= 0 or np.array_equal(other, first.arguments["x0"]):
                     continue
-                attempts.append(self._attempt(start, other, told, arguments, bounds))
-                if attempts[-1].is_final:
-                    break
+                attempts.append(self._attempt(start, other, told, arguments, bounds, solver))
+                if attempts[-1].is_final or all(attempt.is_broken for attempt in attempts):
+                    break  # found, stopped, or not a matter of the start
                 left -= attempts[-1].outcome.iterations
             if attempts[-1].found is not None:
                 return attempts[-1].found
@@ -242,7 +245,7 @@ class Prepared:
                 raise Interrupted(str(error), first.solution) from error
         if found is not None and check and left > 0:
             names = {*form.states, *form.controls, "horizon"}
-            attempts.append(self._attempt(ELASTIC, found.plan, names, arguments, bounds))
+            attempts.append(self._attempt(ELASTIC, found.plan, names, arguments, bounds, solver))
             if attempts[-1].found is not None:
                 return attempts[-1].found
         told_of = attempts[-1] if attempts[-1].is_final else first
@@ -257,18 +260,38 @@ class Prepared:
             self._badness(told_of, bounds),
         ) from told_of.error
 
+    def _solver_of_other_starts(self) -> tuple[Any, Any]:
+        """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
+        options = {**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)}
+        return build_solver(self.scaled, self.solver_name, options, self.fragment.stages, self.problem.name)
+
     def _attempt(
-        self, start: str, point: np.ndarray, told: set[str], limits: dict[str, np.ndarray], bounds: Bounds
+        self,
+        start: str,
+        point: np.ndarray,
+        told: set[str],
+        limits: dict[str, np.ndarray],
+        bounds: Bounds,
+        solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run the solver once from a start, scaled by the sizes along it; see :func:`sizes_along` for ``told``."""
+        """Run a solver, its own for None, once from a start, scaled by the sizes along it.
+
+        See :func:`sizes_along` for ``told``.
+        """
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = unscaled(self.fragment)
         if self._scaling:
-            sizes = sizes_along(self.formulation, self.fragment, self.program, x0, told, bounds, p)
-            scales = fitting_scales(self.fragment, self.program, sizes, x0, p)
+            sizes = sizes_along(self._pattern, x0, told, bounds, p)
+            scales = fitting_scales(self._pattern, sizes, x0, p)
         relaxed = self._known.relaxed(arguments)
-        outcome = scales.outside(call_solver(self._solver, self._progress, scales.inside(relaxed)))
+        own = scales.inside(relaxed)
+        try:
+            run, progress = solver or (self._solver, self._progress)
+            outcome = call_solver(run, progress, own)
+        except RuntimeError as error:
+            outcome = broken_down(own, error)
+        outcome = scales.outside(outcome)
         outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
         try:
             solution = self._solution(outcome, p, start)
@@ -284,8 +307,8 @@ class Prepared:
     def _badness(self, attempt: Attempt, bounds: Bounds) -> str:
         """What was badly scaled to the solver, in words; "" where nothing was."""
         x0, p = attempt.arguments["x0"], attempt.arguments["p"]
-        built = self.formulation, self.fragment, self.program
-        return badness(*built, x0, p, attempt.scales, sizes_along(*built, x0, attempt.told, bounds, p))
+        sizes = sizes_along(self._pattern, x0, attempt.told, bounds, p)
+        return badness(self._pattern, x0, p, attempt.scales, sizes)
 
     def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
         index = self.fragment.horizon
@@ -397,6 +420,11 @@ class Attempt:
     def is_final(self) -> bool:
         """Whether no other start is to be tried: it succeeded, or there is no time left."""
         return self.found is not None or self.outcome.status.startswith(OUT_OF_TIME)
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether a function was not finite, or an integrator broke down."""
+        return self.outcome.status.startswith("Invalid_Number_Detected")
 
     def __str__(self) -> str:
         word = self.outcome.status.partition(":")[0]

@@ -24,7 +24,17 @@ from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
 from ocp.problem.formulation import Bounds, Formulation
 
-__all__ = ["USUAL", "Scales", "Sizes", "badness", "fitting_scales", "scaled_program", "sizes_along", "unscaled"]
+__all__ = [
+    "USUAL",
+    "Pattern",
+    "Scales",
+    "Sizes",
+    "badness",
+    "fitting_scales",
+    "scaled_program",
+    "sizes_along",
+    "unscaled",
+]
 
 USUAL = 1e3
 """Sizes from 1/USUAL to USUAL are left alone: the tolerances of 1e-10 leave seven digits there."""
@@ -80,6 +90,31 @@ class Sizes:
         return found
 
 
+class Pattern:
+    """What sizes are read from, of a program that is scaled many times.
+
+    Attributes:
+        rows, columns: Of the nonzeros of the Jacobian. to, source: Of each the state whose rate the row is, and the
+            entry of (states, controls) that it is derived in; -1 where there is none, or it is the state itself.
+        width: Of the interval of each, as a fraction. label: A number for the label of each row.
+    """
+
+    def __init__(self, form: Formulation, fragment: Fragment, program: Program) -> None:
+        self.form, self.fragment, self.program = form, fragment, program
+        rows, columns = (np.array(part, dtype=int) for part in program.jacobian.sparsity_out(1).get_triplet())
+        self.rows, self.columns = rows, columns
+        kinds = ("dynamics", "continuity")
+        states = {f"{kind} of {label}": i for kind in kinds for i, label in enumerate(form.state_labels)}
+        owner = np.array([states.get(label, -1) for label in fragment.row_labels])
+        to = np.where(fragment.row_bounds == form.bounds.places["zero"][0], owner, -1)[rows]
+        role = fragment.variable_role[columns]
+        source = fragment.variable_entry[columns] + np.where(role == "control", form.nx, 0)
+        inner = (to >= 0) & ((role == "state") | (role == "control")) & (to != source)
+        self.to, self.source = np.where(inner, to, -1), np.where(inner, source, -1)
+        self.width = np.diff(fragment.mesh)[np.clip(fragment.row_stages[rows], 0, len(fragment.mesh) - 2)]
+        _, self.label = np.unique(fragment.row_labels, return_inverse=True)
+
+
 def unscaled(fragment: Fragment) -> Scales:
     """Scales of one: the program as it is."""
     return Scales(np.ones(fragment.size), np.ones(fragment.n_rows), 1.0)
@@ -117,15 +152,7 @@ def scaled_program(program: Program) -> Program:
 # ---- sizes -------------------------------------------------------------------------------------------------------
 
 
-def sizes_along(
-    form: Formulation,
-    fragment: Fragment,
-    program: Program,
-    point: np.ndarray,
-    given: Collection[str],
-    bounds: Bounds,
-    p: np.ndarray,
-) -> Sizes:
+def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bounds: Bounds, p: np.ndarray) -> Sizes:
     """Sizes of what varies along a start.
 
     Args:
@@ -134,6 +161,7 @@ def sizes_along(
             anyhow.
         bounds, p: At the parameters.
     """
+    form, fragment = pattern.form, pattern.fragment
     nx, nu, places = form.nx, form.nu, form.bounds.places
     low, high = bounds
     seen = np.zeros(nx + nu + 1)
@@ -154,7 +182,7 @@ def sizes_along(
         return Sizes(seen[:nx], seen[nx:-1], horizon)
 
     # log s_i = log a_ij + log s_j + log T / T_0 of every coupling a_ij at the horizon T_0
-    pull = couplings(form, fragment, program, point, p)
+    pull = couplings(pattern, point, p)
     to, source = np.nonzero(pull)
     equations = np.zeros((len(to), len(seen)))
     equations[np.arange(len(to)), to] += 1.0
@@ -175,43 +203,28 @@ def sizes_along(
     return Sizes(sizes[:nx], sizes[nx:-1], float(sizes[-1]))
 
 
-def couplings(form: Formulation, fragment: Fragment, program: Program, point: np.ndarray, p: np.ndarray) -> np.ndarray:
+def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Horizon times the largest derivative of each state's rate in each other state and control. (nx, nx + nu)."""
-    found = np.zeros((form.nx, form.nx + form.nu))
-    jacobian = _second_output(program.jacobian, point, p)
-    if jacobian is None:
-        return found
-    rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
-    entries = np.abs(np.array(jacobian.nonzeros()))
-    states = {
-        f"{kind} of {label}": i for kind in ("dynamics", "continuity") for i, label in enumerate(form.state_labels)
-    }
-    zero = form.bounds.places["zero"][0]
-    owner = np.array([states.get(label, -1) for label in fragment.row_labels])
-    to = np.where(fragment.row_bounds == zero, owner, -1)[rows]
-    role = fragment.variable_role[columns]
-    source = fragment.variable_entry[columns] + np.where(role == "control", form.nx, 0)
-    keep = (to >= 0) & ((role == "state") | (role == "control")) & (to != source) & np.isfinite(entries) & (entries > 0)
-    # a row sees the rate over its interval
-    width = np.diff(fragment.mesh)[np.clip(fragment.row_stages[rows], 0, len(fragment.mesh) - 2)]
-    np.maximum.at(found, (to[keep], source[keep]), entries[keep] / width[keep])
+    found = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
+    jacobian = _second_output(pattern.program.jacobian, point, p)
+    if jacobian is not None:
+        entries = np.abs(np.array(jacobian.nonzeros()))
+        keep = (pattern.to >= 0) & np.isfinite(entries) & (entries > 0)
+        # a row sees the rate over its interval
+        np.maximum.at(found, (pattern.to[keep], pattern.source[keep]), entries[keep] / pattern.width[keep])
     return found
 
 
-def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
+def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
     """Scales of a program for variables of these sizes; rows and cost by how far they move from a start."""
-    by = sizes.of_variables(fragment)
+    program, by = pattern.program, sizes.of_variables(pattern.fragment)
     by = np.where(by > LEAST, by, 1.0)
-    rows = np.zeros(fragment.n_rows)
+    largest = np.zeros(pattern.fragment.n_rows)  # of all rows of a label, the same at all times
     jacobian = _second_output(program.jacobian, point, p)
     if jacobian is not None:
-        at, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
         with np.errstate(invalid="ignore"):
-            entries = np.abs(np.array(jacobian.nonzeros())) * by[columns]
-        np.maximum.at(rows, at, np.where(np.isfinite(entries), entries, 0.0))
-    _, label = np.unique(fragment.row_labels, return_inverse=True)  # the same at all times
-    largest = np.zeros(len(rows))
-    np.maximum.at(largest, label, rows)
+            entries = np.abs(np.array(jacobian.nonzeros())) * by[pattern.columns]
+        np.maximum.at(largest, pattern.label[pattern.rows], np.where(np.isfinite(entries), entries, 0.0))
     moves = []
     for place in (point, point + by):  # where a start rests on the least of the cost, beside it
         slope = _second_output(program.gradient, place, p)
@@ -222,19 +235,12 @@ def fitting_scales(fragment: Fragment, program: Program, sizes: Sizes, point: np
     cost = min(usual, default=1.0)
     # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
     cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
-    return Scales(_powers(by), _powers(largest[label]), float(2.0 ** np.round(np.log2(cost))))
+    return Scales(_powers(by), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
-def badness(
-    form: Formulation,
-    fragment: Fragment,
-    program: Program,
-    point: np.ndarray,
-    p: np.ndarray,
-    scales: Scales,
-    sizes: Sizes,
-) -> str:
+def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:
     """What makes a program badly scaled as it was solved, in words; "" where nothing does."""
+    form, fragment = pattern.form, pattern.fragment
     by = sizes.of_variables(fragment) / scales.variables
     off = np.abs(np.log(by))
     if by.size and off.max() > np.log(BAD):
@@ -242,7 +248,7 @@ def badness(
         role, entry = str(fragment.variable_role[k]), int(fragment.variable_entry[k])
         label = {"state": form.state_labels, "control": form.control_labels}.get(role, ("",))[entry]
         return f"{role} {label}".strip() + f" is of size {by[k]:.1g} to the solver, not near 1"
-    pull = couplings(form, fragment, program, point, p)
+    pull = couplings(pattern, point, p)
     inner = np.concatenate([sizes.states, sizes.controls])
     drive = (pull * inner / sizes.states[:, None]).max(axis=1, initial=0.0)
     if form.horizon_is_free:

@@ -32,7 +32,7 @@ def second_order(problem: Problem, solution: Solution) -> Curvature:
 
 
 def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
-    solution = solve(problem, method, **how)
+    solution = solve(problem, method, check=False, **how)  # as the solver leaves it
     return solution, second_order(problem, solution)
 
 
@@ -270,7 +270,7 @@ METHODS = (METHOD, Collocation(20, 3, "legendre"), MultipleShooting(40, control=
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_no_method_passes_its_audit_with_a_plan_past_the_conjugate_point(method: Any) -> None:
     assert solve(oscillator(3.0), method).audit().passed
-    audit = solve(oscillator(3.3), method).audit()
+    audit = solve(oscillator(3.3), method, check=False).audit()
     assert [finding.name for finding in audit.failures] == ["curvature downwards, relative"]
     assert audit.optimality.curvature.upwards is False
     assert audit.feasible
@@ -279,7 +279,7 @@ def test_no_method_passes_its_audit_with_a_plan_past_the_conjugate_point(method:
 
 def test_methods_that_agree_on_a_saddle_get_no_certificate() -> None:
     problem = oscillator(3.3)
-    assert not certificate(problem, [solve(problem, METHOD), solve(problem, METHODS[2])]).passed
+    assert not certificate(problem, [solve(problem, method, check=False) for method in METHODS[::2]]).passed
 
 
 def pan_tilt(turn: float) -> Problem:
@@ -299,7 +299,7 @@ def pan_tilt(turn: float) -> Problem:
 def test_the_long_way_round_a_sphere_is_none(turn: float, verdict: bool) -> None:
     """Great circles are shortest up to half a turn (Jacobi); the equator is stationary for any turn."""
     guess = {"pan": lambda t: turn * t, "rates": [turn, 0.0]}
-    plan = solve(pan_tilt(turn), METHOD, guess=guess)
+    plan = solve(pan_tilt(turn), METHOD, guess=guess, check=False)
     assert np.abs(plan["tilt"]).max() < 1e-6
     assert plan.audit().passed is verdict
 
