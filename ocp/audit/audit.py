@@ -266,7 +266,7 @@ def optimality_findings(
     share = float(found.lost.sum()) / cost
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
-        Finding("costate equation, relative", float(found.adjoint.error.sum()) / errors, costates),
+        Finding("costate equation, relative", found.adjoint.total / errors, costates),
         worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
         Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]

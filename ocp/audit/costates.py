@@ -59,6 +59,8 @@ class Adjoint:
         standing: Multipliers of the limits of the states at the Gauss points, per unit of s, those at the ends of the
             intervals spread over their neighbours. Shape (N q, nx + r').
         error: Of the costates over each interval, from end to end. Shape (N,).
+        total: Of all of them: their sum, or where errors cancel the largest distance from the costates that are
+            integrated from the end of the plan to its start, whichever is less.
         between: Of what is reported between the ends of an interval. Shape (N,).
         charge: What the multipliers of the states' limits win over the gaps to them, in each interval. Shape (N,).
         lumps: What of the costates reported at the ends of the intervals stands for pushes before these: a limit that a
@@ -71,6 +73,7 @@ class Adjoint:
     holding: np.ndarray
     standing: np.ndarray
     error: np.ndarray
+    total: float
     between: np.ndarray
     charge: np.ndarray
     lumps: np.ndarray
@@ -116,16 +119,19 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps:
     force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.stand_x[..., :-1].reshape(n, q, m, -1))) @ size
     for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
         force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_stand_x[nodes, :, :-1])) @ size
+    off = back.chained(first - start)
+    total = min(float(np.abs(first - start).sum(axis=0) @ size), float((np.abs(off) @ size).max()))
     return Adjoint(
         along.mesh * along.solution.horizon,
         costate,
         holding,
         standing.reshape(n * q, m),
         np.abs(first - start) @ size,
+        total,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
         stand.sum(axis=(1, 2)) + single[0] + single[1],
         _lumps(along, holding, atoms),
-        _ends(along, costate, holding, inside, atoms, cost),
+        _ends(along, costate, holding, inside, atoms, cost, last[-1]),
     )
 
 
@@ -204,6 +210,19 @@ class Backwards:
         start = end + np.einsum("k,j,kja->ka", along.width, along.weight, flow) + force.sum(axis=1)
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
+    def chained(self, errors: np.ndarray) -> np.ndarray:
+        """What errors (N, nx) at the start of each interval make together at its start, carried on backwards."""
+        (n, q), nx = self.along.shape, self.along.form.nx
+        answer = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
+        weight = self.along.weight[:, None, None]
+        flow = np.eye(nx) + self.along.width[:, None, None] * (weight * (self.feed @ answer)).sum(axis=1)
+        off, found = np.zeros(nx), np.zeros((n, nx))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in reversed(range(n)):
+                off = errors[k] + flow[k] @ off
+                found[k] = off
+        return np.where(np.isfinite(found), found, np.inf)
+
 
 def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Pushes of the limits of the states in interval k that explain its costates best: (q, m), (2, m)."""
@@ -275,7 +294,13 @@ def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.
 
 
 def _ends(
-    along: Linearisation, costate: np.ndarray, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray, cost: float
+    along: Linearisation,
+    costate: np.ndarray,
+    holding: np.ndarray,
+    inside: np.ndarray,
+    atoms: np.ndarray,
+    cost: float,
+    lam1: np.ndarray,
 ) -> Ends:
     """The conditions at the ends with the multipliers, of the right signs, that explain them best."""
     form, solution, nx = along.form, along.solution, along.form.nx
@@ -283,7 +308,7 @@ def _ends(
     places, sizes = form.bounds.places, along.sizes
     x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
     u0, u1 = stack(solution.controls, 2)[[0, -1]]
-    lam0, lam1 = (part[k] for part, k in zip(_ends_of_intervals(along), (0, -1), strict=True))
+    lam0 = _ends_of_intervals(along)[0][0]
     y = ca.vertcat(form.x, form.x0, form.T)
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
     end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])

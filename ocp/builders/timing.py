@@ -147,7 +147,7 @@ def plan_minimum_time(
 
     A motion that keeps them, hence an upper bound of the least time: jerks held over intervals cannot follow a limit
     exactly, which costs time in proportion to their width (about 0.2 % of the example's with joint limits at 200).
-    The audit of its solution finds everything right but the stationarity, which held jerks have on average only.
+    The audit of its solution finds the motion feasible, but no optimum, for the time that is lost.
 
     Args:
         path, limits, joints: As of `ocp.schedule.schedule`.

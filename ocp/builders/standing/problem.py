@@ -8,8 +8,8 @@ Joint accelerations (or jerks) are the control. Two ways to keep the tips to the
 tip_level "position": for controls held over intervals, `MultipleShooting(..., control="held")` or `Collocation(...,
     control="held")`. The tip is on its path at the nodes; what the ground and the joints bear is constrained at both
     ends of every interval; a pinned zero moment point is where it should be at the start of every interval. Converges
-    with the first order of the interval where a constraint of the ground is active, and by shooting the multipliers of
-    that constraint then belong to one end of an interval: the audit's stationarity, taken inside it, may not fit.
+    with the first order of the interval where a constraint of the ground is active: the audit then finds the motion
+    feasible, and more of the cost lost than an optimum may lose.
 tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
     tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
     nearer to the optimum for the same number of intervals, and certified by the audit. The one to take where slides

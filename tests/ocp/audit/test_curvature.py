@@ -28,7 +28,7 @@ def second_order(problem: Problem, solution: Solution) -> Curvature:
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
-    return curvature(AccessoryProblem(along, adjoint(along, abs(solution.cost) or 1.0)))
+    return curvature(AccessoryProblem(along, adjoint(along, None, abs(solution.cost) or 1.0)))
 
 
 def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
@@ -65,7 +65,7 @@ def random_quadratic(rng: np.random.Generator, fixed: bool, bounded: bool) -> Pr
     r, s = rng.normal(size=(m, m)), 0.3 * rng.normal(size=(n, m))
     problem = Problem("quadratic")
     x = problem.state("x", n, initial=np.zeros(n), terminal=np.zeros(n) if fixed else None, guess=0.0)
-    u = problem.control("u", m, guess=0.0, **({"lower": -1.0, "upper": 1.0} if bounded else {}))
+    u = problem.control("u", m, guess=0.0, lower=-1.0 if bounded else -np.inf, upper=1.0 if bounded else np.inf)
     problem.dynamics(x, ca.mtimes(a, x) + ca.mtimes(b, u))
     problem.horizon(float(rng.uniform(0.3, 3.0)))
     bend = 4.0 if fixed else 1.0  # an end that is given needs more of it to spoil a minimum

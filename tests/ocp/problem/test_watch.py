@@ -99,7 +99,7 @@ def planar() -> FixedBase:
         joints.append(
             Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, (min(i, 1), 0, 0), axis=(0, 0, 1))
         )
-    return FixedBase(Robot(links, joints, tip_translation=(1.0, 0, 0)))
+    return FixedBase(Robot(tuple(links), tuple(joints), tip_translation=(1.0, 0, 0)))
 
 
 def test_the_builders_watch_where_the_tips_are() -> None:

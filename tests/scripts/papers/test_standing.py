@@ -17,7 +17,7 @@ from ocp import resolve_accelerations
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from scripts import standing
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task
-from scripts.papers.standing.checks import ALLOWED, STATIONARITY, check, failures, region_excess
+from scripts.papers.standing.checks import ALLOWED, LOST, check, failures, region_excess
 from scripts.papers.standing.drawing import arm_points
 from scripts.papers.standing.plans import PLANS, Plan
 from scripts.papers.standing.printed import printed_law
@@ -203,19 +203,21 @@ def test_every_plan_that_is_drawn_holds_between_its_nodes(run: Run[Results], sum
     assert max(limit for name, limit in ALLOWED.items() if name not in ("zmp_excess_m", "tip_error_m")) == 1e-6
 
 
-def test_audits_pass_but_for_the_multiplier_of_held_controls(run: Run[Results]) -> None:
+def test_audits_pass_but_for_what_held_controls_lose(run: Run[Results]) -> None:
     text = (run.folder / "audit.txt").read_text(encoding="utf-8")
     for task, key, plan in plans_of(run):
         assert f"{task}, {key}:" in text
         missed = {name for name, _, _ in failures(plan)}
         if not plan.request.drawn:
-            assert missed == {"zero moment point"}  # a pinned point and held accelerations
+            assert "zero moment point" in missed  # a pinned point and held accelerations
+            assert not plan.audit.feasible
         elif plan.request.transcription == "points":
             assert not missed
         else:
-            assert missed <= {STATIONARITY}
+            assert missed <= {LOST}
+            assert plan.audit.feasible
             if task != "minimum_time":
-                assert plan.audit.passed
+                assert plan.audit[LOST].value < 3e-3
 
 
 def test_plans_are_looked_at_on_ten_times_their_grid_with_both_ends_of_every_interval(run: Run[Results]) -> None:
