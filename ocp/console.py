@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 LOG = logging.getLogger("ocp")
-GRACE = 0.7  # s after Ctrl-C in which a call may end by itself, with what it has found
+GRACE = 0.5  # s after Ctrl-C in which a call may end by itself, with what it has found
 INTERRUPTED = "User_Requested_Stop"
 OUT_OF_TIME = "Maximum_WallTime_Exceeded"
 P = ParamSpec("P")

@@ -16,6 +16,7 @@ from ocp.audit.principle import FLAT
 from ocp.audit.reintegration import Reintegration, reintegrate
 from ocp.audit.sizes import Sizes, fine_grid, sizes_along
 from ocp.audit.violations import Violation, violations
+from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
@@ -149,6 +150,7 @@ class Audit:
         return "\n".join([*lines, f"The plan {self.sentence}."])
 
 
+@interruptible
 @np.errstate(invalid="ignore", over="ignore")  # what is not a number fails by name
 def audit(
     problem: Problem,
@@ -208,7 +210,7 @@ def audit(
     grid = fine_grid(solution)
     size = sizes_along(form, grid, solution.horizon, p, bounds)
     again = reintegrate(form, solution, p, grid, size)
-    found = optimality(form, solution, p, bounds)
+    found = optimality(form, solution, p, bounds, size)
 
     findings = []
     off = again.carried_off(integration)

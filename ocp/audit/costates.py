@@ -92,6 +92,8 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps:
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
     taken = np.broadcast_to(lumps, (n + 1, along.form.nx))
+    # what jumps between two intervals is for the pushes at the start of the second to explain
+    first = np.vstack([first[:1], last[:-1]])
     first, last = first - taken[:-1], last - taken[1:]
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
     near, at_node = (
@@ -104,7 +106,6 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps:
         back = Backwards(along, holding, across)
         for k in limited.tolist():
             inside[k], atoms[k] = _pushes(back, k, first[k], last[k], cost)
-        along.follow((inside != 0).any(axis=1) | (atoms != 0).any(axis=1))
         costate, start = back.integrate(last, inside, atoms)
         holding, across = holders(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():

@@ -51,6 +51,13 @@ class Limits:
         part.lower, part.upper = self.lower[points], self.upper[points]
         return part
 
+    def extend(self, count: int) -> None:
+        """Add as many equalities, which the plan meets."""
+        m = len(self.below)
+        self.equal = np.append(self.equal, np.ones(count, bool))
+        self.below, self.above = (np.hstack([part, np.zeros((m, count))]) for part in (self.below, self.above))
+        self.lower, self.upper = (np.hstack([part, np.ones((m, count), bool)]) for part in (self.lower, self.upper))
+
     @property
     def near(self) -> np.ndarray:
         """Which may push on either side. Shape (M, m), bool."""
@@ -75,9 +82,8 @@ class Linearisation:
         rate, rate_y: T f, (M, nx), and its derivatives, (M, nx, ny).
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
         sizes: Of all named things along the plan.
-        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs, in this order. Shape
+        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of the states, in this order. Shape
             (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
-        arc_of: Which limit of the states each arc follows. Shape (a,).
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
             derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
         low, high: Limits of the controls at the points. Shape (M, nu).
@@ -180,23 +186,17 @@ class Linearisation:
         self.node_stand_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
     def _arcs(self) -> None:
-        """Limits of the states hold the controls too where a plan follows them: by the first derivative that has one.
+        """Equalities of the states hold the controls too, by the first derivative in time that has one.
 
-        On an arc the costates are known up to multiples of the gradients of the limit and its derivatives (Hartl,
-        Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of the last derivative.
+        A transcription that holds them at points knows the costates up to multiples of the gradients of such a row and
+        of its derivatives (Hartl, Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of
+        the last derivative.
         """
         form, nx, nu = self.form, self.form.nx, self.form.nu
-        low, high = (side[form.bounds.places["state"]] for side in self.bounds)
-        bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
-        self.arc_of = np.concatenate([bounded, nx + np.arange(len(self.still))]).astype(int)
-        rows = ca.vertcat(*[form.x[int(i)] for i in bounded], *[form.path.expression[int(i)] for i in self.still])
-        m, count = len(self.s), len(self.arc_of)
-        self.hold_u = np.concatenate([self.hold_u, np.zeros((m, count, nu))], axis=1)
-        for limits in (self.hold,):
-            for name in ("below", "above", "lower", "upper"):
-                part = getattr(limits, name)
-                setattr(limits, name, np.hstack([part, np.zeros((m, count), part.dtype)]))
-            limits.equal = np.append(limits.equal, np.zeros(count, bool))
+        equal = np.flatnonzero(form.path.equality[self.still])
+        rows = ca.vertcat(*[form.path.expression[int(i)] for i in self.still[equal]])
+        m, count = len(self.s), len(equal)
+        arcs = np.zeros((m, count, nu))
         left = np.arange(count)
         for _ in range(MOST_DERIVATIVES):
             if not left.size or not nu:
@@ -207,17 +207,10 @@ class Linearisation:
             if found.any():
                 which = np.flatnonzero(found)
                 (slopes,) = form.sampled([in_control[which.tolist(), :]], *self.here[:5])
-                slopes = slopes.reshape(m, nu, len(which)).transpose(0, 2, 1)
-                self.hold_u[:, -count:][:, left[which]] = slopes
+                arcs[:, left[which]] = slopes.reshape(m, nu, len(which)).transpose(0, 2, 1)
                 rows, left = rows[np.flatnonzero(~found).tolist()], left[~found]
-        self.follow(np.zeros((self.shape[0], len(self.stand.equal)), bool))
-
-    def follow(self, pushing: np.ndarray) -> None:
-        """Take the limits of the states that push in an interval, (N, nx + r') bool, and equalities for arcs there."""
-        count = len(self.arc_of)
-        if count:
-            arc = np.repeat(pushing[:, self.arc_of], self.shape[1], axis=0) | self.stand.equal[self.arc_of]
-            self.hold.lower[:, -count:] = self.hold.upper[:, -count:] = arc
+        self.hold_u = np.concatenate([self.hold_u, arcs], axis=1)
+        self.hold.extend(count)
 
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.degeneracy import better_costates
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import Hamiltonian, hamiltonian, holders, lost, reduced_slope
-from ocp.audit.sizes import sizes
+from ocp.audit.sizes import Sizes, sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 
@@ -55,23 +55,29 @@ class Optimality:
     curvature: Curvature
 
 
-def optimality(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Optimality:
-    """Look for the multipliers of a plan, for what it loses and for how the cost curves."""
-    along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
+def optimality(
+    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, size: Sizes | None = None
+) -> Optimality:
+    """Look for the multipliers of a plan, for what it loses and for how the cost curves.
+
+    Args:
+        form, p, bounds: The problem, its parameters and its bounds at these.
+        solution: The plan. size: Sizes along it, where they are known already.
+    """
+    along = Linearisation(form, solution, p, bounds, size or sizes(form, solution, p, bounds))
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
-    size = abs(solution.cost) or along.slope_size or 1.0
+    cost = abs(solution.cost) or along.slope_size or 1.0
     curved = _curved(along)
-    first = adjoint(along, curved, size)
+    first = adjoint(along, curved, cost)
     if first.lumps.any():
         found, told = first, _told(along, first, curved)
         for _ in range(SPREADS):
-            found = adjoint(along, curved, size, found.lumps)
+            found = adjoint(along, curved, cost, found.lumps)
             now = _told(along, found, curved)
             if now >= told:
                 break
             first, told = found, now
-        along.follow((first.standing != 0).reshape(*along.shape, -1).any(axis=1))
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
     cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)

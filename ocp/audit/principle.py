@@ -32,6 +32,8 @@ __all__ = [
 
 DEPENDENT = 1e-9
 """Singular values below this share of the largest are none."""
+ROUNDED = 1e-14
+"""Of a slope: what is left of it by rounding."""
 STEEP = 1e-6
 """Slope of the Hamiltonian, of the largest, above which it is worth looking for what holds it across a gap."""
 FLAT = 1e-7
@@ -88,7 +90,7 @@ def holders(
     gradient, directions = slope(along, costate) * unit, along.hold_u * unit
     found = balance(gradient, directions, hold.lower, hold.upper)
     across = np.zeros(len(found), bool)
-    if curved is None or not mixed:
+    if curved is None or along.form.path.equality[along.mixed].all():
         return found, across
     left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
     steep = float(np.abs(gradient).max())
@@ -276,11 +278,11 @@ def _step(gradient: np.ndarray, curved: np.ndarray, rows: np.ndarray, scale: flo
     else:
         projector = np.broadcast_to(np.eye(nu), (k, nu, nu))
     pull = np.einsum("kuv,kv->ku", projector, gradient)
-    inside = projector @ curved @ projector
+    # held directions are as stiff as the stiffest, so that rounding does not move along them
+    inside = projector @ curved @ projector + scale * (np.eye(nu) - projector)
     values, vectors = np.linalg.eigh((inside + inside.transpose(0, 2, 1)) / 2)
     along = np.einsum("kuv,ku->kv", vectors, pull)
     solid = values > FLAT * scale
     step = np.where(solid, -along / np.where(solid, values, 1.0), -np.sign(along))
-    # the projector's own null directions have no pull
-    step = np.where(np.abs(along) > 1e-14 * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
-    return np.asarray(np.einsum("kuv,kv->ku", vectors, step))
+    step = np.where(np.abs(along) > ROUNDED * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
+    return np.asarray(projector @ np.einsum("kuv,kv->ku", vectors, step)[..., None])[..., 0]

@@ -178,7 +178,7 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """The same with a huge number for every entry that is infinite or not a number."""
+    """The same with a huge number for every entry that is infinite, of its sign, or is not a number."""
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], HUGE), -HUGE))
 
 

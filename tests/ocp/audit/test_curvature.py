@@ -28,7 +28,7 @@ def second_order(problem: Problem, solution: Solution) -> Curvature:
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
-    return curvature(AccessoryProblem(along, adjoint(along, abs(solution.cost) or 1.0)))
+    return curvature(AccessoryProblem(along, adjoint(along, None, abs(solution.cost) or 1.0)))
 
 
 def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
