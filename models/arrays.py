@@ -6,17 +6,24 @@ from collections.abc import Iterable, Mapping
 from math import isfinite, isnan
 from numbers import Real
 from typing import Any, TypeAlias, TypeVar
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
 
 Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
 IDENTITY = np.eye(3)
+MOST = 100_000
+"""Of what is counted: more than these take longer than anybody waits."""
+TWO_TURNS, ENDLESS = 4 * np.pi, 1e4
+"""rad: angles between the two look like degrees; beyond the second they are written for no limit at all."""
+LONGEST_PART = 50.0
+"""m: longer parts look like millimetres."""
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
@@ -123,6 +130,12 @@ def _shown(array: Array, wrong: Any, what: str) -> str:
     return f"{what} (row {row}) {array[row].tolist()}"
 
 
+def checked_numbers(value: ArrayInput, owner: str, what: str) -> Array:
+    """`value` as an array of floats of its own shape, all finite; errors as of checked_array."""
+    array = _read(value, owner, what)
+    return checked_array(array, array.shape, owner, what)
+
+
 def checked_number(
     value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
 ) -> float:
@@ -130,6 +143,32 @@ def checked_number(
     if isinstance(value, float) and (isfinite(value) or not (finite or isnan(value))) and (value > 0 or not positive):
         return float(value)  # nothing to say, and no array needed: a robot has hundreds of numbers
     return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
+
+
+def checked_nonnegative(value: ArrayInput, owner: str, what: str, unit: str = "") -> float:
+    """`value` as a float; ModelError naming `owner` and `what` unless it is a finite number, zero or above."""
+    number = checked_number(value, owner, what)
+    if number < 0:
+        message = f"{owner}: {what} {number} {unit}".rstrip()
+        raise ModelError(f"{message} is negative", name=what, value=number, limit=0.0)
+    return number
+
+
+def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int = MOST) -> int:
+    """`value` as an int; ModelError naming `owner` and `what` unless it is a whole number from `least` to `most`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
+        message = f"{owner}: {what} must be a whole number, {least} to {most}, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=(least, most))
+    return int(value)
+
+
+def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np.intp]:
+    """`value` as an array of indices; ModelError naming `owner` and `what` unless they are whole, from 0 to `count`."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "iu" or ((found < 0) | (found >= count)).any():
+        message = f"{owner}: {what} must be whole numbers from 0, below {count}, not {value!r}"
+        raise ModelError(message, name=what, value=value, limit=(0, count))
+    return found.astype(np.intp)
 
 
 def one_for_each(
@@ -145,6 +184,34 @@ def one_for_each(
         raise ModelError(message, name=what, value=array, limit=(count,))
     known = checked_array(array, array.shape, owner, what, finite=finite, **checks)
     return frozen(np.array(np.broadcast_to(known, (count,))))
+
+
+def warn_of_degrees(angles: ArrayInput, owner: str, name: str, what: str) -> None:
+    """Warn where an angle, rad, is that large that it looks like degrees: beyond two turns, but no stand-in for none.
+
+    Python says the same words once only.
+
+    Warns:
+        ModelWarning: With `name`, of a joint or argument, and the angle.
+    """
+    odd = _first_between(angles, TWO_TURNS, ENDLESS)
+    if odd is not None:
+        message = f"{owner}: {what} {odd:g} rad is more than two turns; angles are in rad, is it in degrees?"
+        warn(ModelWarning(message, name=name, value=odd, limit=TWO_TURNS), stacklevel=1)
+
+
+def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, what: str) -> None:
+    """Warn where a length, m, is that large that it looks like millimetres; as warn_of_degrees."""
+    odd = _first_between(lengths, LONGEST_PART, np.inf)
+    if odd is not None:
+        message = f"{owner}: {what} {odd:g} m is long for a robot; lengths are in m, is it in millimetres?"
+        warn(ModelWarning(message, name=name, value=odd, limit=LONGEST_PART), stacklevel=1)
+
+
+def _first_between(values: ArrayInput, low: float, high: float) -> float | None:
+    """The first entry whose size is between the two, where there is one."""
+    entries = np.ravel(values).tolist()  # a robot has hundreds of few entries, where numpy is slower
+    return next((entry for entry in entries if low < abs(entry) < high), None)
 
 
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:

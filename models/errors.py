@@ -25,4 +25,12 @@ class ModelError(ValueError):
 
 
 class ModelWarning(UserWarning):
-    """Something odd in what describes a machine, which can be worked with; the message names where it is."""
+    """Something odd in what describes a machine, which can be worked with; the message names where it is.
+
+    Attributes:
+        name, value, limit: As of ModelError; each None where there is none, or where several are named.
+    """
+
+    def __init__(self, message: str = "", *, name: str | None = None, value: Any = None, limit: Any = None) -> None:
+        super().__init__(message)
+        self.name, self.value, self.limit = name, value, limit

@@ -9,11 +9,14 @@ import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import Any
+from numbers import Real
+from typing import Any, TypeVar
 
 import numpy as np
 
 __all__ = [
+    "MOST",
+    "NOT_NUMBERS",
     "AuditError",
     "Detailed",
     "Interrupted",
@@ -23,13 +26,24 @@ __all__ = [
     "about",
     "checked_choice",
     "checked_count",
+    "checked_each",
+    "checked_flag",
+    "checked_instance",
     "checked_mapping",
     "checked_nonnegative",
     "checked_positive",
     "checked_text",
     "checked_time_limit",
+    "floats",
+    "real",
     "unknown_name",
 ]
+
+NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
+"""What numpy and casadi raise of values that are no numbers."""
+MOST = 1_000_000
+"""Of what is counted: more than these take longer than anybody waits."""
+_Kind = TypeVar("_Kind")
 
 
 class Detailed(Exception):
@@ -104,7 +118,33 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
     names = [str(item) for item in known]
     near = get_close_matches(str(name), names, n=3)
     hint = f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(names) or 'none'}"
-    return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name), limit=tuple(names))
+    return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name) or kind, limit=tuple(names))
+
+
+def floats(value: Any) -> np.ndarray:
+    """``value`` as a new array of floats; one of NOT_NUMBERS where it is none.
+
+    That is also where numpy would read a number all the same: in a text, in True, in None and in a symbol (nan), in the
+    real part of a complex number.
+    """
+    plain = np.asarray(value)
+    if plain.dtype.kind == "O":
+        fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
+    else:
+        fits = plain.dtype.kind in "iuf"
+    if not fits:
+        raise TypeError(f"{plain.dtype} is no real number")
+    return np.array(plain, dtype=float)
+
+
+def real(value: Any) -> float:
+    """A single real number, nan where it is none."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+        return np.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return np.nan
 
 
 def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
@@ -120,7 +160,7 @@ def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
 def checked_count(what: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """``value`` as a plain integer, or ProblemError unless it is a whole number from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < least or (most is not None and value > most):
+    if not whole or value < least or value > (MOST if most is None else most):
         kind = "a positive integer" if least == 1 else f"a whole number, at least {least}"
         kind = kind if most is None else f"{least} to {most}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=(least, most))
@@ -129,22 +169,20 @@ def checked_count(what: str, value: Any, least: int = 1, most: int | None = None
 
 def checked_nonnegative(what: str, value: Any) -> float:
     """``value``, or ProblemError unless it is a finite number, zero or above."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 <= value < np.inf:
+    if not 0 <= real(value) < np.inf:
         words = f"{what} must be a finite number, zero or above, not {value!r}"
         raise ProblemError(words, name=_last(what), value=value, limit=0.0)
-    return value  # type: ignore[return-value]
+    kept: float = value  # a whole number stays one
+    return kept
 
 
 def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
     """``value``, or ProblemError unless it is a number between 0 and ``below``, both excluded."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float | np.integer | np.floating)
-        or not 0 < value < below
-    ):
+    if not 0 < real(value) < below:
         kind = "positive and finite" if below == np.inf else f"between 0 and {below:g}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
-    return value  # type: ignore[return-value]
+    kept: float = value
+    return kept
 
 
 def checked_text(what: str, value: Any) -> str:
@@ -152,6 +190,33 @@ def checked_text(what: str, value: Any) -> str:
     if not isinstance(value, str):
         raise ProblemError(f"{what} must be a string, not {value!r}", name=_last(what), value=value)
     return value
+
+
+def checked_flag(what: str, value: Any) -> bool:
+    """``value`` as a bool, or ProblemError unless it is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ProblemError(f"{what} must be True or False, not {value!r}", name=_last(what), value=value)
+    return bool(value)
+
+
+def checked_instance(what: str, value: Any, kind: type[_Kind]) -> _Kind:
+    """``value``, or ProblemError unless it is a ``kind``."""
+    if not isinstance(value, kind):
+        words = f"{what} must be a {kind.__name__}, not {value!r}"
+        raise ProblemError(words, name=_last(what), value=value, limit=kind.__name__)
+    return value
+
+
+def checked_each(what: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
+    """``values`` as a tuple, or ProblemError unless they are several (or none) of a ``kind``."""
+    try:
+        each = tuple(values)
+    except TypeError as error:
+        words = f"{what} must be a list of {kind.__name__}, not {values!r}"
+        raise ProblemError(words, name=_last(what), value=values, limit=kind.__name__) from error
+    for value in each:
+        checked_instance(what, value, kind)
+    return each
 
 
 def checked_time_limit(seconds: Any) -> float | None:

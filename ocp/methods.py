@@ -12,7 +12,7 @@ from ocp.audit.optimality import optimality
 from ocp.audit.principle import FLAT
 from ocp.console import interruptible, limited
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError, checked_time_limit
+from ocp.errors import ProblemError, SolveError, checked_flag, checked_time_limit
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
@@ -80,6 +80,8 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
+    for what, flag in (("compiled", compiled), ("scaling", scaling)):
+        checked_flag(f"prepare: {what}", flag)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
@@ -122,6 +124,7 @@ def solve(
             when, and the worst residuals by constraint, state and time. Or what it found is no minimum, and beside it
             there is none either.
     """
+    checked_flag("solve: check", check)
     with limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
         solution = prepared.solve(parameters, guess, check)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import AuditError, ProblemError, unknown_name
+from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, floats, unknown_name
 from ocp.problem.problem import Problem
 from ocp.storage import read_arrays, write_arrays
 
@@ -35,6 +35,7 @@ __all__ = [
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 2
+SLACK = 1e-12  # relative, of what rounding may do to times
 HEAD = {
     "name": str,
     "method": dict,
@@ -140,22 +141,15 @@ class Solution:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
-        for pool in (self.states, self.controls):
-            if name in pool:
-                return pool[name]
-        raise unknown_name("state or control", name, [*self.states, *self.controls])
+        return by_name("state or control", name, {**self.states, **self.controls})
 
     def costate(self, name: str) -> np.ndarray:
         """Costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""
-        if name not in self.costates:
-            raise unknown_name("state", name, self.costates)
-        return self.costates[name]
+        return by_name("state", name, self.costates)
 
     def cost_gradient(self, name: str) -> np.ndarray:
         """Derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""
-        if name not in self.cost_gradients:
-            raise unknown_name("parameter", name, self.cost_gradients)
-        return self.cost_gradients[name]
+        return by_name("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
         """States and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own interpolant.
@@ -164,12 +158,12 @@ class Solution:
             ProblemError: A time outside 0 to the horizon, or not finite.
         """
         try:
-            times = np.asarray(time, dtype=float)
-        except (TypeError, ValueError) as error:
+            times = floats(time)
+        except NOT_NUMBERS as error:
             raise ProblemError(
                 f"a time or an array of times is expected, not {time!r}", name="time", value=time
             ) from error
-        slack = 1e-12 * self.horizon
+        slack = SLACK * self.horizon
         if not np.all((times >= -slack) & (times <= self.horizon + slack)):
             words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon), time=time)
@@ -177,7 +171,14 @@ class Solution:
 
     def at_fraction(self, fraction: Any) -> Sample:
         """As :meth:`at`, at fractions 0..1 of the horizon."""
-        at = np.asarray(fraction, dtype=float)
+        try:
+            at = floats(fraction)
+            inside = bool(((at >= -SLACK) & (at <= 1 + SLACK)).all())
+        except NOT_NUMBERS:
+            inside = False
+        if not inside:
+            words = f"fractions of the horizon, 0 to 1, are expected, not {fraction!r}"
+            raise ProblemError(words, name="fraction", value=fraction, limit=(0.0, 1.0))
         flat = np.clip(at.reshape(-1), 0.0, 1.0)
         values: dict[str, np.ndarray] = {}
         for pool, interpolant in ((self.states, self.state_interpolant), (self.controls, self.control_interpolant)):
@@ -316,6 +317,13 @@ class Solution:
     def __deepcopy__(self, memo: Any) -> Solution:
         """A solution of arrays of its own, of a copy of the problem."""
         return replace(self, **{f.name: deepcopy(getattr(self, f.name), memo) for f in dataclass_fields(self)})
+
+
+def by_name(kind: str, name: Any, pool: Mapping[str, np.ndarray]) -> np.ndarray:
+    """An entry of a pool; ProblemError, which lists the near ones, where nothing bears the name."""
+    if not isinstance(name, str) or name not in pool:
+        raise unknown_name(kind, name, pool)
+    return pool[name]
 
 
 def plain(value: Any) -> Any:

@@ -37,9 +37,11 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     ``NAME.xxxxxxxx.part``, and is locked; one that is not locked any more, because who wrote it was killed, is removed.
 
     Raises:
-        ProblemError: path is no file but a folder, a pipe or a device, or the arrays are larger than is read again.
+        ProblemError: path is no path, no file but a folder, a pipe or a device, or the arrays are larger than is read
+            again.
         OSError: The file cannot be written.
     """
+    checked_path(path)
     size = sum(array.nbytes for array in arrays.values())
     if size > MOST_BYTES:
         words = f"{path}: {size:.3g} bytes of arrays, at most {MOST_BYTES:.3g} are written"
@@ -107,7 +109,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         FileNotFoundError: There is no such file.
         ProblemError: It cannot be read, is no such file, or is larger than ``MOST_BYTES``.
     """
-    told: dict[str, Any] = {"name": "path", "value": str(path)}
+    told: dict[str, Any] = {"name": "path", "value": str(checked_path(path))}
     try:
         check_regular(path, os.stat(os.fspath(path)))  # a pipe would be waited for
         with open(path, "rb") as stream:
@@ -127,6 +129,13 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         raise ProblemError(f"{path} cannot be read: {error.strerror or error}", **told) from error
     except Exception as error:  # what zip, zlib and numpy say of broken bytes is of many kinds
         raise ProblemError(f"{path} is not a saved solution: {error}", **told) from error
+
+
+def checked_path(path: Any) -> str | os.PathLike[str]:
+    """``path``, or ProblemError unless it is the path of a file: a number would be an open file's, 0 the terminal."""
+    if not isinstance(path, str | os.PathLike):
+        raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
+    return path
 
 
 def check_regular(path: Any, status: os.stat_result) -> None:

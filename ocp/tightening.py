@@ -14,7 +14,7 @@ import numpy as np
 from ocp.console import interruptible
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
-from ocp.errors import SolveError
+from ocp.errors import SolveError, checked_mapping
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution
 
@@ -55,7 +55,7 @@ def tighten(
     check_meshed("tighten", method, tolerance)
     prepared = method.prepare(problem, solver=solver, options=options)
     form, fragment = prepared.formulation, prepared.fragment
-    p = form.parameter_vector(dict(parameters or {}))
+    p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
     bounds = form.bound_values(p)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
     low, high = bounds[0][index], bounds[1][index]

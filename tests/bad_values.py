@@ -13,7 +13,7 @@ import pytest
 from models import ModelError
 from ocp import ProblemError
 
-Bad = Mapping[str, Any]
+Bad = dict[str, Any]
 
 NAN, INF = float("nan"), float("inf")
 NOTHING: Bad = {"None": None}
@@ -106,7 +106,8 @@ def good_calls(cases: Iterable[Case]) -> list[Any]:
 
 def assert_refused(case: Case, argument: str, value: Any) -> None:
     """It ends in an error of the package that names something."""
-    with pytest.raises((ModelError, ProblemError)) as caught:
+    refused: tuple[type[ModelError | ProblemError], ...] = (ModelError, ProblemError)
+    with pytest.raises(refused) as caught:
         case.call(**{**case.good, argument: value})
     assert isinstance(caught.value.name, str), caught.value
     assert caught.value.name, caught.value

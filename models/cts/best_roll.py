@@ -23,7 +23,8 @@ from typing import Any, NamedTuple, TypeVar
 import casadi as ca
 import numpy as np
 
-from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, joints_of, posture_at
+from models.arrays import checked_flag, checked_instance
+from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import (
     Candidate,
     index_harmonics,
@@ -158,6 +159,9 @@ def optimal_inverse(
     Raises:
         ModelError: A negative or non-finite rate weight; limits=False with a rate weight.
     """
+    checked_instance(rig, Rig, "rig", "rig")
+    checked_instance(tunnel, Tunnel, "rig", "tunnel")
+    branch, limits = checked_branch(branch), checked_flag(limits, "rig", "limits")
     gain = checked_gain(rate_weight)
     if gain and not limits:
         message = "limits=False is for the closed form of I1; with a rate weight leave limits on"

@@ -14,12 +14,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_number
+from models.arrays import checked_count, checked_each, checked_instance, checked_nonnegative, checked_number
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, dh_frames, joints_of, posture_at
+from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, dh_frames, joints_of, posture_at
 from models.cts.roll import ACTIVE, STATUS, index_harmonics, verdict
 from models.cts.roll_change import checked_gain, unrolled
 from models.errors import ModelError
+from models.robot.kinematics import checked_vector
 from models.shapes.capsules import Box, Capsule, capsule_in_box, capsule_to_box, capsule_to_capsule, soft_minimum
 from models.spatial import FULL_TURN, Expression
 
@@ -38,6 +39,10 @@ class Radii:
     pitch: float = 1.5 * INCH
     sting: float = 0.75 * INCH
 
+    def __post_init__(self) -> None:
+        for what, radius in vars(self).items():
+            checked_nonnegative(radius, "radii", what, "m")
+
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -53,11 +58,18 @@ class Surroundings:
     solids: tuple[Box, ...] = ()
     capsules: tuple[Capsule, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.walls is not None:
+            checked_instance(self.walls, Box, "surroundings", "walls")
+        for what, kind in (("solids", Box), ("capsules", Capsule)):
+            object.__setattr__(self, what, checked_each(getattr(self, what), kind, "surroundings", what))
+
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, Capsule]:
     """Links of the rig as capsules, by name, from joint 2 to the store."""
-    radii = radii or Radii()
-    frames = dh_frames(rig, q)
+    checked_instance(rig, Rig, "rig", "rig")
+    radii = Radii() if radii is None else checked_instance(radii, Radii, "rig", "radii")
+    frames = dh_frames(rig, checked_vector(q, 6, "q", "one entry for each joint of the rig"))
     joint2, joint3, joint4 = (frames[k].position for k in (1, 2, 3))
     side = frames[3].point((0, 0, rig.yaw_offset))
     corner, tool = frames[4].position, frames[7]
@@ -80,6 +92,7 @@ def clearances(
     Raises:
         ModelError: Nothing around.
     """
+    checked_instance(surroundings, Surroundings, "clearances", "surroundings")
     found: dict[tuple[str, str], Expression] = {}
     for name, capsule in rig_capsules(rig, q, radii).items():
         if surroundings.walls is not None:
@@ -100,15 +113,14 @@ def nearness(gap: Expression, weight: float, width: float) -> Expression:
     Raises:
         ModelError: A weight that is negative or not finite, a width that is not positive.
     """
-    if checked_number(weight, "clearance", "weight") < 0:
-        raise ModelError(f"clearance: weight {weight} is negative", name="weight", value=weight, limit=0.0)
+    checked_nonnegative(weight, "clearance", "weight")
     checked_number(width, "clearance", "width", positive=True, unit="m")
     return weight * ca.exp(-gap / width)
 
 
 def checked_clearance(clearance: float) -> float:
     """`clearance` itself, m; ModelError unless it is a finite distance or -inf for none."""
-    if np.isnan(clearance) or clearance == np.inf:
+    if checked_number(clearance, "rig", "clearance", finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
     return clearance
@@ -147,9 +159,11 @@ def clear_inverse(
         ModelError: A weight, width, clearance or number of samples that cannot be.
     """
     gain = checked_gain(rate_weight)
+    checked_instance(rig, Rig, "rig", "rig")
+    checked_instance(tunnel, Tunnel, "rig", "tunnel")
+    branch = checked_branch(branch)
     checked_clearance(clearance)
-    if samples < 8:
-        raise ModelError(f"samples {samples} must be 8 or more", name="samples", value=samples, limit=8)
+    checked_count(samples, "rig", "samples", 8)
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
     posture = posture_at(rig, target, c, s, branch)

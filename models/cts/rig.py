@@ -16,7 +16,15 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_number,
+    warn_of_degrees,
+    warn_of_millimetres,
+)
 from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
@@ -57,6 +65,7 @@ class Rig:
         for name in LENGTHS:
             length = checked_number(getattr(self, name), "rig", name, positive=True, unit="m")
             object.__setattr__(self, name, length)
+            warn_of_millimetres(length, "rig", name, name)
         for name in ("lower", "upper"):
             object.__setattr__(self, name, checked_array(getattr(self, name), (6,), "rig", name, finite=False))
         for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
@@ -66,6 +75,9 @@ class Rig:
             if joint > 1 and np.isfinite(low) != np.isfinite(high):
                 message = f"rig: joint {joint} has limits {low} .. {high}; give a revolute joint both or none"
                 raise ModelError(message, name=f"joint {joint}", limit=(low, high))
+
+            if joint > 1:
+                warn_of_degrees((low, high), "rig", f"joint {joint}", f"limit of joint {joint}")
 
     def limited(self, joint: int) -> bool:
         """Whether revolute joint 2..6 (counted from 1) has limits less than a full turn apart."""
@@ -131,6 +143,11 @@ class Branch(NamedTuple):
 
 BRANCHES = (Branch(-1, 1), Branch(-1, -1), Branch(1, 1), Branch(1, -1))
 HOME = BRANCHES[0]
+
+
+def checked_branch(branch: Branch) -> Branch:
+    """The branch itself; ModelError unless it is one of the four."""
+    return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
 
 
 class RigPosture(NamedTuple):

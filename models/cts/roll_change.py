@@ -12,11 +12,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_number
+from models.arrays import checked_nonnegative
 from models.cts.rig import Rig, Tunnel, in_nearest_turn, in_turn_after
 from models.cts.roll import ANGLE_INSET, index_harmonics
 from models.cts.trigonometric import Harmonics, roots
-from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression
 
 CONVEX_STEPS, PIECE_STEPS = 12, 20
@@ -25,11 +24,7 @@ CONVEX_STEPS, PIECE_STEPS = 12, 20
 
 def checked_gain(rate_weight: float) -> float:
     """w4 / (2 pi); ModelError for a weight that is negative or not finite."""
-    if checked_number(rate_weight, "rig", "rate_weight") < 0:
-        raise ModelError(
-            f"rig: rate_weight {rate_weight} is negative", name="rate_weight", value=rate_weight, limit=0.0
-        )
-    return float(rate_weight) / FULL_TURN
+    return checked_nonnegative(rate_weight, "rig", "rate_weight") / FULL_TURN
 
 
 def unrolled(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:

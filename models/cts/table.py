@@ -10,10 +10,20 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number, one_for_each
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_each,
+    checked_flag,
+    checked_instance,
+    checked_number,
+    one_for_each,
+    warn_of_degrees,
+)
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Surroundings, clear_inverse
-from models.cts.rig import BRANCHES, HOME, Branch, Rig, Tunnel, inverse, posture_at
+from models.cts.rig import BRANCHES, HOME, Branch, Rig, Tunnel, checked_branch, inverse, posture_at
 from models.cts.roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
 from models.errors import ModelError
 from models.spatial import FULL_TURN
@@ -76,8 +86,11 @@ def solve_table(
     Raises:
         ModelError: An empty table, another shape, no branch, an unknown branch, a previous roll that is not finite.
     """
+    checked_instance(rig, Rig, "rig", "rig")
+    checked_instance(tunnel, Tunnel, "rig", "tunnel")
+    checked_flag(in_sequence, "table", "in_sequence")
     rows = checked_targets(targets, finite=False)
-    chosen = [checked_branch(branch) for branch in branches]
+    chosen = [checked_branch(branch) for branch in checked_each(branches, Branch, "table", "branches")]
     if not chosen:
         raise ModelError("branches is empty; give at least one, for example (HOME,)", name="branches", value=branches)
     count = len(rows)
@@ -122,11 +135,6 @@ def _best(results: list[Any]) -> Array:
     return best if len(best) > 1 else best[0]
 
 
-def checked_branch(branch: Branch) -> Branch:
-    """The branch itself; ModelError unless it is one of the four."""
-    return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
-
-
 @dataclass(frozen=True)
 class RollInterval:
     """A range of rolls that reach within all limits.
@@ -150,6 +158,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
     Raises:
         ModelError: A target of another shape or not finite.
     """
+    checked_instance(rig, Rig, "rig", "rig")
     row = checked_targets([target])[0]
     ends, feasible = roll_interval_functions(rig, checked_branch(branch))
     points = np.array(ends(row))
@@ -198,6 +207,7 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
     Raises:
         ModelError: A target or roll that is not finite; a pose that no branch reaches, naming the link.
     """
+    checked_instance(rig, Rig, "rig", "rig")
     row = checked_targets([target])[0]
     checked_number(roll, "rig", "roll")
     found, short = [], []
@@ -217,4 +227,6 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
     """Targets (x, y, z, yaw, pitch), at least one, shape (samples, 5); ModelError naming the first wrong row."""
-    return checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
+    rows = checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
+    warn_of_degrees(rows[:, 3:], "table", "targets", "yaw or pitch")
+    return rows

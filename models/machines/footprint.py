@@ -8,7 +8,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_number, checked_rotation
+from models.arrays import Array, ArrayInput, checked_each, checked_instance, checked_nonnegative, checked_rotation
 from models.errors import ModelError
 from models.machines.support import Support
 from models.robot.kinematics import link_frames
@@ -66,8 +66,10 @@ def footprint(
         ModelError: Unknown links, no shape but meshes or the origin of a mesh below them, contact points in one line, a
             negative depth, no rotation.
     """
-    if checked_number(depth, "footprint", "depth") < 0:
-        raise ModelError(f"footprint: depth {depth!r} m must be zero or positive", name="depth", value=depth, limit=0.0)
+    checked_instance(robot, Robot, "footprint", "robot")
+    checked_nonnegative(depth, "footprint", "depth", "m")
+    if links is not None:
+        links = checked_each(links, str, "footprint", "links")
     standing = robot.links if links is None else [robot.link(name) for name in links]
     upright = checked_rotation(np.eye(3) if rotation is None else rotation, "footprint", "rotation")
     frames = link_frames(robot, np.zeros(robot.dof) if q is None else q, Frame(ca.DM(upright), ca.DM.zeros(3)))

@@ -9,7 +9,7 @@ from typing import Protocol, cast
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_rotation
+from models.arrays import Array, ArrayInput, checked_array, checked_instance, checked_rotation
 from models.errors import ModelError
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
@@ -150,16 +150,17 @@ def with_tip(
     Raises:
         ModelError: Unknown link, wrong sizes, a machine that is no such dataclass.
     """
-    if not is_dataclass(machine) or "robot" not in {part.name for part in fields(machine)}:
+    if not is_dataclass(machine) or isinstance(machine, type) or "robot" not in {part.name for part in fields(machine)}:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot': its tip cannot be moved"
         raise ModelError(message, name="machine", value=machine)
     turn = np.eye(3) if rotation is None else rotation
-    robot = replace(machine.robot, tip=link, tip_translation=translation, tip_rotation=turn)
+    robot = replace(machine.robot, tip=machine.robot.link(link).name, tip_translation=translation, tip_rotation=turn)
     return cast(Machine, replace(machine, robot=robot))
 
 
 def require_joints(robot: Robot) -> None:
-    """Raise ModelError when the robot has no moving joint."""
+    """Raise ModelError when the robot has no moving joint, or is none."""
+    checked_instance(robot, Robot, "machine", "robot")
     if robot.dof == 0:
         names = [link.name for link in robot.links]
         raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)

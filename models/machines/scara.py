@@ -17,11 +17,21 @@ from typing import Any, Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_number
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_each,
+    checked_number,
+    warn_of_degrees,
+    warn_of_millimetres,
+)
 from models.errors import ModelError
+from models.robot.kinematics import checked_vector
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
+from models.spatial import FULL_TURN, Expression, Frame, rotation
 
 __all__ = ["Elbow", "Scara"]
 
@@ -58,16 +68,22 @@ class Scara:
         for what in ("upper_arm", "forearm"):
             length = checked_number(getattr(self, what), "scara", what, positive=True, unit="m")
             object.__setattr__(self, what, length)
+            warn_of_millimetres(length, "scara", what, what)
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
         for what in ("lower", "upper"):
             object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
-        if len(self.names) != 4 or len(set(self.names)) != 4:
+        names = () if isinstance(self.names, str) else checked_each(self.names, str, "scara", "names")
+        if len(set(names) - {""}) != 4 or len(names) != 4:
             message = f"scara: joint names {list(self.names)} must be four that differ"
             raise ModelError(message, name="names", value=self.names)
         for name, low, high in zip(self.names, self.lower, self.upper, strict=True):
-            if low > high:
-                message = f"scara: joint {name!r} has its lower limit {low:g} above its upper limit {high:g}"
+            if low > high or low == np.inf or high == -np.inf:
+                message = f"scara: joint {name!r} has limits {low:g} .. {high:g}, which leave it no position"
                 raise ModelError(message, name=name, value=low, limit=high)
+
+        for joint, name in enumerate(self.names):
+            if joint != QUILL:
+                warn_of_degrees((self.lower[joint], self.upper[joint]), "scara", name, f"limit of {name!r}")
 
     @property
     def outer(self) -> float:
@@ -93,10 +109,7 @@ class Scara:
 
     def forward(self, joints: Expression) -> Frame:
         """Frame of the tool in world. `joints` of shape (4,), casadi or numbers."""
-        q = expression(joints)
-        if q.numel() != 4:
-            message = f"scara: joints have {q.numel()} entries, expected 4: {list(self.names)}"
-            raise ModelError(message, name="joints", value=joints, limit=(4,))
+        q = checked_vector(joints, 4, "joints", f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
         y = self.upper_arm * ca.sin(q[0]) + self.forearm * ca.sin(bend)
@@ -155,7 +168,7 @@ class Scara:
         sin q2 from the product of the distances to both ends of the reach, which keeps its digits near them.
         """
         checked_choice(elbow, get_args(Elbow), "scara", "elbow")
-        p = expression(pose)
+        p = checked_vector(pose, 4, "pose", "x, y, z and yaw")
         x, y, z = (p[i] - float(self.mount[i]) for i in range(3))
         a, b = self.upper_arm, self.forearm
         square = x**2 + y**2

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_number
+from models.arrays import Array, ArrayInput, checked_instance, checked_nonnegative, checked_number
 from models.errors import ModelError
 from models.machines.scara import Elbow, Scara
 from models.paths import SmoothPath
@@ -83,6 +83,9 @@ def scara_along(
         ModelError: A path out of reach, or within `clearance` of a singular arm (the message says where); a tool that
             tilts; joint limits.
     """
+    checked_instance(scara, Scara, "scara", "scara")
+    checked_instance(path, SmoothPath, "scara", "path")
+    checked_nonnegative(clearance, "scara", "clearance", "m")
     _check_reach(scara, path, clearance)
     rates = scara.inverse_rates(elbow)
     s = path.dense(8, 16)

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number
+from models.arrays import Array, ArrayInput, checked_array, checked_instance, checked_number
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
-from models.robot.kinematics import checked_vector
+from models.robot.kinematics import checked_vector, joint_vector
 from models.robot.parts import massless
 from models.robot.rebuild import simplified
 from models.robot.robot import Robot
@@ -157,6 +157,7 @@ class Standing(FixedBase):
         """
         outside = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector(point, 2, "point", "x and y on the ground")
+        q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
         jacobian, first, second, right = self._zmp_rows(q, qd, point, outside)
         return ZmpRows(jacobian, (first, second), right)
 
@@ -228,6 +229,7 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
         stiffness: Along world x, y, z. Shape (3,), N/m.
         rest: Position of the tip where the spring is relaxed. Shape (3,), m.
     """
+    checked_instance(machine, Standing, "tip spring", "machine")
     k = checked_array(stiffness, (3,), "tip spring", "stiffness")
     relaxed = checked_array(rest, (3,), "tip spring", "rest")
     return lambda time, tip: [machine.tip_wrench(-ca.DM(k) * (tip - ca.DM(relaxed)))]

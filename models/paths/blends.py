@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias, get_args
 
+import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_choice, checked_number, one_for_each
+from models.arrays import Array, ArrayInput, checked_choice, checked_number, checked_numbers, one_for_each
 from models.errors import ModelError
 from models.spatial import Expression
 
@@ -71,6 +72,8 @@ def rest_to_rest(s: Expression) -> Expression:
 
     The polynomial of least degree whose speed and acceleration are zero at both ends. Numbers, arrays and expressions.
     """
+    if not isinstance(s, ca.SX | ca.MX | ca.DM):
+        s = checked_numbers(s, "rest_to_rest", "s")
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 

@@ -14,7 +14,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_choice,
+    checked_count,
+    checked_each,
+    checked_instance,
+)
 from models.errors import ModelError
 from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, NEWTON_STEPS, speed
 from models.paths.orientation import orientation_function
@@ -22,6 +30,8 @@ from models.paths.smooth_path import SmoothPath
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
+DEGREES = (3, 5)  # of the cubic, of the quintic
+MOST_CORRECTIONS, MOST_NODES = 100, 100  # of a mapping, whose expression grows with them
 QUADRATURE_NODES = (2, 3, 4, 8)
 """Twice the time of the paper's 3 corrections; on a 90 deg corner of 5 mm, at 1 m/s and 2 ms, a drift of 2e-9 mm."""
 # rows of the table of cells
@@ -38,7 +48,7 @@ def path_function(path: SmoothPath) -> Any:
     `SmoothPath.at`, on a binary search for the cell, so that `generate` writes C without any library. Derivatives are
     those of the last three outputs' own formulas: casadi differentiates inside a cell only.
     """
-    knots, columns = _table(path)
+    knots, columns = _table(checked_instance(path, SmoothPath, "path_function", "path"))
     s = ca.MX.sym("distance")
     inside = ca.fmin(ca.fmax(s, 0.0), path.length)
     cell = ca.low(ca.DM(knots), inside, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
@@ -51,7 +61,7 @@ def turn_function(path: SmoothPath) -> Any:
 
     Tool orientation in world and its rates, as of `SmoothPath.turn`; MX with the tables in it, made as path_function.
     """
-    reference, theta = path.charts
+    reference, theta = checked_instance(path, SmoothPath, "turn_function", "path").charts
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
     s = ca.MX.sym("distance")
     inside = ca.fmin(ca.fmax(s, 0.0), path.length)
@@ -149,7 +159,6 @@ def _table(path: SmoothPath) -> tuple[Array, Array]:
     return np.append(rows[:, CELL.start], path.length), rows.T
 
 
-@lru_cache(maxsize=16)
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
     """The paper's mapping: predictor (15), then `corrections` times the corrector (13).
 
@@ -163,6 +172,12 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
+    number = checked_count(corrections, "mapping", "corrections", 0, MOST_CORRECTIONS)
+    return _predictor_corrector(checked_choice(degree, DEGREES, "blend", "degree"), number)
+
+
+@lru_cache(maxsize=16)
+def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
     here = rate(u)
@@ -172,17 +187,24 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
 
-@lru_cache(maxsize=16)
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = QUADRATURE_NODES) -> Any:
     """The default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
 
     Arguments and results as of predictor_corrector, but for `nodes`: of the quadrature over one control step, for each
     Newton step. The first ones need few, since they only lead near; the last one decides the drift.
     """
-    state, coefficients, steps, rate = _symbols(degree)
-    if not nodes or not all(isinstance(n, int) and n > 0 for n in nodes):
-        message = f"quadrature nodes {nodes!r} must be positive whole numbers, one for each Newton step"
+    numbers = tuple(
+        checked_count(n, "mapping", "nodes", 1, MOST_NODES) for n in checked_each(nodes, int, "mapping", "nodes")
+    )
+    if not numbers:
+        message = "mapping: nodes are empty; give one number for each Newton step"
         raise ModelError(message, name="nodes", value=nodes)
+    return _gauss_newton(checked_choice(degree, DEGREES, "blend", "degree"), numbers)
+
+
+@lru_cache(maxsize=16)
+def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
+    state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
     guess = _predicted(state, steps, rate(u))
     for number in nodes:
@@ -205,6 +227,7 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
     Raises:
         ModelError: Wrong shapes, nan, distances that do not increase from 0.
     """
+    checked_instance(mapping, ca.Function, "march", "mapping")
     places = checked_array(distances, ("samples",), "march", "distances", least=0)
     given = np.diff(places, prepend=0.0)
     if (given < 0).any():
@@ -221,7 +244,6 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
-    checked_choice(degree, (3, 5), "blend", "degree")  # cubic, quintic
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
     columns = ca.reshape(coefficients, 3, degree + 1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import Array, ArrayInput, checked_array, checked_indices, checked_numbers
 from models.errors import ModelError
 from models.paths.orientation import rotation_vector
 from models.paths.segments import Arc, Line, Segment, constant_curvature
@@ -99,8 +99,10 @@ class Path:
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
+        index = checked_indices(index, len(self.segments), "path", "index")
+        along = checked_numbers(distance, "path", "distance")
         return constant_curvature(
-            self.start[index], self.tangent[index], self.normal[index], self.curvature[index], np.asarray(distance)
+            self.start[index], self.tangent[index], self.normal[index], self.curvature[index], along
         )
 
     def corner_angles(self) -> Array:

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_choice, one_for_each
+from models.arrays import Array, ArrayInput, checked_choice, checked_instance, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import cells
 from models.paths.blends import BlendKind, checked_shape, cubic, polynomial, quintic
@@ -256,7 +256,7 @@ def smooth(
     Raises:
         ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
     """
-    count = len(path.segments)
+    count = len(checked_instance(path, Path, "smooth", "path").segments)
     corners = _Corners(path, kind, checked_shape(shape, kind, count - 1), np.arange(count - 1))
     distances = _remaining_distances(corners, remaining, deviation, overlap)
     coefficients = corners.blends(distances)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_array, one_for_each
+from models.arrays import Array, ArrayInput, checked_array, checked_count, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, by_arc_length, quintic
@@ -132,7 +132,7 @@ class SmoothPath:
     def blend(self, vertex: int) -> Blend:
         """The blend at a vertex, 0 being the end of the first segment; ModelError when there is none."""
         count = len(self.remaining)
-        if not isinstance(vertex, int | np.integer) or not 0 <= vertex < count:
+        if not isinstance(vertex, int | np.integer) or isinstance(vertex, bool) or not 0 <= vertex < count:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
             raise ModelError(message, name="vertex", value=vertex, limit=count)
         piece = int(self.blend_starts[vertex])
@@ -181,6 +181,8 @@ class SmoothPath:
 
         Shape (M,), m.
         """
+        for what, number in (("per_cell", per_cell), ("per_segment", per_segment)):
+            checked_count(number, "path", what)
         on_segment = np.flatnonzero(self.piece_segment >= 0)
         starts = np.concatenate([self.bounds[on_segment], self.cell_bounds])
         lengths = np.concatenate([self.piece_lengths[on_segment], self.cells.length])

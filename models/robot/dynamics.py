@@ -127,8 +127,8 @@ def external_wrench(
 ) -> Expression:
     """Sum of wrenches: (moment about the world's origin, force). Shape (6, 1)."""
     frames, _ = frames_and_axes(robot, q, world_from_base)
-    links = tuple(w.link for w in wrenches)
-    given = _given_wrenches(frames, stacked_wrenches(robot, wrenches), links)
+    stacked = stacked_wrenches(robot, wrenches)
+    given = _given_wrenches(frames, stacked, tuple(w.link for w in wrenches))
     return ca.densify(sum((wrench for _, wrench in given), start=ca.DM(6, 1)))
 
 

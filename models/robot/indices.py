@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from models.arrays import NOT_NUMBERS, floats
 from models.errors import ModelError
 from models.robot.kinematics import joint_vector
 from models.robot.robot import Robot
@@ -70,10 +71,11 @@ def manipulability_of(task: Expression) -> Expression:
 def checked_rows(rows: Sequence[int]) -> list[int]:
     """`rows` as a list; ModelError unless they are different indices of a twist, 0..5, and at least one."""
     try:
-        chosen = [int(row) for row in rows]
-        whole = all(row == given for row, given in zip(chosen, rows, strict=True))
-    except (TypeError, ValueError):
-        whole = False
+        given = floats(list(rows))
+    except NOT_NUMBERS:
+        given = np.array([np.nan])
+    whole = given.ndim == 1 and bool((given == np.round(given)).all())
+    chosen = given.astype(int).tolist() if whole else []
     if not whole:
         message = f"rows must be a list of the twist rows 0..5, not {rows!r}"
     elif not chosen:

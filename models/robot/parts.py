@@ -20,10 +20,13 @@ from models.arrays import (
     checked_flag,
     checked_instance,
     checked_name,
+    checked_nonnegative,
     checked_number,
     checked_rotation,
     checked_text,
     frozen,
+    warn_of_degrees,
+    warn_of_millimetres,
 )
 from models.errors import ModelError
 from models.spatial import rotation
@@ -70,6 +73,8 @@ class CollisionShape:
             raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
+        if not mesh:
+            warn_of_millimetres(size, owner, "size", "size")
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
 
     def placed(self, rotation: Array, translation: Array) -> CollisionShape:
@@ -106,13 +111,12 @@ class Link:
     def __post_init__(self) -> None:
         owner = f"link {checked_name(self.name, 'link', 'name')!r}"
         checked_flag(self.any_inertia, owner, "any_inertia")
-        mass = checked_number(self.mass, owner, "mass")
-        if mass < 0:
-            raise ModelError(f"{owner}: mass {mass} kg is negative", name="mass", value=mass, limit=0.0)
+        mass = checked_nonnegative(self.mass, owner, "mass", "kg")
         inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
         _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
+        warn_of_millimetres(self.center_of_mass, owner, self.name, "center_of_mass")
         object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
         object.__setattr__(self, "collisions", checked_each(self.collisions, CollisionShape, owner, "collisions"))
 
@@ -165,6 +169,9 @@ class Joint:
     Raises:
         ModelError: Unknown kind, wrong sizes, zero axis, a rotation that is none, lower > upper, a negative
             limit, position limits of a continuous joint, a fixed joint that follows another.
+
+    Warns:
+        ModelWarning: Limits that look like degrees, an origin that looks like millimetres.
     """
 
     name: str
@@ -212,6 +219,9 @@ class Joint:
                 "given; make it revolute or leave them out"
             )
             raise ModelError(message, name="limits", value=room, limit=(-np.inf, np.inf))
+        warn_of_millimetres(self.translation, owner, self.name, "translation")
+        if self.kind == "revolute":
+            warn_of_degrees(room, owner, self.name, "limit")
         if self.mimic is not None and not self.moves:
             message = f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}"
             raise ModelError(message, name=self.name, value=self.mimic.joint)

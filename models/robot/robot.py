@@ -23,6 +23,7 @@ from models.arrays import (
     checked_mapping,
     checked_rotation,
     checked_text,
+    warn_of_millimetres,
 )
 from models.errors import ModelError, ModelWarning
 from models.robot.mimicry import Drive, drives, held, joint_limits, ties_to_leaders
@@ -78,6 +79,7 @@ class Robot:
         owner = "robot"
         object.__setattr__(self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation"))
         object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
+        warn_of_millimetres(self.tip_translation, owner, "tip_translation", "tip_translation")
         _ = self._limits  # raises where followers leave a joint no position
 
     def _find_tip(self) -> str | None:

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from models.arrays import Array, checked_choice
+from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic
 
@@ -81,7 +81,8 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
             twice, kinds of joints or shapes that are not supported, impossible masses, limits or shapes.
 
     Warns:
-        ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF.
+        ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF; angles that look like
+            degrees, lengths that look like millimetres (see `models.arrays.warn_of_degrees`).
     """
     checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
     tree = parsed(source)
@@ -344,12 +345,13 @@ def _unread(owner: ElementTree.Element) -> list[str]:
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) of an <origin>."""
+    """Position (3,) and rotation (3, 3) of an <origin>; warns where its rpy look like degrees."""
     origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
         shift = numbers_of(origin, "xyz", owner, 3) if "xyz" in origin.attrib else shift
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
+    warn_of_degrees(angles, owner, owner.partition(" ")[2].strip("'"), "rpy")
     (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in angles.tolist())  # a file has hundreds
     turn = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

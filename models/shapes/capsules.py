@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import ArrayInput, checked_array, checked_number, checked_rotation
+from models.arrays import ArrayInput, checked_array, checked_nonnegative, checked_number, checked_rotation
 from models.errors import ModelError
 from models.spatial import Expression, expression
 
@@ -23,12 +22,30 @@ GOLDEN = (5**0.5 - 1) / 2
 KINK = 1e-12  # m; rounds off the kink of a distance at zero
 
 
-class Capsule(NamedTuple):
-    """All points within `radius` (m) of the segment from `start` to `end`, in world. Shapes (3, 1), m."""
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within `radius` (m) of the segment from `start` to `end`, in world. Shapes (3, 1), m.
+
+    Numbers or expressions.
+
+    Raises:
+        ModelError: Other shapes, numbers that are not finite, a negative radius.
+    """
 
     radius: Expression
     start: Expression
     end: Expression
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.radius, ca.SX | ca.MX):
+            checked_nonnegative(self.radius, "capsule", "radius", "m")
+        for what in ("start", "end"):
+            point = expression(getattr(self, what))
+            if point.shape != (3, 1):
+                message = f"capsule: {what} has shape {point.shape}, expected (3, 1)"
+                raise ModelError(message, name=what, value=point.shape, limit=(3, 1))
+            if isinstance(point, ca.DM) and not point.is_regular():
+                raise ModelError(f"capsule: {what} {point} is not finite", name=what, value=np.array(point).ravel())
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ocp.audit.audit import Audit, audit
 from ocp.console import interruptible
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_each, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs
@@ -112,7 +112,12 @@ def certificate(
     Raises:
         ProblemError: Fewer than two solutions, one of another problem, or solved at other parameters.
     """
-    named = dict(solutions) if isinstance(solutions, Mapping) else name_by_method(solutions)
+    checked_positive("certificate: tolerance", tolerance)
+    if isinstance(solutions, Mapping):
+        named = checked_mapping("certificate: solutions", solutions)
+        checked_each("certificate: solutions", named.values(), Solution)
+    else:
+        named = name_by_method(checked_each("certificate: solutions", solutions, Solution))
     if len(named) < 2:
         words = f"a certificate compares at least two solutions, not {len(named)}"
         raise ProblemError(words, name="solutions", value=len(named), limit=2)

@@ -22,14 +22,14 @@ from models import ModelError
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Radii, Surroundings, checked_clearance, clearances, nearness
-from models.cts.rig import HOME, Branch, Rig, Tunnel, joints_of, posture_at
+from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.capsules import soft_minimum
-from models.spatial import FULL_TURN
+from models.spatial import FULL_TURN, expression
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, checked_positive
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
 from ocp.problem.problem import Problem
 
 __all__ = ["ROLLS", "least_course", "roll_problem", "spline_targets"]
@@ -57,7 +57,10 @@ def spline_targets(times: Any, targets: Any) -> Targets:
     Raises:
         ProblemError: Fewer than 4 samples, times that do not increase, or targets of another shape or not finite.
     """
-    t = np.asarray(times, dtype=float)
+    try:
+        t = floats(times)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"times {times!r} are not numeric", name="times", value=times) from error
     try:
         rows = checked_targets(targets)
     except ModelError as error:
@@ -120,18 +123,28 @@ def roll_problem(
     weights = {"rate_weight": rate_weight, "acceleration_weight": acceleration_weight, "rate_limit": rate_limit}
     weights |= {"acceleration_limit": acceleration_limit, "clearance_weight": clearance_weight}
     for name, value in weights.items():
-        if not value >= 0:
-            message = f"roll_problem: {name} {value} must not be negative"
+        number = real(value)
+        if not number >= 0 or (np.isinf(number) and name.endswith("weight")):
+            message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
             raise ProblemError(message, name=name, value=value, limit=0.0)
     checked_positive("roll_problem: clearance_width", clearance_width)
     try:
         checked_clearance(clearance)
+        branch = checked_branch(branch)
     except ModelError as error:
         raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
     checked_positive("roll_problem: horizon", horizon)
-    if start_roll is not None and not np.isfinite(start_roll):
-        message = f"roll_problem: start_roll {start_roll} rad must be finite"
-        raise ProblemError(message, name="start_roll", value=start_roll)
+    for name, given in (("start_roll", start_roll), ("start_rate", start_rate)):
+        if given is not None and not np.isfinite(real(given)):
+            raise ProblemError(f"roll_problem: {name} {given!r} must be a finite number", name=name, value=given)
+    checked_instance("roll_problem: rig", rig, Rig)
+    checked_instance("roll_problem: tunnel", tunnel, Tunnel)
+    if radii is not None:
+        checked_instance("roll_problem: radii", radii, Radii)
+    checked_positive("roll_problem: softness", softness)
+    if symbols not in (ca.SX, ca.MX):
+        words = f"roll_problem: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
+        raise ProblemError(words, name="symbols", value=symbols)
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
     posture = posture_at(rig, x, c, s, branch)
@@ -176,7 +189,7 @@ def roll_problem(
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, pull)
-    target = _column(targets(problem.time))
+    target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
         """The value on the way."""
@@ -193,14 +206,27 @@ def roll_problem(
     return problem
 
 
-def _column(target: Any) -> Any:
-    return ca.vertcat(*target) if isinstance(target, list | tuple) else target
+def _column(targets: Targets, time: Any) -> Any:
+    """A target at a symbol of time, shape (5, 1); ProblemError where it is none, or the function fails."""
+    try:
+        target = expression(targets(time))
+    except RuntimeError:  # what interpolants say of SX symbols
+        raise
+    except Exception as error:  # of the function's own
+        words = f"roll_problem: targets must be a function of time that gives (5,), not {targets!r}: {error!r}"
+        raise ProblemError(words, name="targets", value=targets) from error
+    symbols = [] if isinstance(target, ca.DM) else ca.symvar(target)
+    strange = [str(symbol) for symbol in symbols if not ca.is_equal(symbol, time, 1)]
+    if target.shape != (5, 1) or strange or (isinstance(target, ca.DM) and not target.is_regular()):
+        words = f"roll_problem: targets gives {target}, not five finite numbers or expressions of the time"
+        raise ProblemError(words, name="targets", value=str(target), limit=(5, 1))
+    return target
 
 
 def _curve(targets: Targets, symbols: Any) -> Any:
     """Function of time -> target."""
     time = symbols.sym("time")
-    return ca.Function("target", [time], [_column(targets(time))])
+    return ca.Function("target", [time], [_column(targets, time)])
 
 
 def _beyond(value: Any, lower: Any, upper: Any) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Real
 from typing import Any, Literal, TypeAlias, get_args
 
 import casadi as ca
@@ -22,7 +23,16 @@ from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError, checked_choice, checked_positive
+from ocp.errors import (
+    ProblemError,
+    SolveError,
+    checked_choice,
+    checked_each,
+    checked_flag,
+    checked_instance,
+    checked_mapping,
+    checked_positive,
+)
 from ocp.local.inverse_kinematics import check_reach, inverse_kinematics
 from ocp.local.rates import LocalSolution, least_rates, resolve
 from ocp.methods import solve
@@ -123,6 +133,8 @@ def minimum_velocity_problem(
     """
     checked_choice("formulation", formulation, get_args(Form))
     checked_positive("guess_damping", guess_damping)
+    for what, flag in (("free_start", free_start), ("cyclic", cyclic), ("limits", limits)):
+        checked_flag(what, flag)
     equations, duration = bind(machine, one_of(tip_velocity, rows, task)), checked_horizon(horizon)
     if start_joints is None and free_start:
         tasks = [part.task for part in equations.bound]
@@ -322,6 +334,13 @@ def plan_minimum_velocity(
         ProblemError: As minimum_velocity_problem; Unreachable, which is one, where a fixed machine cannot reach what
             its tasks ask (see ocp.local.inverse_kinematics.check_reach).
     """
+    for what, flag in (("free_start", free_start), ("cyclic", cyclic), ("limits", limits)):
+        checked_flag(what, flag)
+    if method is not None:
+        checked_instance("method", method, Collocation)
+    options = checked_mapping("options", options)
+    for damping in checked_each("dampings", dampings, Real):  # type: ignore[type-abstract]
+        checked_positive("dampings", damping)
     if not len(dampings):
         raise ProblemError("dampings are empty: there is no guess to start from", name="dampings", value=dampings)
     tasks = one_of(tip_velocity, rows, task)
@@ -341,7 +360,7 @@ def plan_minimum_velocity(
             target = float(local.cost[-1])
     asked |= {"free_start": free_start, "cyclic": cyclic, "formulation": formulation, "limits": limits}
     declare = partial(minimum_velocity_problem, machine, **asked, symbols=symbols)
-    mesh, settings = method or Collocation(intervals=50, degree=4), {**IPOPT, **(options or {})}
+    mesh, settings = method or Collocation(intervals=50, degree=4), {**IPOPT, **options}
     tried: list[_Outcome] = []
     for attempt in _attempts(declare, mesh, dampings, target, tried):
         # what conflicts is looked for once: it takes long

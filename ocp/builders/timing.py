@@ -32,11 +32,11 @@ from ocp.builders.timing_tables import (
 )
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_count
+from ocp.errors import ProblemError, checked_count, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import JointPath, LineLimits, PathLike
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, SpeedProfile, advanced
 from ocp.solution import Solution
@@ -159,10 +159,12 @@ def plan_minimum_time(
     Raises:
         ProblemError: As minimum_time_problem. SolveError: the solver failed, naming the worst residuals.
     """
+    checked_count("rounds", rounds, 0)
+    own = checked_mapping("options", options)
     timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
-        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **(options or {})})
+        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **own})
         profile = timing.profile(solution)
         demand = demand_of_pieces(path, limits, joints, profile)
         parts = _parts(profile, demand)
@@ -193,10 +195,9 @@ def minimum_time_problem(
             joints that are not finite; a guess for another path; fewer than 10 intervals.
     """
     checked_count("intervals", intervals, 10)
-    if limits.joints is not None and joints is None:
-        message = "joint limits need the joints along the path: plan_minimum_time(path, limits, arm)"
-        raise ProblemError(message, name="joints")
-    limited = joints if limits.joints is not None else None
+    limited = check_line(path, limits, joints)
+    if guess is not None:
+        checked_instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)

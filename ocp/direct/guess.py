@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ocp.direct.fragment import Fragment
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
@@ -44,7 +44,8 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
         words = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
         raise ProblemError(words, name="guess", value=guess)
     if "horizon" in given:
-        number = numeric("guess of the horizon", given.pop("horizon"))
+        with about("horizon"):
+            number = numeric("guess of the horizon", given.pop("horizon"))
         if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
             words = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
             raise ProblemError(words, name="horizon", value=number.tolist())
@@ -66,8 +67,10 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
             elif value is None:
                 curve = default(form, role, place, bounds)
             else:
-                curve = trajectory(name, value, place.stop - place.start, horizon, times)
-            table[:, place] = curve(where)
+                with about(name):
+                    curve = trajectory(name, value, place.stop - place.start, horizon, times)
+            with about(name):
+                table[:, place] = curve(where)
             for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
                 words = f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}"
                 raise ProblemError(words, name=name, value=table[i, place], time=float(where[i] * horizon))
@@ -90,7 +93,7 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
     if callable(value):
-        return lambda at: np.array([fitted(name, value(float(s) * horizon), size) for s in at])
+        return lambda at: np.array([fitted(name, asked(name, value, float(s) * horizon), size) for s in at])
     array = table(f"guess of {name!r}", value)
     if array.ndim == 2 and array.shape[0] > 1 and array.shape != (size, 1):
         rows = len(array)
@@ -104,6 +107,15 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
         return lambda s: sampled.over(s * horizon)
     constant = fitted(name, value, size)
     return lambda s: np.tile(constant, (len(s), 1))
+
+
+def asked(name: str, function: Callable[[float], Any], time: float) -> Any:
+    """What a guess that is a function says at a time, s; ProblemError where it fails."""
+    try:
+        return function(time)
+    except Exception as error:  # of the function's own
+        words = f"guess of {name!r}: the function fails at {time:g} s: {error!r}"
+        raise ProblemError(words, name=name, value=function, time=time) from error
 
 
 @dataclass(frozen=True)

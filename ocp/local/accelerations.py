@@ -20,7 +20,7 @@ from models.machines.standing import External, Standing
 from models.machines.standing_motion import StandingMotion, evaluate, motion_function
 from ocp.console import interruptible
 from ocp.curves import rk4_step
-from ocp.errors import ProblemError, checked_choice, checked_positive
+from ocp.errors import ProblemError, checked_choice, checked_flag, checked_instance, checked_positive
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
 from ocp.tasks.equations import bind, on_symbols
@@ -140,7 +140,8 @@ def resolve_accelerations(
     Raises:
         ProblemError: Something does not fit the machine, or the tasks cannot be done even at the start.
     """
-    equations, duration = bind(machine, tasks), checked_horizon(horizon)
+    equations, duration = bind(checked_instance("machine", machine, Standing), tasks), checked_horizon(horizon)
+    checked_flag("stop_at_lift_off", stop_at_lift_off)
     joints, base = checked_configuration(machine, start_joints, None)
     checked_law(machine, equations.size, law, layers, null_damping)
     for what, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):

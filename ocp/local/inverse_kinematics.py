@@ -16,7 +16,7 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_count, checked_positive
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
 from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
@@ -24,6 +24,7 @@ from ocp.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics"]
 
+LARGEST_SEED = 2**64
 SLIDE_SPREAD = 1.0
 """m: of the starts of slides without limits."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
@@ -120,6 +121,10 @@ def inverse_kinematics(
         checked_count(what, number, least=int(what == "iterations"))
     for what, value in (("tolerance", tolerance), ("apart", apart)):
         checked_positive(what, value)
+    checked_count("seed", seed, 0, LARGEST_SEED)
+    checked_flag("limits", limits)
+    if not np.isfinite(real(time)):
+        raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
     place = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
@@ -204,7 +209,10 @@ def _starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any,
     span = np.where(slides, SLIDE_SPREAD, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
-    given = np.zeros((0, size)) if near is None else np.atleast_2d(np.asarray(near, dtype=float))
+    try:
+        given = np.zeros((0, size)) if near is None else np.atleast_2d(floats(near))
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"near {near!r} is not numeric", name="near", value=near, limit=(size,)) from error
     if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
         words = f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected"
         raise ProblemError(words, name="near", value=given, limit=(size,))

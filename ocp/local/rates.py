@@ -18,7 +18,16 @@ from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
-from ocp.errors import ProblemError, checked_nonnegative, checked_positive
+from ocp.errors import (
+    MOST,
+    NOT_NUMBERS,
+    ProblemError,
+    checked_flag,
+    checked_nonnegative,
+    checked_positive,
+    floats,
+    real,
+)
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.tip_task import TipTask, Velocity, one_of
@@ -124,6 +133,7 @@ def resolve(
         ProblemError: Something does not fit the machine, or the task is singular already at the start.
     """
     equations = bind(machine, one_of(tip_velocity, rows, task))
+    checked_flag("check_start", check_start)
     joints, base = checked_configuration(machine, start_joints, start_base)
     duration, heavy = checked_horizon(horizon), checked_weights(weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration, start=check_start)
@@ -161,13 +171,16 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
 
 
 def _times(samples: Any, horizon: float) -> Array:
-    if np.ndim(samples) == 0:
-        count = int(samples)
-        if count != samples or count < 2:
+    if not isinstance(samples, list | tuple | np.ndarray):
+        count = real(samples)
+        if not (2 <= count <= MOST and count == int(count)):
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
-        return np.linspace(0.0, horizon, count)
-    times = np.asarray(samples, dtype=float)
+        return np.linspace(0.0, horizon, int(count))
+    try:
+        times = floats(samples)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"samples {samples!r} are no times", name="samples", value=samples) from error
     if times.ndim != 1 or len(times) < 2 or times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
         words = f"samples must be times from 0 to the horizon {horizon:g} s"
         raise ProblemError(words, name="samples", value=times, limit=(0.0, horizon))

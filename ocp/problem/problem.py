@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
+from ocp.errors import ProblemError, about, checked_count, checked_flag, checked_text, unknown_name
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
     check_finite,
@@ -43,7 +43,7 @@ def _about_its_name(method: Declare) -> Declare:
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
-        with about(name):
+        with about(name if isinstance(name, str) and name else "name"):
             return method(self, name, *args, **values)
 
     return cast(Declare, declare)
@@ -164,7 +164,9 @@ class Problem:
         if symbols not in (ca.SX, ca.MX):
             words = f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
             raise ProblemError(words, name="symbols", value=symbols)
-        self.name = str(name)
+        if not checked_text("problem: its name", name):
+            raise ProblemError("a problem needs a name", name="name", value=name)
+        self.name = name
         self.symbols = symbols
         self.time = symbols.sym("time")
         self.declared = Declarations()
@@ -261,7 +263,7 @@ class Problem:
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
         """Declare a parameter, whose value is given at solve time, and return its symbol, shape (n, 1)."""
-        size = self._size(f"parameter {name!r}", size, {})
+        size = checked_count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
 
@@ -338,8 +340,7 @@ class Problem:
                 integral of ``way`` goes along the plan. None: to what the expression is made of.
             unit: Of the expression, or of its integral.
         """
-        if not isinstance(integral, bool):
-            raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
+        checked_flag(f"watch {name!r}: integral", integral)
         known = list(self.declared.at_start.values())
         self._constrain("watch", name, expression, lower, upper, unit, known)
         found = self.declared.watch.pop(name)
@@ -355,18 +356,12 @@ class Problem:
             raise ProblemError(f"problem {self.name!r}: the cost is declared twice")
         ends = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
         ends += [*self.declared.at_start.values(), self.time, *self._horizon_symbol()]
-        costs = {
-            "running": self._expression("running cost", running, self._inner()),
-            "terminal": self._expression("terminal cost", terminal, ends),
-        }
-        for label, cost in costs.items():
-            if cost.numel() != 1:
-                raise ProblemError(
-                    f"{label} cost must be a scalar, it has {cost.numel()} entries",
-                    name=label,
-                    value=cost.numel(),
-                    limit=1,
-                )
+        costs = {}
+        for label, cost, known in (("running", running, self._inner()), ("terminal", terminal, ends)):
+            with about(label):
+                costs[label] = self._expression(f"{label} cost", cost, known)
+                if (size := costs[label].numel()) != 1:
+                    raise ProblemError(f"{label} cost must be a scalar, it has {size} entries", value=size, limit=1)
         self.declared.running, self.declared.terminal = costs["running"], costs["terminal"]
 
     def check(self) -> None:
@@ -548,7 +543,9 @@ class Problem:
                     return variable
         raise ProblemError(
             f"{what}: {symbol!r} is not a declared {'state' if what == 'dynamics' else 'state or control'} of "
-            f"problem {self.name!r}; known: {', '.join(pool) or 'none'}"
+            f"problem {self.name!r}; known: {', '.join(pool) or 'none'}",
+            name="state" if what == "dynamics" else "variable",
+            limit=tuple(pool),
         )
 
     def _constrain(

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, floats
 
 __all__ = [
     "check_finite",
@@ -35,7 +35,7 @@ def stacked(what: str, value: Any) -> Any:
     """An expression as one column; a list or tuple of expressions and numbers is stacked."""
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
-    except NotImplementedError as error:
+    except NOT_NUMBERS as error:
         words = f"{what}: a flat list of numbers and expressions is expected, not {value!r}"
         raise ProblemError(words, value=value) from error
 
@@ -58,11 +58,8 @@ def numeric(what: str, value: Any) -> np.ndarray:
 def table(what: str, value: Any) -> np.ndarray:
     """A value as a float array of its own shape, or ProblemError where it is none."""
     try:
-        plain = value.full() if isinstance(value, ca.DM) else value
-        if np.asarray(plain).dtype.kind in "SU":  # numpy would read digits in a string
-            raise TypeError("a string")
-        return np.asarray(plain, dtype=float)
-    except (TypeError, ValueError) as error:
+        return floats(value.full() if isinstance(value, ca.DM) else value)
+    except NOT_NUMBERS as error:
         words = f"{what}: numbers or expressions are expected, not {value!r}"
         raise ProblemError(words, value=value) from error
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, floats
 from ocp.schedule.profile import Array, LineMotion
 
 __all__ = [
@@ -19,6 +19,8 @@ __all__ = [
     "LineLimits",
     "PathLike",
     "cause_names",
+    "check_joints",
+    "check_line",
     "curvature_along",
     "joint_demands",
     "line_demands",
@@ -62,11 +64,19 @@ class JointPath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Greatest joint velocities (rad/s or m/s), accelerations and jerks, symmetric. Shape (n,) or one for all."""
+    """Greatest joint velocities (rad/s or m/s), accelerations and jerks, symmetric. Shape (n,) or one for all.
+
+    Raises:
+        ProblemError: A limit that is not positive; it may be infinite.
+    """
 
     velocity: ArrayLike = np.inf
     acceleration: ArrayLike = np.inf
     jerk: ArrayLike = np.inf
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration", "jerk"):
+            _check(f"joint {name}", getattr(self, name), False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +104,7 @@ class LineLimits:
         for name, finite in (("speed", True), ("acceleration", True), ("jerk", True), ("centripetal", False)):
             _check(name, getattr(self, name), finite, 1 if name == "speed" else 0)
         if self.joints is not None:
-            if not isinstance(self.joints, JointLimits):
-                message = f"joint limits {self.joints!r} must be a JointLimits"
-                raise ProblemError(message, name="joint limits", value=self.joints)
-            for name in ("velocity", "acceleration", "jerk"):
-                _check(f"joint {name}", getattr(self.joints, name), False)
+            checked_instance("joint limits", self.joints, JointLimits)
 
     def of_joints(self, count: int) -> Array:
         """Velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
@@ -115,8 +121,8 @@ class LineLimits:
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> None:
     try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
+        array = floats(value)
+    except NOT_NUMBERS as error:
         raise ProblemError(f"{name} limit {value!r} is not numeric", name=name, value=value) from error
     if array.ndim > dimensions:
         message = f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}"
@@ -128,18 +134,46 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
         raise ProblemError(message, name=name, value=bad, limit=0.0)
 
 
+def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
+    """The joints that are limited, None where none are.
+
+    Raises:
+        ProblemError: No path, no limits, no joints along a path, or joint limits without joints.
+    """
+    what = ("length", "bounds", "by_piece", "curvature", "dense")
+    missing = [name for name in what if isinstance(path, type) or not hasattr(path, name)]
+    if missing:
+        hint = "give a SmoothPath, as models.smooth makes it"
+        raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}", name="path", value=path)
+    checked_instance("limits", limits, LineLimits)
+    if joints is not None:
+        check_joints(joints)
+    elif limits.joints is not None:
+        message = "joint limits need the joints along the path: joints=scara_along(arm, path)"
+        raise ProblemError(message, name="joints")
+    return joints if limits.joints is not None else None
+
+
+def check_joints(joints: JointPath) -> None:
+    """Raise ProblemError where something has not the names and places of joints along a path."""
+    if isinstance(joints, type) or not hasattr(joints, "names") or not callable(getattr(joints, "at", None)):
+        message = f"joints must be a function of the distance, as models.scara_along makes it, not {joints!r}"
+        raise ProblemError(message, name="joints", value=joints)
+
+
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
     """Joints at distances (M,), checked.
 
     Raises:
         ProblemError: Shapes that are not (M, n), a value that is not finite.
     """
+    check_joints(joints)
     rates = joints.at(distance)
     shape = (len(distance), len(joints.names))
     for kind in ("position", "first", "second", "third"):
         try:
-            value = np.asarray(getattr(rates, kind), dtype=float)
-        except (AttributeError, TypeError, ValueError) as error:
+            value = floats(getattr(rates, kind))
+        except (AttributeError, *NOT_NUMBERS) as error:
             message = f"joints along the path: {kind} is missing or not numeric: {error}"
             raise ProblemError(message, name=kind, value=getattr(rates, kind, None)) from error
         if value.shape != shape:

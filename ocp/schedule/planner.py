@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_positive
+from ocp.errors import ProblemError, checked_flag, checked_positive
 from ocp.schedule.grid import make_grid
 from ocp.schedule.joints import KEPT, Attempt, search
-from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names, check_line
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
 
 __all__ = ["Dip", "Schedule", "schedule"]
@@ -112,16 +112,8 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
         ProblemError: Joint limits without joints, or a limit that would be broken at the asked speed, if strict;
             limits that no schedule keeps.
     """
-    missing = [name for name in ("length", "bounds", "by_piece", "curvature", "dense") if not hasattr(path, name)]
-    if missing:
-        hint = "give a SmoothPath, as models.paths.smooth_path makes it"
-        raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}", name="path", value=path)
-    if not isinstance(limits, LineLimits):
-        raise ProblemError(f"limits {limits!r} must be a LineLimits", name="limits", value=limits)
-    if limits.joints is not None and joints is None:
-        message = "joint limits need the joints along the path: schedule(path, limits, joints=scara_along(arm, path))"
-        raise ProblemError(message, name="joints")
-    limited = joints if limits.joints is not None else None
+    limited = check_line(path, limits, joints)
+    checked_flag("strict", strict)
     grid = make_grid(path, limits, limited)
     found = search(grid, limits, limited)
     dips = _dips(found, limits, cause_names(limited.names if limited is not None else ()))

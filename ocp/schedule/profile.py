@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, floats
 
 __all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "piece_of"]
 
@@ -50,8 +50,8 @@ def piece_of(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"
 def _inside(value: ArrayLike, most: float, what: str, place: str) -> Array:
     """A row of numbers of [0, most], clipped to that; ProblemError where one lies outside by more than rounding."""
     try:
-        array = np.atleast_1d(np.asarray(value, dtype=float))
-    except (TypeError, ValueError) as error:
+        array = np.atleast_1d(floats(value))
+    except NOT_NUMBERS as error:
         raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.ndim != 1:
         message = f"{what} has shape {array.shape}; give one number or a row"
@@ -71,6 +71,9 @@ class SpeedProfile:
     Attributes:
         t, distance, speed, acceleration: At the start of each piece, and at the end of the last. Shape (K + 1,).
         jerk: Of each piece. Shape (K,), m/s^3.
+
+    Raises:
+        ProblemError: Other shapes, what is not finite, times or distances that fall.
     """
 
     t: Array
@@ -78,6 +81,23 @@ class SpeedProfile:
     speed: Array
     acceleration: Array
     jerk: Array
+
+    def __post_init__(self) -> None:
+        for what in ("t", "distance", "speed", "acceleration", "jerk"):
+            try:
+                row = floats(getattr(self, what))
+            except NOT_NUMBERS as error:
+                message = f"profile: {what} is not numeric: {getattr(self, what)!r}"
+                raise ProblemError(message, name=what, value=getattr(self, what)) from error
+            object.__setattr__(self, what, row)
+            shape = (len(self.t) - (what == "jerk"),) if self.t.ndim == 1 and len(self.t) > 1 else None
+            if row.shape != shape or not np.isfinite(row).all():
+                message = (
+                    f"profile: {what} of shape {row.shape} must be finite, {shape or 'two times at least'} expected"
+                )
+                raise ProblemError(message, name=what, value=row, limit=shape)
+            if what in ("t", "distance") and (np.diff(row) < 0).any():
+                raise ProblemError(f"profile: {what} must not fall", name=what, value=row)
 
     @property
     def duration(self) -> float:

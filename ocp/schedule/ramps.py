@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from ocp.errors import ProblemError, checked_positive
+from ocp.errors import ProblemError, checked_nonnegative, checked_positive
 from ocp.schedule.profile import Array, SpeedProfile, advanced
 
 __all__ = ["Memory", "Phases", "Zones", "fastest", "peak_acceleration", "plan", "ramp_distance", "ramp_time", "reach"]
@@ -45,14 +45,23 @@ class Zones(NamedTuple):
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Shortest time (s) of a speed change (m/s) that begins and ends without acceleration."""
+    """Shortest time (s) of a speed change (m/s) that begins and ends without acceleration.
+
+    Raises:
+        ProblemError: A negative change, a limit that is not positive.
+    """
+    checked_nonnegative("ramp: change", change)
+    for name, value in (("acceleration", acceleration), ("jerk", jerk)):
+        checked_positive(f"ramp: {name}", value)
     if change * jerk >= acceleration**2:
         return change / acceleration + acceleration / jerk
     return 2 * sqrt(change / jerk)
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Distance (m) that the shortest change from one speed to the other takes."""
+    """Distance (m) that the shortest change from one speed to the other takes; raises as ramp_time."""
+    for name, value in (("first", first), ("last", last)):
+        checked_nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ocp.errors import ProblemError
-from ocp.schedule.limits import JointPath, rates_along
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, checked_instance, floats
+from ocp.schedule.limits import JointPath, check_joints, rates_along
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, LineMotion
 
@@ -41,17 +41,17 @@ class JointTrajectory:
     accelerations: Array
 
     def __post_init__(self) -> None:
-        names = tuple(str(name) for name in self.names)
-        if not names or len(set(names)) != len(names):
+        names = checked_each("trajectory: names", self.names, str)
+        if isinstance(self.names, str) or not names or len(set(names)) != len(names):
             message = f"trajectory: joint names {list(names)} must be there and differ"
             raise ProblemError(message, name="names", value=names)
         object.__setattr__(self, "names", names)
-        t = np.array(self.t, dtype=float)
+        t = _numbers("times", self.t)
         if t.ndim != 1 or not t.size or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
             raise ProblemError("trajectory: times must be finite, increasing, and at least one", name="times", value=t)
         object.__setattr__(self, "t", t)
         for kind in KINDS:
-            values = np.array(getattr(self, kind), dtype=float)
+            values = _numbers(kind, getattr(self, kind))
             if values.shape != (shape := (len(t), len(names))):
                 message = f"trajectory: {kind} have shape {values.shape}, expected {shape}"
                 raise ProblemError(message, name=kind, value=values.shape, limit=shape)
@@ -62,6 +62,8 @@ class JointTrajectory:
     def write_csv(self, path: str | FilePath[str]) -> None:
         """Write columns t and position, velocity, acceleration of each joint, in full precision."""
         head = ["t", *(f"{name}.{kind}" for kind in KINDS for name in self.names)]
+        if not isinstance(path, str | FilePath):
+            raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
         rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
         with Path(path).open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream, lineterminator="\n")
@@ -114,7 +116,7 @@ class JointTrajectory:
             points = message["points"]
             stamps = [p["time_from_start"] for p in points]
             t = np.array([(stamp["sec"] * 10**9 + stamp["nanosec"]) / 1e9 for stamp in stamps])
-            values = [np.array([p[kind] for p in points], dtype=float) for kind in KINDS]
+            values = [floats([p[kind] for p in points]) for kind in KINDS]
             names = tuple(message["joint_names"])
         except (KeyError, TypeError, ValueError) as error:
             text = f"this is no joint trajectory message: {error!r}"
@@ -122,11 +124,19 @@ class JointTrajectory:
         return cls(names, t, *values)
 
 
+def _numbers(what: str, value: Any) -> Array:
+    try:
+        return floats(value)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"trajectory: {what} are not numeric: {value!r}", name=what, value=value) from error
+
+
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
     """Joints, their velocities, accelerations and jerks during a motion along the path. Shape (M, n) each.
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """
+    checked_instance("motion", motion, LineMotion)
     along = rates_along(joints, motion.distance)
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
     velocity = along.first * v
@@ -140,6 +150,8 @@ def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> Jo
     Times are whole nanoseconds, those of the message, and the joints are those of these times; the last is the first
     one at or after the end, at rest.
     """
+    checked_instance("schedule", schedule, Schedule)
+    check_joints(joints)
     whole = np.round(schedule.sample(period).t * 1e9)
     whole[-1] = np.ceil(schedule.duration * 1e9)
     t = np.unique(whole) / 1e9

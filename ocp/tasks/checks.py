@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
-from ocp.errors import ProblemError
+from models.arrays import Array, warn_of_degrees
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.geometry import Bound, is_holonomic, target_size
 from ocp.tasks.tip_task import ANGULAR, TipTask
@@ -36,10 +36,7 @@ STILL = 1e-6
 
 def checked_horizon(horizon: Any) -> float:
     """The horizon; ProblemError unless it is a positive, finite number."""
-    try:
-        duration = float(horizon)
-    except (TypeError, ValueError):
-        duration = np.nan
+    duration = real(horizon)
     if not 0 < duration < np.inf:
         words = f"horizon must be a positive number of seconds, not {horizon!r}"
         raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
@@ -51,11 +48,17 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
     Raises:
         ProblemError: Wrong sizes, not finite; a quaternion that is not of unit length.
+
+    Warns:
+        ModelWarning: Angles that look like degrees.
     """
     if joints is None:
         words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start_joints")
     angles = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
+    for joint, angle in zip(machine.robot.moving_joints, angles, strict=True):
+        if joint.kind != "prismatic":
+            warn_of_degrees(angle, "start_joints", joint.name, f"joint {joint.name!r} at")
     home = machine.base_home() if base is None else base
     place = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
     if machine.base_size == 7 and abs(np.linalg.norm(place[3:]) - 1) > 1e-9:
@@ -77,8 +80,8 @@ def checked_weights(weights: Any, size: int) -> Array:
 def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
     """Finite numbers as a flat array; ProblemError, with their name and meaning, unless there are `size` of them."""
     try:
-        array = np.asarray(value, dtype=float).ravel()
-    except (TypeError, ValueError) as error:
+        array = floats(value).ravel()
+    except NOT_NUMBERS as error:
         raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.shape != (size,):
         words = f"{what} has {array.size} entries, expected {size}: {meaning}"

@@ -15,12 +15,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FreeFloating, Machine, ModelError, center_of_mass
+from models import FreeFloating, Machine, ModelError, Robot, center_of_mass
 from models.arrays import Array
 from models.machines.machine import with_tip
 from models.robot.indices import manipulability_of
 from models.spatial import on_scalars, skew
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, floats
 from ocp.tasks.geometry import (
     Bound,
     angular_velocity,
@@ -356,7 +356,7 @@ def track_expression(
         ProblemError: Another shape, not finite, or an expression of anything but the time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
-    value = track(time) if callable(track) else track
+    value = _asked(track, time, what) if callable(track) else track
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value.ravel())
     if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
@@ -364,8 +364,8 @@ def track_expression(
     wanted = " or ".join(map(str, allowed))
     if not isinstance(value, ca.SX | ca.MX | ca.DM):
         try:
-            value = ca.DM(np.asarray(value, dtype=float))
-        except (TypeError, ValueError, NotImplementedError) as error:
+            value = ca.DM(floats(value))
+        except NOT_NUMBERS as error:
             words = f"{what} gives {value!r}, not numbers or expressions of shape {wanted}"
             raise ProblemError(words, name=what, value=value, limit=allowed) from error
     if value.shape not in allowed:
@@ -380,6 +380,16 @@ def track_expression(
         words = f"{what} depends on {strange}, but only the time it is called with may occur"
         raise ProblemError(words, name=what, value=strange)
     return ca.densify(value)
+
+
+def _asked(track: Callable[[Any], Any], time: Any, what: str) -> Any:
+    """What a track says; ProblemError where it fails, but for what interpolants say of SX symbols (see on_symbols)."""
+    try:
+        return track(time)
+    except (RuntimeError, NotImplementedError, ProblemError, ModelError):
+        raise
+    except Exception as error:  # of the function's own
+        raise ProblemError(f"{what}: the function fails: {error!r}", name=what, value=track) from error
 
 
 def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
@@ -408,16 +418,17 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
     That of the equations has the frame of the first task for its tip where the robot has none.
 
     Raises:
-        ProblemError: No task, something else than a task, an unknown link, a task of the tip of a robot that has none.
+        ProblemError: No machine, no task, something else than a task, an unknown link, a task of the tip of a robot
+            that has none.
     """
-    listed = [tasks] if isinstance(tasks, TipTask) else list(tasks)
+    if isinstance(machine, type) or not isinstance(getattr(machine, "robot", None), Robot):
+        words = f"machine must be a FixedBase(robot), FreeFloating(robot) or Standing(robot, ...), not {machine!r}"
+        raise ProblemError(words, name="machine", value=machine)
+    listed = (tasks,) if isinstance(tasks, TipTask) else checked_each("task", tasks, TipTask)
     if not listed:
         raise ProblemError("task is an empty list; give a TipTask, or several", name="task", value=listed)
     bound = []
     for task in listed:
-        if not isinstance(task, TipTask):
-            words = f"task must be a TipTask or a list of them, not {task!r}"
-            raise ProblemError(words, name="task", value=task)
         try:
             tip = with_tip(machine, task.link, task.point) if task.link is not None else machine
             _ = tip.robot.tip_link

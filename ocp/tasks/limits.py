@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from models import Machine, Standing
 from models.arrays import Array
-from ocp.errors import ProblemError, checked_positive
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive, floats, real
 
 __all__ = ["JointBounds", "Limits"]
 
@@ -61,7 +60,8 @@ class Limits:
                 raise ProblemError(words, name=what, value=value, limit=0.0)
         if self.vertical_force is not None:
             checked_positive("limits: vertical_force", self.vertical_force)
-        if not (isinstance(self.friction, Real) and self.friction > 0):  # which may be infinite
+        checked_flag("limits: joints", self.joints)
+        if not real(self.friction) > 0:  # which may be infinite
             words = f"limits: friction must be positive, not {self.friction!r}"
             raise ProblemError(words, name="friction", value=self.friction, limit=0.0)
 
@@ -100,6 +100,7 @@ class Limits:
 def _numbers(value: Any) -> Array:
     """A limit as a flat array, a single 0 where it is none."""
     try:
-        return np.asarray(value, dtype=float).ravel()
-    except (TypeError, ValueError):
+        given = floats(value).ravel()
+        return given if given.size else np.zeros(1)
+    except NOT_NUMBERS:
         return np.zeros(1)

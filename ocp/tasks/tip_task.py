@@ -21,7 +21,7 @@ from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.robot.indices import checked_rows
 from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import ProblemError, checked_choice, checked_nonnegative
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_nonnegative, checked_text, real
 
 __all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "timed"]
 
@@ -90,6 +90,10 @@ class TipTask:
             words = "a tip task takes an orientation or a direction of its tool axis, not both"
             raise ProblemError(words, name="direction")
         checked_choice("axes", self.axes, get_args(Axes))
+        for what in ("link", "relative_to"):
+            name = getattr(self, what)
+            if name is not None and not checked_text(f"tip task: {what}", name):
+                raise ProblemError(f"tip task: {what} is an empty name", name=what, value=name)
         for what in ("gain", "start_gap"):
             checked_nonnegative(what, getattr(self, what))
         try:
@@ -157,7 +161,7 @@ def one_of(
         return [TipTask(rows=rows, velocity=tip_velocity)]
     if tip_velocity is not None or rows is not None:
         raise ProblemError("give either tip_velocity and rows, or task, not both", name="task")
-    return [task] if isinstance(task, TipTask) else list(task)
+    return [task] if isinstance(task, TipTask) else list(checked_each("task", task, TipTask))
 
 
 class PoseLine(NamedTuple):
@@ -187,7 +191,7 @@ def pose_line(
             not positive.
     """
     checked_choice("pace", pace, ("constant", "rest"))
-    if not (isinstance(duration, int | float | np.number) and 0 < duration < np.inf):
+    if not 0 < real(duration) < np.inf:
         words = f"duration must be a positive number of seconds, not {duration!r}"
         raise ProblemError(words, name="duration", value=duration, limit=0.0)
     (turn, place), (other, there) = (_pose(pose, what) for pose, what in ((first, "first"), (second, "second")))
@@ -237,7 +241,9 @@ def along(path: SmoothPath, speed: float) -> Callable[[Any], Any]:
 
     A mesh whose nodes are where the pieces of the path begin, `path.bounds / path.length`, keeps the full order.
     """
-    if not (isinstance(speed, int | float | np.number) and 0 < speed < np.inf):
+    if not isinstance(path, SmoothPath):
+        raise ProblemError(f"path must be a SmoothPath, as smooth makes it, not {path!r}", name="path", value=path)
+    if not 0 < real(speed) < np.inf:
         words = f"speed must be a positive number of m/s, not {speed!r}"
         raise ProblemError(words, name="speed", value=speed, limit=0.0)
     return _Along(path, float(speed))
@@ -278,13 +284,13 @@ def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 def _pose(pose: tuple[ArrayInput, ArrayInput], what: str) -> tuple[Array, Array]:
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
-    except (TypeError, ValueError, NotImplementedError) as error:
+    except NOT_NUMBERS as error:
         words = f"the {what} pose must be (orientation, position) in numbers, not {pose!r}"
         raise ProblemError(words, name=what, value=str(pose)) from error
     if orientation.size == 4 and np.linalg.norm(orientation) > 0:
         orientation = np.array(rotation_from_quaternion(ca.DM(orientation.ravel())))
-    if orientation.shape != (3, 3) or position.size != 3:
-        words = f"the {what} pose has the shapes {orientation.shape}, {position.shape}; (3, 3), (3,) expected"
+    if orientation.shape != (3, 3) or position.size != 3 or not np.isfinite(position).all():
+        words = f"the {what} pose has the shapes {orientation.shape}, {position.shape}; finite (3, 3), (3,) expected"
         raise ProblemError(words, name=what, value=(orientation.shape, position.shape), limit=((3, 3), (3,)))
     if not (np.abs(orientation @ orientation.T - np.eye(3)).max() < 1e-6 and np.linalg.det(orientation) > 0):
         words = f"the {what} pose has the orientation {orientation.tolist()}, which is no rotation"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, TypeAlias, get_args
 
 import casadi as ca
@@ -13,7 +12,7 @@ import numpy as np
 from models.arrays import Array
 from models.machines.standing import Standing
 from models.spatial import expression
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, real
 
 __all__ = [
     "Anywhere",
@@ -39,7 +38,7 @@ REFERENCE_SAMPLES = 201  # times at which a reference is looked at
 
 def is_finite(value: Any) -> bool:
     """Whether it is a single finite number."""
-    return isinstance(value, Real) and bool(np.isfinite(float(value)))
+    return bool(np.isfinite(real(value)))
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ def checked_place(given: Any, what: str) -> Any:
     """(x, y) as a casadi column, m; ProblemError unless it is two numbers or expressions."""
     try:
         point = expression(given)
-    except (TypeError, ValueError, NotImplementedError):
+    except NOT_NUMBERS:
         point = ca.DM()
     numeric = isinstance(point, ca.DM)
     if point.numel() != 2 or 1 not in point.shape or (numeric and not np.isfinite(np.array(point)).all()):

@@ -14,7 +14,7 @@ from models.machines.standing import External, Standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -101,8 +101,11 @@ def plan_standing(
             lacks.
         ProblemError: As standing_problem.
     """
+    if method is not None:
+        checked_instance("method", method, Collocation)
+    options = checked_mapping("options", options)
     judge = _Judge(machine, tasks, tolerances, asked.get("along") == "parameter")
-    settings = {**IPOPT, **(options or {})}
+    settings = {**IPOPT, **options}
     trials = _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
     reasons: list[str] = []
     why = SolveError()

@@ -42,7 +42,7 @@ from models.robot.indices import joint_limit_index
 from models.robot.robot import Robot
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_choice, checked_nonnegative
+from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
 from ocp.tasks.equations import TaskEquations, bind
@@ -157,12 +157,10 @@ def standing_problem(
             point that is asked out of the support; no freedom left to come to rest; a singular start whose
             manipulability the cost would need.
     """
-    zmp, weights, limits = zmp or InFoot(), weights or Weights(), limits or Limits()
-    for one, kind in ((machine, Standing), (weights, Weights), (limits, Limits)):
-        if not isinstance(one, kind):
-            given = ", ".join(type(each).__name__ for each in (machine, weights, limits))
-            message = f"standing_problem takes a Standing machine, Weights and Limits, not {given}"
-            raise ProblemError(message, name=kind.__name__, value=one)
+    zmp = InFoot() if zmp is None else zmp
+    weights = Weights() if weights is None else checked_instance("standing_problem: weights", weights, Weights)
+    limits = Limits() if limits is None else checked_instance("standing_problem: limits", limits, Limits)
+    checked_instance("standing_problem: machine", machine, Standing)
     checked_choice("control", control, ("acceleration", "jerk"))
     checked_choice("along", along, ("time", "parameter"))
     checked_choice("tip_level", tip_level, ("position", "acceleration"))

@@ -467,6 +467,7 @@ def test_a_robot_of_point_masses_does_not_float_and_the_bare_links_are_named() -
         FreeFloating(Robot.from_urdf(text(joint).replace(BODY, point)))
 
 
+@pytest.mark.filterwarnings("ignore:.*in millimetres:models.errors.ModelWarning")
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e5])
 def test_whether_a_robot_floats_does_not_depend_on_its_size(size: float) -> None:
     """Similar robots of one mass move alike: the same turning, all ways in proportion."""

@@ -477,7 +477,7 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
-        ({"limits": 3}, "Standing machine, Weights and Limits, not Standing, Weights, int"),
+        ({"limits": 3}, "limits must be a Limits, not "),
         ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
         ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
         ({"end_joints": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),

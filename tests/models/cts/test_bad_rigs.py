@@ -1,0 +1,169 @@
+"""Whatever is wrong with a rig, its tunnel or its targets is refused by name; so are shapes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import Box, Capsule, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
+from models.cts.clearance import Radii, Surroundings, clear_inverse, clearances
+from models.cts.rig import INCH, Branch
+from models.cts.table import all_joint_sets, reachable_rolls
+from tests.bad_values import (
+    FINITE,
+    FLAG,
+    INF,
+    INSTANCE,
+    NONNEGATIVE,
+    NOTHING,
+    POSITIVE,
+    SEQUENCE,
+    Bad,
+    Case,
+    array,
+    assert_refused,
+    but,
+    good_calls,
+    panel,
+    rotation,
+)
+
+LENGTHS = dict.fromkeys(("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck"), 0.5)
+OPEN = but(array(6), "inf")
+RIG, TUNNEL = reference_rig(), reference_tunnel()
+TARGET = INCH * np.array([100.0, 6.0, -15.0, 0.0, 0.0])
+BRANCH: Bad = INSTANCE | {"no sign": Branch(2, 0), "text": ("a", "b")}
+WALLS = Surroundings(walls=Box((10, 10, 10)))
+CLEAR: dict[str, Bad] = {
+    "surroundings": but(INSTANCE, "None") | {"empty": Surroundings()},
+    "clearance": but(FINITE, "minus inf") | NOTHING,
+}
+CASES = [
+    Case(
+        "Rig",
+        Rig,
+        LENGTHS,
+        {
+            **dict.fromkeys(LENGTHS, POSITIVE | NOTHING),
+            "lower": OPEN | {"never": (INF,) * 6},
+            "upper": OPEN | {"never": (-INF,) * 6},
+        },
+    ),
+    Case("reference_rig", reference_rig, {}, {"lower": OPEN, "upper": OPEN}),
+    Case(
+        "Tunnel",
+        Tunnel,
+        {"center": (0, 0, 0), "ranges": (1, 1, 1)},
+        {
+            "center": array(3),
+            "ranges": array(3) | {"zero": (0, 1, 1), "negative": (-1, 1, 1)},
+            "weights": array(3) | {"negative": (-1, 1, 1)},
+        },
+    ),
+    Case(
+        "optimal_inverse",
+        optimal_inverse,
+        {"rig": RIG, "tunnel": TUNNEL},
+        {"rig": INSTANCE, "tunnel": INSTANCE, "branch": BRANCH, "rate_weight": NONNEGATIVE | NOTHING, "limits": FLAG},
+    ),
+    Case(
+        "solve_table",
+        solve_table,
+        {"rig": RIG, "tunnel": TUNNEL, "targets": [TARGET]},
+        {
+            "rig": INSTANCE,
+            "tunnel": INSTANCE,
+            "targets": but(array(1, 5), "nan", "inf") | {"none": np.zeros((0, 5)), "flat": TARGET},
+            "branches": SEQUENCE | {"empty": [], "no sign": [Branch(2, 0)]},
+            "previous": FINITE | NOTHING | {"two": [0.0, 0.0]},
+            "in_sequence": FLAG,
+            "rate_weight": NONNEGATIVE | NOTHING,
+            "surroundings": but(INSTANCE, "None") | {"empty": Surroundings()},
+        },
+    ),
+    Case(
+        "solve_table beside walls",
+        solve_table,
+        {"rig": RIG, "tunnel": TUNNEL, "targets": [TARGET], "surroundings": WALLS},
+        {
+            "clearance": but(FINITE, "minus inf") | NOTHING,
+            "clearance_weight": NONNEGATIVE | NOTHING,
+            "clearance_width": POSITIVE | NOTHING,
+        },
+    ),
+    Case(
+        "clear_inverse",
+        clear_inverse,
+        {"rig": RIG, "tunnel": TUNNEL, "surroundings": WALLS},
+        {
+            "rig": INSTANCE,
+            "tunnel": INSTANCE,
+            "branch": BRANCH,
+            **CLEAR,
+            "weight": NONNEGATIVE | NOTHING,
+            "width": POSITIVE | NOTHING,
+            "rate_weight": NONNEGATIVE | NOTHING,
+            "samples": FINITE | {"few": 7, "half": 8.5},
+            "softness": POSITIVE | NOTHING,
+            "radii": but(INSTANCE, "None"),
+        },
+    ),
+    Case(
+        "clearances",
+        clearances,
+        {"rig": RIG, "q": np.zeros(6), "surroundings": WALLS},
+        {
+            "rig": INSTANCE,
+            "q": array(6),
+            "surroundings": INSTANCE | {"empty": Surroundings()},
+            "radii": but(INSTANCE, "None"),
+        },
+    ),
+    Case(
+        "Surroundings",
+        Surroundings,
+        {"walls": Box((10, 10, 10))},
+        {"walls": but(INSTANCE, "None"), "solids": SEQUENCE | {"alone": Box((1, 1, 1))}, "capsules": SEQUENCE},
+    ),
+    Case("Radii", Radii, {}, dict.fromkeys(("yaw", "pitch", "sting"), NONNEGATIVE | NOTHING)),
+    Case(
+        "reachable_rolls",
+        reachable_rolls,
+        {"rig": RIG, "target": TARGET},
+        {"rig": INSTANCE, "target": array(5), "branch": BRANCH},
+    ),
+    Case(
+        "all_joint_sets",
+        all_joint_sets,
+        {"rig": RIG, "target": TARGET, "roll": 0.1},
+        {"rig": INSTANCE, "target": array(5), "roll": FINITE | NOTHING},
+    ),
+    Case(
+        "Box",
+        Box,
+        {"size": (1, 1, 1)},
+        {
+            "size": but(array(3), "inf") | {"zero": (0, 1, 1), "negative": (-1, 1, 1), "endless": (INF, INF, INF)},
+            "position": array(3),
+            "rotation": rotation(),
+        },
+    ),
+    Case(
+        "Capsule",
+        Capsule,
+        {"radius": 0.1, "start": (0, 0, 0), "end": (0, 0, 1)},
+        {"radius": but(NONNEGATIVE, "symbol") | NOTHING, "start": array(3), "end": array(3)},
+    ),
+]
+
+
+@pytest.mark.parametrize("case", good_calls(CASES))
+def test_what_is_good_is_taken(case: Case) -> None:
+    case.call(**case.good)
+
+
+@pytest.mark.parametrize(("case", "argument", "value"), panel(CASES))
+def test_bad_input_is_refused_by_name(case: Case, argument: str, value: Any) -> None:
+    assert_refused(case, argument, value)

@@ -1,0 +1,415 @@
+"""Whatever is wrong with a task, a start, limits or laws is refused by name, by builders and local laws alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, Link, Standing, planar_chain, rectangle, reference_rig, reference_tunnel
+from ocp import (
+    Collocation,
+    Following,
+    FreeTime,
+    IndexAtLeast,
+    Indirect,
+    InFoot,
+    Layer,
+    Limits,
+    Pinned,
+    Stabiliser,
+    TipTask,
+    Weights,
+    inverse_kinematics,
+    minimum_velocity_problem,
+    plan_minimum_velocity,
+    plan_standing,
+    resolve,
+    resolve_accelerations,
+    roll_problem,
+    spline_targets,
+    standing_problem,
+)
+from ocp.tasks.tip_task import along, pose_line
+from tests.bad_values import (
+    CALLABLE,
+    CHOICE,
+    COUNT,
+    FINITE,
+    FLAG,
+    INF,
+    INSTANCE,
+    LIMIT,
+    MAPPING,
+    NAN,
+    NONNEGATIVE,
+    NOTHING,
+    POSITIVE,
+    SEQUENCE,
+    STRANGE,
+    UNKNOWN,
+    WHOLE,
+    Bad,
+    Case,
+    array,
+    assert_refused,
+    but,
+    good_calls,
+    panel,
+)
+
+START = [0.3, 0.6, 0.9]
+CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
+ARM = FixedBase(CHAIN)
+UPRIGHT = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]
+STANDING = Standing(CHAIN, rotation=UPRIGHT, support=rectangle((-0.3, 0.3), (-0.3, 0.3)))
+UP = [1.4, 0.3, 0.3]
+REACHED = np.array(ca.DM(ARM.tip_pose((), START).position)).ravel()
+FORWARD = TipTask(velocity=[0.1, 0.0], rows=(3, 4))
+HELD = TipTask(position=REACHED, rows=(3, 4))
+STILL = TipTask(velocity=[0.0, 0.0], rows=(4, 5))
+TRACK: Bad = STRANGE | {
+    "short": [1.0],
+    "nan": [NAN, 0.0],
+    "symbol": ca.SX.sym("strange", 2),
+    "texts": ["1", "2"],
+    "truths": [True, False],
+    "function of a word": lambda t: "a",
+    "function of one": lambda t: [t],
+    "function of nothing": lambda: [0, 0],
+    "function of nan": lambda t: [NAN, 0],
+    "function that fails": lambda t: 1 / 0,
+    "function of none": lambda t: None,
+}
+PLACE: Bad = TRACK | {"inf": [INF, 0.0, 0.0]}
+ROWS: Bad = but(SEQUENCE, "numbers") | {
+    "empty": [],
+    "twice": [3, 3],
+    "high": [6],
+    "half": [3.5, 4],
+    "digits": ["3", "4"],
+    "truths": [True, False],
+}
+BASE: Bad = array(7)
+RATES: Bad = array(3) | {"zero": [0.0, 1.0, 1.0], "negative": [-1.0, 1.0, 1.0]}
+SYMBOLS = INSTANCE
+HORIZON: Bad = POSITIVE | NOTHING
+TASK: Bad = INSTANCE | {
+    "none in it": [None],
+    "empty": (),
+    "unknown link": TipTask(velocity=[0.0], rows=(3,), link="nobody"),
+}
+ASKED: dict[str, Bad] = {
+    "machine": INSTANCE | {"a robot": CHAIN},
+    "start_joints": array(3) | NOTHING,
+    "horizon": HORIZON,
+    "weights": RATES,
+    "start_base": but(BASE, "empty"),
+}
+GIVEN = {"machine": ARM, "task": FORWARD, "start_joints": START, "horizon": 1.0}
+STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
+EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
+
+TASKS = [
+    Case(
+        "TipTask",
+        TipTask,
+        {"velocity": [0.1, 0.0], "rows": (3, 4)},
+        {
+            "rows": ROWS | NOTHING,
+            "position": {"both": REACHED},
+            "axes": CHOICE,
+            "link": but(UNKNOWN, "None", "unknown"),
+            "relative_to": but(UNKNOWN, "None", "unknown"),
+            "gain": NONNEGATIVE | NOTHING,
+            "start_gap": NONNEGATIVE | NOTHING,
+            "tool_axis": array(3) | {"zero": (0, 0, 0)},
+            "point": array(3) | {"without a link": (1, 0, 0)},
+            "velocity": NOTHING,
+        },
+    ),
+    Case("along", along, {"path": None, "speed": 0.1}, {"path": INSTANCE, "speed": POSITIVE}),
+    Case(
+        "pose_line",
+        pose_line,
+        {"first": (np.eye(3), REACHED), "second": (np.eye(3), REACHED + 1), "duration": 1.0},
+        {
+            "first": INSTANCE
+            | {
+                "no turn": (np.zeros((3, 3)), REACHED),
+                "one": (np.eye(3),),
+                "nan": (np.eye(3), [NAN, 0, 0]),
+                "inf": (np.eye(3), [INF, 0, 0]),
+                "texts": (np.eye(3), ["1", "2", "3"]),
+            },
+            "second": {"half a turn": (np.diag([-1, -1, 1]), REACHED)},
+            "duration": HORIZON,
+            "pace": CHOICE,
+        },
+    ),
+    Case(
+        "Limits",
+        Limits,
+        {},
+        {
+            "velocity": EACH,
+            "acceleration": EACH,
+            "jerk": EACH,
+            "torque": EACH,
+            "joints": FLAG,
+            "vertical_force": POSITIVE,
+            "friction": LIMIT | NOTHING,
+        },
+    ),
+    Case(
+        "Weights",
+        Weights,
+        {},
+        dict.fromkeys(
+            ("acceleration", "velocity", "joint_limits", "manipulability", "jerk", "time"), NONNEGATIVE | NOTHING
+        ),
+    ),
+    Case(
+        "FreeTime",
+        FreeTime,
+        {"lower": 0.5, "upper": 2.0, "guess": 1.0},
+        {
+            "lower": POSITIVE | NOTHING | {"above": 1.5},
+            "upper": POSITIVE | NOTHING | {"below": 0.7},
+            "guess": POSITIVE | NOTHING,
+        },
+    ),
+    Case("InFoot", InFoot, {}, {"margin": NONNEGATIVE | NOTHING}),
+    Case("IndexAtLeast", IndexAtLeast, {"value": 0.5}, {"value": FINITE | NOTHING | {"one": 1.0}}),
+    Case(
+        "Layer",
+        Layer,
+        {"index": "joint_limits", "demand": -1.0},
+        {"index": CHOICE, "demand": FINITE | NOTHING, "form": CHOICE},
+    ),
+    Case(
+        "Stabiliser",
+        Stabiliser,
+        {},
+        {
+            "poles": array(3) | NOTHING | {"zero": (0, 1, 1)},
+            "damping": NONNEGATIVE | NOTHING,
+            "gradient": NONNEGATIVE | NOTHING,
+        },
+    ),
+]
+
+VELOCITIES = [
+    Case(
+        "inverse_kinematics",
+        inverse_kinematics,
+        {"machine": ARM, "task": HELD, "starts": 4, "near": START},
+        {
+            "machine": ASKED["machine"],
+            "task": TASK | {"velocity": FORWARD},
+            "time": FINITE | NOTHING,
+            "base": but(BASE, "empty"),
+            "starts": WHOLE | NOTHING,
+            "near": array(3),
+            "seed": WHOLE | NOTHING,
+            "limits": FLAG,
+            "tolerance": POSITIVE | NOTHING,
+            "apart": POSITIVE | NOTHING,
+            "iterations": COUNT | NOTHING,
+        },
+    ),
+    Case(
+        "resolve",
+        resolve,
+        {**GIVEN, "samples": 5},
+        {
+            **ASKED,
+            "task": TASK,
+            "damping": NONNEGATIVE | NOTHING,
+            "tolerance": POSITIVE | NOTHING,
+            "check_start": FLAG,
+            "samples": COUNT
+            | NOTHING
+            | {"falling": [0, 0.5, 0.4, 1.0], "one": [0.0], "texts": ["0", "1"], "nan": [0, NAN, 1]},
+        },
+    ),
+    Case(
+        "resolve by rows",
+        resolve,
+        {
+            "machine": ARM,
+            "tip_velocity": [0.1, 0.0],
+            "rows": (3, 4),
+            "start_joints": START,
+            "horizon": 1.0,
+            "samples": 5,
+        },
+        {"tip_velocity": TRACK | NOTHING, "rows": ROWS | NOTHING | {"too many": (2, 3, 4, 5), "unmoved": (0, 3)}},
+    ),
+    Case(
+        "resolve a pose",
+        lambda position: resolve(
+            ARM, task=TipTask(position=position, rows=(3, 4)), start_joints=START, horizon=1.0, samples=3
+        ),
+        {"position": REACHED},
+        {"position": PLACE | {"elsewhere": [9.0, 9.0]}},
+    ),
+    Case(
+        "minimum_velocity_problem",
+        minimum_velocity_problem,
+        GIVEN,
+        {
+            **ASKED,
+            "task": TASK,
+            "free_start": FLAG,
+            "cyclic": FLAG,
+            "formulation": CHOICE,
+            "limits": FLAG,
+            "guess_damping": POSITIVE | NOTHING,
+            "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "plan_minimum_velocity",
+        plan_minimum_velocity,
+        {**GIVEN, "method": Collocation(5)},
+        {
+            "machine": ASKED["machine"],
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "weights": RATES,
+            "task": TASK,
+            "free_start": FLAG,
+            "cyclic": FLAG,
+            "formulation": CHOICE,
+            "limits": FLAG,
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "dampings": but(SEQUENCE, "numbers") | NOTHING | {"empty": [], "zero": [0.0]},
+            "options": MAPPING,
+        },
+    ),
+]
+
+STANDINGS = [
+    Case(
+        "resolve_accelerations",
+        resolve_accelerations,
+        {**STOOD, "step": 0.05},
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "law": CHOICE,
+            "start_velocities": array(3),
+            "external": CALLABLE,
+            "layers": SEQUENCE,
+            "stabiliser": but(INSTANCE, "None"),
+            "null_damping": NONNEGATIVE | NOTHING,
+            "step": POSITIVE | NOTHING,
+            "integrator": CHOICE,
+            "tolerance": POSITIVE | NOTHING,
+            "stop_at_lift_off": FLAG,
+            "speed_limit": POSITIVE | NOTHING,
+        },
+    ),
+    Case(
+        "standing_problem",
+        standing_problem,
+        STOOD,
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "zmp": but(INSTANCE, "None")
+            | {
+                "wide": InFoot(9.0),
+                "far": Pinned((9.0, 9.0)),
+                "of words": Pinned("a"),
+                "no function": Following(3),  # type: ignore[arg-type]
+                "function of one": Following(lambda t: [t]),
+                "function of nan": Following(lambda t: [NAN, 0]),
+            },
+            "external": CALLABLE,
+            "weights": but(INSTANCE, "None"),
+            "limits": but(INSTANCE, "None") | {"of two": Limits(velocity=[1.0, 2.0])},
+            "control": CHOICE,
+            "along": CHOICE,
+            "tip_level": CHOICE,
+            "start": CHOICE,
+            "end": CHOICE,
+            "end_joints": but(array(3), "nan"),
+            "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "plan_standing",
+        plan_standing,
+        STOOD,
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "options": MAPPING,
+            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
+        },
+    ),
+]
+
+RIG, TUNNEL = reference_rig(), reference_tunnel()
+
+
+def falling(time: Any) -> list[Any]:
+    return [2.54, 0.1524, -0.381 + 0.0762 * time, 0.0, 0.0]
+
+
+ROLLS = [
+    Case(
+        "spline_targets",
+        spline_targets,
+        {"times": [0.0, 1.0, 2.0, 3.0], "targets": np.ones((4, 5))},
+        {"times": array(4) | NOTHING | {"falling": [0.0, 2.0, 1.0, 3.0]}, "targets": array(4, 5) | NOTHING},
+    ),
+    Case(
+        "roll_problem",
+        roll_problem,
+        {"rig": RIG, "tunnel": TUNNEL, "targets": falling, "horizon": 10.0},
+        {
+            "rig": INSTANCE,
+            "tunnel": INSTANCE,
+            "targets": TRACK | NOTHING | {"unreachable": lambda t: [9.0, 9, 9, 0, 0]},
+            "horizon": HORIZON,
+            "branch": INSTANCE,
+            "rate_weight": NONNEGATIVE | NOTHING,
+            "acceleration_weight": NONNEGATIVE | NOTHING,
+            "rate_limit": but(LIMIT, "zero") | NOTHING,
+            "acceleration_limit": but(LIMIT, "zero") | NOTHING,
+            "start_roll": FINITE,
+            "start_rate": FINITE,
+            "surroundings": but(INSTANCE, "None"),
+            "clearance": but(FINITE, "minus inf") | NOTHING,
+            "clearance_weight": NONNEGATIVE | NOTHING,
+            "clearance_width": POSITIVE | NOTHING,
+            "softness": POSITIVE | NOTHING,
+            "radii": but(INSTANCE, "None"),
+            "symbols": SYMBOLS,
+        },
+    ),
+]
+CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS]
+LONG = ("along", "plan_minimum_velocity", "plan_standing")
+
+
+@pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))
+def test_what_is_good_is_taken(case: Case) -> None:
+    case.call(**case.good)
+
+
+@pytest.mark.parametrize(("case", "argument", "value"), panel(CASES))
+def test_bad_input_is_refused_by_name(case: Case, argument: str, value: Any) -> None:
+    assert_refused(case, argument, value)

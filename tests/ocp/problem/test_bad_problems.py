@@ -1,0 +1,334 @@
+"""Whatever is wrong with a declaration, a method or what is asked of a solve is refused by name."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, prepare, refine, solve, tighten
+from tests.bad_values import (
+    CHOICE,
+    COUNT,
+    FINITE,
+    FLAG,
+    INF,
+    INSTANCE,
+    MAPPING,
+    NAME,
+    NAN,
+    NONNEGATIVE,
+    NOTHING,
+    NUMBER,
+    POSITIVE,
+    SHARE,
+    STRANGE,
+    TEXT,
+    Bad,
+    Case,
+    assert_refused,
+    but,
+    good_calls,
+    method,
+    panel,
+)
+
+PLAN = Collocation(4)
+STRANGER = ca.SX.sym("stranger")
+VALUE: Bad = but(STRANGE, "dictionary") | {
+    "mapping": {"a": 1},
+    "stranger": STRANGER,
+    "other symbols": ca.MX.sym("x"),
+    "ragged": [[1, 2], [3]],
+    "empty": [],
+    "truth": True,
+    "huge": 10**400,
+    "texts": ["1", "2"],
+}
+BOUND = VALUE | {"nan": NAN}
+FREE = VALUE | {"inf": INF}  # nan leaves an entry free
+GUESS = but(VALUE, "stranger", "other symbols") | {"nan": NAN, "inf": INF}
+EXPRESSION = VALUE | NOTHING | {"nan": NAN, "inf": INF}
+UNIT = TEXT | NOTHING
+RESERVED: Bad = NAME | {"reserved": "time", "taken": "x"}
+
+
+def blank() -> Problem:
+    """A problem that is not finished: one state without dynamics, and one control."""
+    problem = Problem("blank")
+    problem.state("x")
+    problem.control("u")
+    return problem
+
+
+def line() -> Problem:
+    """From 0 to p in the unit of time with the least effort."""
+    problem = Problem("line")
+    x = problem.state("x", initial=0.0)
+    u = problem.control("u", lower=-9.0, upper=9.0)
+    p = problem.parameter("p")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.end("there", x - p, 0, 0)
+    problem.minimize(running=u**2)
+    return problem
+
+
+@cache
+def made() -> tuple[Problem, Solution]:
+    problem = line()
+    return problem, solve(problem, PLAN, parameters={"p": 1.0})
+
+
+def plan() -> Solution:
+    return made()[1]
+
+
+def declared() -> Problem:
+    return made()[0]
+
+
+def about_blank(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
+    """A declaration on a problem that has the state x and the control u; "x" stands for its symbol."""
+
+    def call(**given: Any) -> Any:
+        problem = blank()
+        x = problem.declared.states["x"].symbol
+        return getattr(problem, name)(
+            **{k: x if isinstance(v, str) and v == "the state" else v for k, v in given.items()}
+        )
+
+    return Case(f"Problem.{name}", call, good, bad)
+
+
+DECLARATIONS = [
+    Case("Problem", Problem, {"name": "a"}, {"name": NAME, "symbols": INSTANCE}),
+    about_blank(
+        "state",
+        {"name": "y"},
+        name=RESERVED,
+        size=COUNT,
+        initial=FREE,
+        terminal=FREE,
+        lower=BOUND | {"inf": INF},
+        upper=BOUND | {"minus inf": -INF},
+        guess=GUESS,
+        unit=UNIT,
+    ),
+    about_blank(
+        "control",
+        {"name": "y"},
+        name=RESERVED,
+        size=COUNT,
+        lower=BOUND | {"inf": INF},
+        upper=BOUND | {"minus inf": -INF},
+        guess=GUESS,
+        unit=UNIT,
+    ),
+    about_blank("parameter", {"name": "y"}, name=RESERVED, size=COUNT | NOTHING),
+    about_blank(
+        "horizon", {"value": 1.0}, value=BOUND | NONNEGATIVE | {"zero": 0.0}, guess={"both": 1.0}, lower={"both": 0.5}
+    ),
+    about_blank(
+        "horizon",
+        {"lower": 0.5, "upper": 2.0},
+        lower=BOUND | {"zero": 0.0, "negative": -1.0, "above": 3.0},
+        upper=BOUND | {"negative": -1.0},
+        guess=but(NUMBER, "symbol") | {"inf": INF, "outside": 9.0, "negative": -1.0},
+    ),
+    about_blank("at_start", {"variable": "x"}, variable=EXPRESSION | {"unknown": "y"}),
+    about_blank(
+        "dynamics",
+        {"state": "x", "derivative": 0.0},
+        state=EXPRESSION | {"unknown": "y"},
+        derivative=EXPRESSION | {"two": [1.0, 2.0]},
+    ),
+    *[
+        about_blank(
+            kind,
+            {"name": "y", "expression": "the state", "lower": 0.0},
+            name=NAME,
+            expression=EXPRESSION,
+            lower=BOUND | NOTHING | {"inf": INF},
+            upper=BOUND | {"minus inf": -INF, "below": -1.0},
+            unit=UNIT,
+        )
+        for kind in ("path", "start", "end")
+    ],
+    about_blank("minimize", {"running": "the state"}, running=EXPRESSION | {"two": [1.0, 2.0]}, terminal=EXPRESSION),
+]
+
+MESH: Bad = STRANGE | {
+    "short": (0.0, 1.0),
+    "falling": (0.0, 0.5, 0.4, 0.8, 1.0),
+    "nan": (0, 0.2, NAN, 0.6, 1),
+    "texts": tuple("01234"),
+}
+METHODS = [
+    Case(
+        "Collocation",
+        Collocation,
+        {"intervals": 4},
+        {
+            "intervals": COUNT | NOTHING,
+            "degree": COUNT | NOTHING | {"ten": 10},
+            "scheme": CHOICE,
+            "control": CHOICE,
+            "mesh": MESH,
+        },
+    ),
+    Case(
+        "MultipleShooting",
+        MultipleShooting,
+        {"intervals": 4},
+        {"intervals": COUNT | NOTHING, "integrator": CHOICE, "steps": COUNT | NOTHING, "control": CHOICE, "mesh": MESH},
+    ),
+    Case(
+        "Indirect",
+        Indirect,
+        {},
+        {
+            "segments": COUNT | NOTHING,
+            "shooting": CHOICE,
+            "tolerance": SHARE | NOTHING,
+            "residual": SHARE | NOTHING,
+            "seed": INSTANCE,
+        },
+    ),
+]
+
+OPTIONS: Bad = MAPPING | {
+    "unknown": {"no_such": 1},
+    "wrong type": {"max_iter": "a"},
+    "number": {3: 4},
+    "object": {"max_iter": object()},
+}
+PARAMETERS: Bad = (
+    MAPPING
+    | NOTHING
+    | {
+        "unknown": {"p": 1.0, "q": 2.0},
+        "missing": {},
+        "two": {"p": [1.0, 2.0]},
+        "word": {"p": "a"},
+        "nan": {"p": NAN},
+        "none": {"p": None},
+        "symbol": {"p": STRANGER},
+        "truth": {"p": True},
+        "digits": {"p": "1"},
+        "complex": {"p": 1j},
+    }
+)
+START: Bad = {
+    "word": "a",
+    "number": 3,
+    "list": ["a"],
+    "object": object(),
+    "unknown": {"y": 1.0},
+    "nan": {"x": NAN},
+    "text": {"x": "a"},
+    "shape": {"x": np.zeros((3, 2))},
+    "horizon": {"horizon": -1.0},
+    "horizon of a word": {"horizon": "a"},
+    "function of nothing": {"x": lambda: 0.0},
+    "function that fails": {"x": lambda t: 1 / 0},
+    "function of a word": {"x": lambda t: "a"},
+    "times fall": {"x": np.zeros((3, 1)), "t": [0, 2, 1]},
+    "times of a word": {"x": np.zeros((3, 1)), "t": "a"},
+    "number as name": {3: 1.0},
+}
+FRONT: dict[str, Bad] = {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": OPTIONS}
+SOLVED = {"method": PLAN, "parameters": {"p": 1.0}}
+
+
+def on_line(call: Any, good: dict[str, Any], /, **bad: Bad) -> Case:
+    """A call that takes the problem of a line."""
+    return Case(call.__name__, lambda **given: call(**{"problem": declared(), **given}), good, bad)
+
+
+FRONTS = [
+    on_line(prepare, {"method": PLAN}, **FRONT, method=INSTANCE, compiled=FLAG),
+    on_line(solve, SOLVED, **FRONT, method=INSTANCE, parameters=PARAMETERS, guess=START, check=FLAG),
+    on_line(
+        refine,
+        SOLVED,
+        **FRONT,
+        method=INSTANCE | {"indirect": Indirect()},
+        parameters=PARAMETERS,
+        guess=START,
+        tolerance=POSITIVE | NOTHING,
+        max_intervals=COUNT | NOTHING | {"few": 2},
+    ),
+    on_line(
+        tighten,
+        SOLVED,
+        **FRONT,
+        method=INSTANCE | {"indirect": Indirect()},
+        parameters=PARAMETERS,
+        guess=START,
+        tolerance=POSITIVE | NOTHING,
+    ),
+    Case(
+        "Indirect.prepare",
+        lambda **given: Indirect().prepare(**{"problem": declared(), **given}),
+        {},
+        {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": MAPPING},
+    ),
+    Case(
+        "certificate",
+        lambda **given: certificate(**{"problem": declared(), "solutions": [plan(), plan()], **given}),
+        {},
+        {
+            "problem": INSTANCE | {"another": blank()},
+            "tolerance": POSITIVE | NOTHING,
+            "solutions": INSTANCE | {"none in it": [None, None], "one": {"a": 3}, "named by numbers": {1: 2, 3: 4}},
+        },
+    ),
+    method(plan, "costate", {"name": "x"}, name=NAME | {"unknown": "y"}),
+    method(plan, "cost_gradient", {"name": "p"}, name=NAME | {"unknown": "q"}),
+    method(plan, "__getitem__", {"name": "x"}, name=NAME | {"unknown": "y"}),
+    method(
+        plan,
+        "at",
+        {"time": 0.5},
+        time=but(FINITE, "empty") | NOTHING | {"after": 1.1, "before": -0.1, "list of texts": ["0.1"]},
+    ),
+    method(
+        plan,
+        "at_fraction",
+        {"fraction": 0.5},
+        fraction=but(FINITE, "empty") | NOTHING | {"after": 1.1, "before": -0.1, "truths": [True]},
+    ),
+    method(
+        plan,
+        "audit",
+        {},
+        problem=but(INSTANCE, "None") | {"unfinished": blank()},
+        tolerances=MAPPING | {"unknown": {"y": 1.0}, "nan": {"x": NAN}, "word": {"x": "a"}, "negative": {"x": -1.0}},
+        integration=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        constraints=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        stationarity=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        costates=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+    ),
+    method(plan, "save", {"path": "/dev/null/x"}, path={"None": None, "number": 3, "list": [], "object": object()}),
+    Case(
+        "Solution.load",
+        Solution.load,
+        {"path": "x"},
+        {"path": {"None": None, "number": -3, "list": [], "object": object(), "folder": "."}},
+    ),
+]
+CASES = [*DECLARATIONS, *METHODS, *FRONTS]
+
+
+@pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in ("plan.save", "Solution.load")))
+def test_what_is_good_is_taken(case: Case) -> None:
+    case.call(**case.good)
+
+
+@pytest.mark.parametrize(("case", "argument", "value"), panel(CASES))
+def test_bad_input_is_refused_by_name(case: Case, argument: str, value: Any) -> None:
+    assert_refused(case, argument, value)

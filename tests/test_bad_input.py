@@ -1,0 +1,50 @@
+"""The panels of bad input leave out nothing that a user types, and are as large as they say."""
+
+from __future__ import annotations
+
+import models
+import ocp
+import ocp.schedule
+from tests.bad_values import panel
+from tests.models.cts.test_bad_rigs import CASES as RIGS
+from tests.models.machines.test_bad_machines import CASES as MACHINES
+from tests.models.paths.test_bad_paths import CASES as PATHS
+from tests.models.robot.test_bad_robots import CASES as ROBOTS
+from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
+from tests.ocp.builders.test_bad_tasks import CASES as TASKS
+from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
+from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
+
+CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS]
+MADE_BY_THE_PACKAGE = {
+    "Audit",
+    "Certificate",
+    "Dip",
+    "Finding",
+    "Footprint",
+    "Frame",
+    "JointPath",
+    "JointRates",
+    "LineMotion",
+    "Machine",
+    "PathLike",
+    "STANDING_STARTS",
+    "Schedule",
+    "SmoothPath",
+    "Solution",
+}
+"""Results, protocols and constants: their methods are in the panels, but nobody makes them."""
+WITHOUT_ARGUMENTS = {"Anywhere", "paper_example", "reference_tunnel", "standing_example"}
+LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
+"""What a rule says of the zero moment point is looked at by standing_problem, which has them in its panel."""
+
+
+def test_everything_a_user_types_is_in_a_panel() -> None:
+    asked = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
+    faces = {*models.__all__, *ocp.__all__, *ocp.schedule.__all__}
+    errors = {name for name in faces if name.endswith(("Error", "Warning")) or name == "Unreachable"}
+    assert faces - asked - errors - MADE_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - LOOKED_AT_IN_A_PROBLEM == set()
+
+
+def test_the_panels_are_large() -> None:
+    assert len(panel(CASES)) + len(TEXTS) > 7000
