@@ -87,7 +87,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
         along: The plan.
         curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
         cost: A size of the cost, which errors are weighed by.
-        taken: Lumps of an earlier look, taken from the costates reported at the ends of the intervals, for pushes to spread.
+        taken: Lumps of an earlier look, taken from the costates reported at the ends, so that their pushes spread.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
