@@ -80,21 +80,21 @@ class Adjoint:
     ends: Ends
 
 
-def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps: np.ndarray | float = 0.0) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken: np.ndarray | None = None) -> Adjoint:
     """Integrate the costates of a plan backwards, find what pushes them, and look at the ends.
 
     Args:
         along: The plan.
         curved: T H_uu at the points, (M, nu, nu), or None where no path inequality has a control.
         cost: A size of the cost, which errors are weighed by.
-        lumps: Taken from the costates reported at the ends of the intervals, so that pushes spread; see `Adjoint`.
+        taken: Lumps of an earlier look, taken from the costates reported at the ends, so that their pushes spread.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
     first, last = _ends_of_intervals(along)
-    taken = np.broadcast_to(lumps, (n + 1, along.form.nx))
     # what jumps between two intervals is for the pushes at the start of the second to explain
     first = np.vstack([first[:1], last[:-1]])
-    first, last = first - taken[:-1], last - taken[1:]
+    if taken is not None:
+        first, last = first - taken[:-1], last - taken[1:]
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
     near, at_node = (
         np.asarray(part.any(axis=1)) for part in (along.stand.near.reshape(n, q * m), along.node_stand.near)
@@ -131,18 +131,24 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, lumps:
         total,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
         stand.sum(axis=(1, 2)) + single[0] + single[1],
-        _lumps(along, holding, atoms),
+        _lumps(along, holding, inside, atoms if taken is None else None),
         _ends(along, costate, holding, inside, atoms, cost, last[-1]),
     )
 
 
-def _lumps(along: Linearisation, holding: np.ndarray, atoms: np.ndarray) -> np.ndarray:
-    """See `Adjoint`. Half of what pushes at a node alone, and the share of a hat of what pushes all along."""
+def _lumps(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
+    """See `Adjoint`: the share of a node's hat that lies before it, of all that pushes there.
+
+    Of ``atoms`` at the starts of the intervals, where they are not spread yet, that is half.
+    """
     (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
     found = np.zeros((n + 1, nx))
     if not along.nodal:
         return found
-    found[:-1] += np.einsum("km,kmi->ki", atoms[:, 0], along.node_stand_x[:-1, :, :nx]) / 2
+    if atoms is not None:
+        found[:-1] += np.einsum("km,kmi->ki", atoms[:, 0], along.node_stand_x[:-1, :, :nx]) / 2
+    slopes = along.stand_x[:, :, :nx].reshape(n, q, inside.shape[2], nx)
+    found[1:] += np.einsum("j,kjm,kjmi->ki", along.places, inside, slopes)
     pushes = holding[:, nu : nu + along.mixed.size]
     rising = (along.share.reshape(n, q) * along.places).ravel()
     force = np.einsum("k,km,kmi->ki", rising, pushes, along.row_y[:, along.mixed, :nx])

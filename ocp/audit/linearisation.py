@@ -82,8 +82,8 @@ class Linearisation:
         rate, rate_y: T f, (M, nx), and its derivatives, (M, nx, ny).
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
         sizes: Of all named things along the plan.
-        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of the states, in this order. Shape
-            (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
+        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of states,
+            in this order. Shape (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
             derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
         low, high: Limits of the controls at the points. Shape (M, nu).
@@ -192,7 +192,7 @@ class Linearisation:
         of its derivatives (Hartl, Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of
         the last derivative.
         """
-        form, nx, nu = self.form, self.form.nx, self.form.nu
+        form, nu = self.form, self.form.nu
         equal = np.flatnonzero(form.path.equality[self.still])
         rows = ca.vertcat(*[form.path.expression[int(i)] for i in self.still[equal]])
         m, count = len(self.s), len(equal)

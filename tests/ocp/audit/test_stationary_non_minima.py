@@ -57,7 +57,7 @@ def test_a_plan_past_its_conjugate_point_does_not_pass(
 
 def test_no_agreement_of_methods_certifies_a_plan_past_its_conjugate_point() -> None:
     problem = to_rest(3.4)
-    plans = [solve(problem, METHODS[name]) for name in ("radau", "legendre", "linear")]
+    plans = [solve(problem, METHODS[name], check=False) for name in ("radau", "legendre", "linear")]
     assert not certificate(problem, plans).passed
 
 
@@ -310,6 +310,10 @@ def test_of_random_indefinite_problems_no_non_minimum_passes_and_the_minima_do()
         if abs(least) < 0.02:
             continue  # too near to the conjugate point to be told by held controls
         counts[least > 0] += 1
-        plan: Any = solve(problem, [METHODS["radau"], METHODS["legendre"], METHODS["linear"]][k % 3])
-        (holds if least > 0 else is_no_minimum)(plan.audit())
+        name = ("radau", "legendre", "linear")[k % 3]
+        plan = solve(problem, METHODS[name], check=False)
+        if least > 0:
+            holds(plan.audit())
+        else:  # the solver may see for itself that it is none
+            assert not plan.audit().passed
     assert min(counts.values()) >= 4
