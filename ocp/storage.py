@@ -175,7 +175,9 @@ def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
     shape, by_columns, kind = read_header(stream)
     if kind.kind not in "fiu" or kind.itemsize > 8:
-        raise ValueError(f"{member.filename!r} holds {kind}, no real numbers")
+        part = name_of(member)
+        words = f"{archive.filename} is not a saved solution: {part!r} holds {kind}, no real numbers"
+        raise ProblemError(words, name=part, value=str(kind))
     count, left = 1, len(data) - stream.tell()
     for length in shape:
         count *= length
