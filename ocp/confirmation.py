@@ -14,7 +14,7 @@ from ocp.audit.certificate import Certificate
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, checked_flag
 from ocp.methods import prepare
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -47,9 +47,9 @@ def certificate(
         ProblemError: Fewer than two solutions, one of another problem, or solved at other parameters; no direct one for
             a second solver.
     """
-    if not second_solver:
+    if not checked_flag("certificate: second_solver", second_solver):
         return comparison.certificate(problem, solutions, tolerance=tolerance)
-    named = dict(solutions) if isinstance(solutions, Mapping) else comparison.name_by_method(solutions)
+    named = comparison.checked_solutions(solutions)
     direct = [name for name, solution in named.items() if solution.method["type"] in METHODS]
     if not direct:
         words = "a second solver confirms plans of Collocation(...) and MultipleShooting(...); none is given"

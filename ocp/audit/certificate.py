@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -113,11 +114,7 @@ def certificate(
         ProblemError: Fewer than two solutions, one of another problem, or solved at other parameters.
     """
     checked_positive("certificate: tolerance", tolerance)
-    if isinstance(solutions, Mapping):
-        named = checked_mapping("certificate: solutions", solutions)
-        checked_each("certificate: solutions", named.values(), Solution)
-    else:
-        named = name_by_method(checked_each("certificate: solutions", solutions, Solution))
+    named = checked_solutions(solutions)
     if len(named) < 2:
         words = f"a certificate compares at least two solutions, not {len(named)}"
         raise ProblemError(words, name="solutions", value=len(named), limit=2)
@@ -156,6 +153,15 @@ def certificate(
             )
         )
     return Certificate(problem.name, reference, tuple(comparisons), tolerance, audits)
+
+
+def checked_solutions(solutions: Any) -> dict[str, Solution]:
+    """Solutions by name, those of a sequence by their methods; ProblemError where something else is among them."""
+    if not isinstance(solutions, Mapping):
+        return name_by_method(checked_each("certificate: solutions", solutions, Solution))
+    named = checked_mapping("certificate: solutions", solutions)
+    checked_each("certificate: solutions", named.values(), Solution)
+    return named
 
 
 def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_count, checked_flag, checked_text, unknown_name
+from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
     check_finite,
@@ -340,7 +340,8 @@ class Problem:
                 integral of ``way`` goes along the plan. None: to what the expression is made of.
             unit: Of the expression, or of its integral.
         """
-        checked_flag(f"watch {name!r}: integral", integral)
+        if not isinstance(integral, bool):
+            raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
         known = list(self.declared.at_start.values())
         self._constrain("watch", name, expression, lower, upper, unit, known)
         found = self.declared.watch.pop(name)

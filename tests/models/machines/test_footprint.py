@@ -126,7 +126,7 @@ def test_unknown_links_and_impossible_depths_are_named() -> None:
     robot = Robot.from_urdf(text)
     with pytest.raises(ModelError, match=r"link 'bace' does not exist; did you mean 'base'"):
         footprint(robot, links=["bace"])
-    with pytest.raises(ModelError, match=r"depth -1 m"):
+    with pytest.raises(ModelError, match=r"depth -1.0 m"):
         footprint(robot, depth=-1)
 
 

@@ -158,6 +158,17 @@ DECLARATIONS = [
         )
         for kind in ("path", "start", "end")
     ],
+    about_blank(
+        "watch",
+        {"name": "y", "expression": "the state", "lower": 0.0},
+        name=NAME,
+        expression=EXPRESSION,
+        lower=BOUND | NOTHING | {"inf": INF},
+        upper=BOUND | {"minus inf": -INF, "below": -1.0},
+        integral=FLAG,
+        way=but(EXPRESSION, "None") | {"two": [1.0, 2.0]},
+        unit=UNIT,
+    ),
     about_blank("minimize", {"running": "the state"}, running=EXPRESSION | {"two": [1.0, 2.0]}, terminal=EXPRESSION),
 ]
 
@@ -250,8 +261,18 @@ def on_line(call: Any, good: dict[str, Any], /, **bad: Bad) -> Case:
 
 
 FRONTS = [
-    on_line(prepare, {"method": PLAN}, **FRONT, method=INSTANCE, compiled=FLAG),
-    on_line(solve, SOLVED, **FRONT, method=INSTANCE, parameters=PARAMETERS, guess=START, check=FLAG),
+    on_line(prepare, {"method": PLAN}, **FRONT, method=INSTANCE, compiled=FLAG, scaling=FLAG),
+    on_line(
+        solve,
+        SOLVED,
+        **FRONT,
+        method=INSTANCE,
+        parameters=PARAMETERS,
+        guess=START,
+        check=FLAG,
+        scaling=FLAG,
+        time_limit=POSITIVE,
+    ),
     on_line(
         refine,
         SOLVED,
@@ -261,6 +282,8 @@ FRONTS = [
         guess=START,
         tolerance=POSITIVE | NOTHING,
         max_intervals=COUNT | NOTHING | {"few": 2},
+        limits=MAPPING | {"unknown": {"no_such": 1.0}, "nan": {"lost": NAN}, "negative": {"lost": -1.0}},
+        breaks={"number": 3, "word": "a", "outside": [9.0], "nan": [NAN], "texts": ["0.5"], "None": None},
     ),
     on_line(
         tighten,
@@ -284,6 +307,16 @@ FRONTS = [
         {
             "problem": INSTANCE | {"another": blank()},
             "tolerance": POSITIVE | NOTHING,
+            "solutions": INSTANCE | {"none in it": [None, None], "one": {"a": 3}, "named by numbers": {1: 2, 3: 4}},
+            "second_solver": FLAG,
+        },
+    ),
+    Case(
+        "certificate by a second solver",
+        lambda **given: certificate(**{"problem": declared(), "solutions": [plan()], "second_solver": True, **given}),
+        {},
+        {
+            "problem": INSTANCE | {"another": blank()},
             "solutions": INSTANCE | {"none in it": [None, None], "one": {"a": 3}, "named by numbers": {1: 2, 3: 4}},
         },
     ),
@@ -310,8 +343,10 @@ FRONTS = [
         tolerances=MAPPING | {"unknown": {"y": 1.0}, "nan": {"x": NAN}, "word": {"x": "a"}, "negative": {"x": -1.0}},
         integration=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         constraints=but(NONNEGATIVE, "inf", "huge") | NOTHING,
-        stationarity=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        lost=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         costates=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        stationarity=but(NONNEGATIVE, "inf", "huge"),  # None: it is told, and judged by no limit
+        drift=but(NONNEGATIVE, "inf", "huge"),
     ),
     method(plan, "save", {"path": "/dev/null/x"}, path={"None": None, "number": 3, "list": [], "object": object()}),
     Case(
