@@ -142,7 +142,9 @@ class AccessoryProblem:
         normals *= self.unit
         reach = np.abs(normals).max(axis=2)
 
-        held = np.append(along.sizes.control, along.sizes.path[along.mixed])
+        # a control that rests on its limit all along is near it by its own size, for it has no other
+        at_rest = np.abs(along.u).max(axis=0, initial=0.0)
+        held = np.append(np.maximum(along.sizes.control, at_rest), along.sizes.path[along.mixed])
         rests = np.append(along.sizes.state, along.sizes.path[along.still])
 
         def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
