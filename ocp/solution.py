@@ -267,7 +267,8 @@ class Solution:
             }
             past = head.pop("refinement", None)
             if past is not None:
-                rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in past["errors"].items()}
+                errors = past["errors"] if isinstance(past["errors"], dict) else {"integration": past["errors"]}
+                rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in errors.items()}
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
             fields["drawn_in"] = arrays.pop("drawn_in", None)
             fields |= {name: arrays.pop(name) for name in PLAIN}
@@ -277,9 +278,9 @@ class Solution:
                 fields["problem"] = Problem.restored({**problem, "function": function})
             elif version == 1:
                 fields["problem_lost"] = "the file is of the first version, which holds none"
-            if arrays:
-                words = f"{path} holds {', '.join(arrays)}, which no plan has"
-                raise ProblemError(words, name=next(iter(arrays)), value=str(path))
+            parts = [name for name in arrays if "/" in name]  # what else stands in the file is somebody else's
+            if parts:
+                raise ProblemError(f"{path} holds {', '.join(parts)}, which no plan has", name=parts[0], value=str(path))
             solution = cls(**head, **fields)
             check_structure(solution)
             check_finite(solution)

@@ -284,6 +284,9 @@ class Prepared:
         if self._scaling:
             sizes = sizes_along(self._pattern, x0, told, bounds, p)
             scales = fitting_scales(self._pattern, sizes, x0, p)
+            if getattr(self.method, "integrator", "") == "cvodes":
+                # its tolerances are absolute: what it integrates backwards is not made larger
+                scales = dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         relaxed = self._known.relaxed(arguments)
         own = scales.inside(relaxed)
         try:

@@ -478,7 +478,7 @@ WRONG: list[tuple[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]]] 
     ("problem", lambda h, a: h["problem"].pop("declared")),
     ("problem", lambda h, a: h["problem"].update(name="another")),
     ("problem", lambda h, a: a.update(problem=a["problem"][:-3])),
-    ("extra", lambda h, a: a.update(extra=np.zeros(3))),
+    ("states/z", lambda h, a: a.update({"states/z": np.zeros(3)})),
     ("states/y", lambda h, a: a.update({"states/y": np.zeros(3)})),
 ]
 
