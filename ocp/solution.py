@@ -280,7 +280,8 @@ class Solution:
                 fields["problem_lost"] = "the file is of the first version, which holds none"
             parts = [name for name in arrays if "/" in name]  # what else stands in the file is somebody else's
             if parts:
-                raise ProblemError(f"{path} holds {', '.join(parts)}, which no plan has", name=parts[0], value=str(path))
+                words = f"{path} holds {', '.join(parts)}, which no plan has"
+                raise ProblemError(words, name=parts[0], value=str(path))
             solution = cls(**head, **fields)
             check_structure(solution)
             check_finite(solution)
@@ -413,6 +414,9 @@ def check_structure(solution: Solution) -> None:
             raise refuse(name, f"is no real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}")
         return array
 
+    for pool in POOLS:
+        if not isinstance(getattr(solution, pool), Mapping):
+            raise refuse(pool, f"are no dictionary by name, but {type(getattr(solution, pool)).__name__}")
     if set(solution.costates) != set(solution.states):
         words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
         raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
@@ -448,7 +452,8 @@ def check_structure(solution: Solution) -> None:
         values = real(f"{interpolant}.values", curve.values, 3)
         if breaks.size < 2 or not (np.diff(breaks) > 0).all() or abs(breaks[0]) > 1e-12 or abs(breaks[-1] - 1) > 1e-12:
             raise refuse(f"{interpolant}.breaks", "do not increase from 0 to 1")
-        if not nodes.size or not (np.diff(nodes) > 0).all() or nodes[0] < -1e-12 or nodes[-1] > 1 + 1e-12:
+        rising = nodes.size > 0 and np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()
+        if not rising or nodes[0] < -1e-12 or nodes[-1] > 1 + 1e-12:
             raise refuse(f"{interpolant}.nodes", "do not increase within 0 to 1")
         if values.shape != (breaks.size - 1, nodes.size, columns):
             shape = (breaks.size - 1, nodes.size, columns)

@@ -25,6 +25,7 @@ from ocp.solution import Solution, check_belongs, check_structure, in_order_of, 
 
 __all__ = ["Audit", "Finding", "audit"]
 
+COSTATES = 1e-2  # share of the cost that errors of costates may be
 HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
@@ -159,7 +160,7 @@ def audit(
     integration: float = 1e-3,
     constraints: float = 1e-3,
     lost: float = 1e-3,
-    costates: float = 1e-2,
+    costates: float | None = None,
     stationarity: float | None = None,
     drift: float | None = None,
     tolerances: Mapping[str, float] | None = None,
@@ -183,8 +184,8 @@ def audit(
             error of the cost.
         constraints: Largest violation of a bound or constraint, as a share of its size.
         lost: What of its cost the plan may lose to the extremal beside it, as a share.
-        costates: Largest error of the costates against their own equation, summed over the plan, and of the conditions
-            at the ends, as a share of the cost.
+        costates: Largest error of the costates against their own equation, over the whole plan, and of the conditions
+            at the ends, as a share of the cost. None: 1e-2, or the root of the share that the plan loses.
         stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts; None: it is told, and judged
             by the cost that it loses.
         drift: Largest change of the Hamiltonian where time does not enter, relative to its parts; None: it is told.
@@ -195,8 +196,8 @@ def audit(
             unknown.
     """
     limits = checked_mapping("audit: tolerances", tolerances)
-    named = {"integration": integration, "constraints": constraints, "lost": lost, "costates": costates, **limits}
-    told = {"stationarity": stationarity, "drift": drift}
+    named = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
+    told = {"costates": costates, "stationarity": stationarity, "drift": drift}
     for name, limit in {**named, **{k: v for k, v in told.items() if v is not None}}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
@@ -261,11 +262,22 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 
 
 def optimality_findings(
-    form: Formulation, found: Optimality, lost: float, costates: float, stationarity: float | None, drift: float | None
+    form: Formulation,
+    found: Optimality,
+    lost: float,
+    costates: float | None,
+    stationarity: float | None,
+    drift: float | None,
 ) -> list[Finding]:
-    """First and second order."""
+    """First and second order.
+
+    Errors of the costates cost by their square: a transcription that loses a share of the cost knows its costates to
+    the root of it, which is no fault of its own. Curvature says something at an extremal alone.
+    """
     cost, errors = found.cost_size, found.error_size
     share = float(found.lost.sum()) / cost
+    if costates is None:
+        costates = max(COSTATES, float(np.sqrt(share))) if np.isfinite(share) and share > 0 else COSTATES
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", found.adjoint.total / errors, costates),
@@ -277,7 +289,7 @@ def optimality_findings(
     second = found.curvature
     note = f"not decided: {second.flat}" if second.upwards is None else f"least {second.least:.3g} of the largest"
     downwards = 0.0 if second.upwards is not False else max(-second.least, FLAT)
-    limit = None if second.upwards is None else 0.0
+    limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
     if form.nu:
         rows.append(worst("stationarity, relative", found.stationarity, found.t, stationarity))

@@ -38,6 +38,8 @@ __all__ = [
 
 USUAL = 1e3
 """Sizes from 1/USUAL to USUAL are left alone: the tolerances of 1e-10 leave seven digits there."""
+ROUNDING = 1e-13
+"""Of the largest size: what is smaller is the rounding of a zero, such as the sine of pi in a guess."""
 BAD = 1e6
 """From which factor on between sizes, or between a state and what drives it, a program counts as badly scaled."""
 WEAK = 1e-3
@@ -261,8 +263,8 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """The nearest powers of two of sizes out of the usual; 1 of the others."""
-    odd = (sizes > 0) & ((sizes < 1 / USUAL) | (sizes > USUAL))
+    """The nearest powers of two of sizes out of the usual; 1 of the others and of rounding beside the largest."""
+    odd = (sizes > ROUNDING * sizes.max(initial=0.0)) & ((sizes < 1 / USUAL) | (sizes > USUAL))
     return np.where(odd, np.exp2(np.round(np.log2(np.where(odd, sizes, 1.0)))), 1.0)
 
 

@@ -48,7 +48,7 @@ LOAD = 1.0  # kg
 PUSH = (0.0, -60.0, 0.0)  # of the hand on what resists, N
 MARGIN = 0.01  # m
 FRICTION = 0.7
-METHOD = Collocation(16, degree=3, scheme="legendre")
+METHOD = Collocation(24, degree=3, scheme="legendre")
 
 
 def anymal() -> tuple[Standing, Footprint]:

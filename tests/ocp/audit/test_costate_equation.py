@@ -262,7 +262,7 @@ def test_costates_of_the_indirect_method_are_taken_to_task_too(name: str) -> Non
     assert audit[ENDS].value < 1e-7
     size = np.max(np.abs(plan.costate_interpolant.values))
     bent = tampered(plan, lambda s, lam: lam + 0.1 * size * np.sin(np.pi * s))
-    assert EQUATION in failed(bent.audit())
+    assert EQUATION in failed(bent.audit(costates=1e-2))
     assert not bent.audit().passed
 
 

@@ -15,6 +15,8 @@ from ocp import Collocation, MultipleShooting, Problem, Solution, minimum_veloci
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum, of
 from tests.ocp.problems import Array, double_integrator
 
+pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
+
 METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "legendre": Collocation(20, scheme="legendre"),

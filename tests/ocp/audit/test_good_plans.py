@@ -26,6 +26,8 @@ from tests.ocp.builders.standing_tasks import table_plan
 from tests.ocp.problems import double_integrator
 from tests.ocp.test_tightening import walled
 
+pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
+
 METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "radau-held": Collocation(80, control="held"),

@@ -12,6 +12,8 @@ from models import FixedBase, Joint, Link, Robot
 from ocp import Collocation, Indirect, MultipleShooting, Problem, certificate, solve
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum
 
+pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
+
 METHODS: dict[str, Any] = {
     "radau": Collocation(20),
     "radau-held": Collocation(40, control="held"),

@@ -29,6 +29,8 @@ from ocp import (
 from tests.ocp.audit.drawn import does_not_do_what_is_asked, drawn, holds, is_no_minimum, of
 from tests.ocp.problems import Array, double_integrator
 
+pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
+
 METHODS = {
     "radau": Collocation(20),
     "legendre": Collocation(20, scheme="legendre"),
