@@ -18,7 +18,7 @@ from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
 
-__all__ = ["AccessoryProblem", "dependent", "end_conditions", "rows_of_length_one", "unseen"]
+__all__ = ["RANK", "AccessoryProblem", "dependent", "end_conditions", "rows_of_length_one", "unseen"]
 
 RANK = 1e-9
 """Size of a singular value, relative to the largest, from which on constraints count as dependent."""
@@ -240,20 +240,20 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     return end_hessian * scale, end_rows * z_unit, start_hessian * scale, np.vstack([start_rows * z_unit, *extra])
 
 
-def dependent(rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+def dependent(rows: np.ndarray, rank: float = RANK) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
     """Rank of rows (m, n) each of length 1 or less, and their singular vectors and values: left, values, right."""
     left, sizes, right = np.linalg.svd(rows)
-    return int(np.sum(sizes > RANK)), left, sizes, right
+    return int(np.sum(sizes > rank)), left, sizes, right
 
 
-def unseen(rows: np.ndarray) -> np.ndarray:
+def unseen(rows: np.ndarray, rank: float = RANK) -> np.ndarray:
     """Orthonormal directions (n, k) that rows (m, n) do not see."""
-    rank, _, _, right = dependent(rows_of_length_one(rows))
-    return np.asarray(right[rank:].T)
+    count, _, _, right = dependent(rows_of_length_one(rows, rank), rank)
+    return np.asarray(right[count:].T)
 
 
-def rows_of_length_one(rows: np.ndarray) -> np.ndarray:
+def rows_of_length_one(rows: np.ndarray, rank: float = RANK) -> np.ndarray:
     """The same rows, each of length 1, without those that say nothing."""
     sizes = np.linalg.norm(rows, axis=1)
-    keep = sizes > RANK * max(1.0, float(sizes.max(initial=0.0)))
+    keep = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
     return np.asarray(rows[keep] / sizes[keep, None])

@@ -14,12 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ocp.audit.accessory import AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
+from ocp.audit.accessory import RANK, AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
 from ocp.audit.principle import FLAT
 from ocp.problem.formulation import Formulation
 
 __all__ = ["Curvature", "curvature"]
 
+NEARLY = "constraints are nearly dependent"
+TIED = 1e-4
+"""Size of a singular value below which conditions may be implied by others but for the error of a plan."""
 SLIP = 1e-6
 """What a variation that lowers the cost may miss its constraints by, relative to its size."""
 
@@ -70,6 +73,11 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             why = "the cost curves upwards only because of limits that are touched without a push"
             return Curvature(inside.least, inside.time, why, None, along.t)
         found = inside
+    if found.flat.startswith(NEARLY):
+        # without what is left of conditions that others imply there is more to vary: upwards all the more
+        wider = _sweep(accessory, weak=False, tied=TIED)
+        if wider.least > FLAT and not wider.flat:
+            found = wider
     least, time, flat, direction = found
     return Curvature(least, time, flat, direction, along.t)
 
@@ -83,11 +91,12 @@ class _Swept(NamedTuple):
     direction: tuple[np.ndarray, np.ndarray] | None
 
 
-def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
+def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swept:
     """The backward sweep over all stages.
 
     Args:
         weak: Whether what is touched without a push is held too.
+        tied: Size of a singular value below which constraints count as dependent, and the rest of them is dropped.
     """
     along = accessory.along
     n, q = along.shape
@@ -134,11 +143,11 @@ def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
             own += [accessory.weak[k * q + j] @ whole[k, j] for j in range(q)]
         for i in np.flatnonzero(accessory.moved[k]):  # a switch moves: one variation, of the mean
             own.append(whole[k, 1:, nz + i] - whole[k, :1, nz + i])
-        stacked = rows_of_length_one(np.vstack([*own, rows @ step[k]]))
-        rank, left, sizes, right = dependent(stacked[:, nz:])
+        stacked = rows_of_length_one(np.vstack([*own, rows @ step[k]]), tied)
+        rank, left, sizes, right = dependent(stacked[:, nz:], tied)
         basis = right[rank:].T
         follow = -(right[:rank].T / sizes[:rank]) @ left[:, :rank].T @ stacked[:, :nz]
-        rows = rows_of_length_one(left[:, rank:].T @ stacked[:, :nz])
+        rows = rows_of_length_one(left[:, rank:].T @ stacked[:, :nz], tied)
         lift = np.vstack([np.eye(nz), follow])
         free = basis.T @ joined[nz:, nz:] @ basis
         mixed = basis.T @ joined[nz:] @ lift
@@ -166,7 +175,7 @@ def _sweep(accessory: AccessoryProblem, weak: bool) -> _Swept:
             cost = cost - mixed.T @ inverse @ mixed
         cost = (cost + cost.T) / 2
         gains.append(gain)
-    basis = unseen(np.vstack([rows, start_rows]))
+    basis = unseen(np.vstack([rows, start_rows]), tied)
     if basis.shape[1]:
         values, vectors = np.linalg.eigh(basis.T @ (cost + start_cost) @ basis)
         if values[0] / scale < least:
@@ -238,7 +247,7 @@ def _confirmed(least: float, at: float | None, found: _Variation, scale: float) 
     """
     if found.curvature < -FLAT * scale and found.slip < SLIP:
         return _Swept(least, at, "", (found.controls, found.states))
-    return _Swept(least, at, f"constraints are nearly dependent at {at or 0.0:.4g} s", None)
+    return _Swept(least, at, f"{NEARLY} at {at or 0.0:.4g} s", None)
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:

@@ -46,10 +46,10 @@ def chain() -> FixedBase:
 
 
 def audited(machine: Machine, method: Collocation, /, **asked: Any) -> Solution:
-    """The solution of `minimum_velocity_problem`, which passes its audit."""
+    """The solution of `minimum_velocity_problem`, in which its audit finds no fault."""
     solution = solve(minimum_velocity_problem(machine, **asked), method)
     audit = solution.audit()
-    assert audit.passed, str(audit)
+    assert not audit.failures, str(audit)
     return solution
 
 
@@ -290,15 +290,14 @@ the intervals of each attempt; which one is the plan."""
 
 
 @pytest.mark.parametrize("undecided", ["a singular arc from 1 to 2 s", "the solver says Solved_To_Acceptable_Level"])
-def test_a_plan_of_which_it_is_not_decided_whether_it_is_a_minimum_does_not_stand(
+def test_a_plan_of_which_it_is_not_decided_whether_it_is_a_minimum_stands(
     undecided: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """No fault is found in it, and its audit says what is not decided."""
     audit = SimpleNamespace(passed=False, failures=(), undecided=undecided, controls={})
     plan = SimpleNamespace(success=True, states={}, cost=CHEAP, audit=lambda: audit)
     monkeypatch.setattr(redundancy, "solve", lambda *_, **__: plan)
-    with pytest.raises(SolveError, match=f"it is not decided whether the plan is a minimum: {undecided}") as caught:
-        plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED)
-    assert caught.value.name == "audit"
+    assert plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED) is plan
 
 
 @pytest.mark.parametrize(("script", "changes", "meshes", "best"), PLAYED)

@@ -58,7 +58,8 @@ def table_request(**changes: Any) -> Solution:
         (IN_RANGE, {}, -0.7092, {"intervals": 20, "control": "points"}),
         (Pinned(), {}, -0.1166, {"intervals": 20, "control": "points"}),
         (IndexAtLeast(0.9), {}, -0.3814, {"intervals": 20, "control": "points"}),  # tightened
-        (IN_RANGE, {"limits": replace(LIMITS, velocity=0.7)}, -0.6617, {"intervals": 40, "control": "points"}),
+        # tightened
+        (IN_RANGE, {"limits": replace(LIMITS, velocity=0.7)}, -0.6615, {"intervals": 20, "control": "points"}),
         (IN_RANGE, {"control": "jerk"}, -0.7026, {"intervals": 20, "control": "points"}),
     ],
     ids=["in_range", "pinned", "index", "slow", "jerk"],

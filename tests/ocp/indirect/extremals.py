@@ -13,7 +13,7 @@ from ocp import Collocation, Problem
 from tests.ocp.problems import plant
 
 FINE = Collocation(60, 4, "legendre")
-KINKED = Collocation(240)
+KINKED = Collocation(320)
 HELD = Collocation(240, control="held")
 
 
