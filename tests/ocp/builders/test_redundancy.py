@@ -297,7 +297,8 @@ def test_a_plan_of_which_it_is_not_decided_whether_it_is_a_minimum_stands(
     audit = SimpleNamespace(passed=False, failures=(), undecided=undecided, controls={})
     plan = SimpleNamespace(success=True, states={}, cost=CHEAP, audit=lambda: audit)
     monkeypatch.setattr(redundancy, "solve", lambda *_, **__: plan)
-    assert plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED) is plan
+    found: Any = plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED)
+    assert found is plan
 
 
 @pytest.mark.parametrize(("script", "changes", "meshes", "best"), PLAYED)
