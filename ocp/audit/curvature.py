@@ -147,7 +147,9 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
         rank, left, sizes, right = dependent(stacked[:, nz:], tied)
         basis = right[rank:].T
         follow = -(right[:rank].T / sizes[:rank]) @ left[:, :rank].T @ stacked[:, :nz]
-        rows = rows_of_length_one(left[:, rank:].T @ stacked[:, :nz], tied)
+        # what no control sees is for the stages before; what some see by less than counts is dropped, not passed on
+        unheld = left[:, max(rank, int(np.sum(sizes > RANK))) :]
+        rows = rows_of_length_one(unheld.T @ stacked[:, :nz], tied)
         lift = np.vstack([np.eye(nz), follow])
         free = basis.T @ joined[nz:, nz:] @ basis
         mixed = basis.T @ joined[nz:] @ lift

@@ -112,7 +112,8 @@ def _told(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> fl
 def _curved(along: Linearisation) -> np.ndarray | None:
     """T H_uu at the points but for its path constraints, (M, nu, nu), where what pushes at single points needs it."""
     form = along.form
-    single = along.nodal and (along.mixed.size > 0 or along.node_stand.near.any())
+    near = along.stand.near.any() or along.node_stand.near.any()
+    single = along.nodal and (along.mixed.size > 0 or near)
     if form.path.equality[along.mixed].all() and not single:
         return None
     lam = form.sym("lam", form.nx)
