@@ -18,10 +18,8 @@ from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
 
-__all__ = ["RANK", "AccessoryProblem", "dependent", "end_conditions", "rows_of_length_one", "unseen"]
+__all__ = ["AccessoryProblem", "end_conditions"]
 
-RANK = 1e-9
-"""Size of a singular value, relative to the largest, from which on constraints count as dependent."""
 NOISE = 1e-14
 """Curvature along a control of its size, of the largest, below which it is rounding."""
 AT_BOUND = 1e-5
@@ -38,9 +36,9 @@ class AccessoryProblem:
         rate: Jacobian of dz/ds in (z, u) at the M points. Shape (M, nz, nz + nu).
         hessian: Of T H in (z, u). Shape (M, nz + nu, nz + nu).
         curved: Of T H in u alone, in their own units. Shape (M, nu, nu).
-        rows: Constraints that hold the variations, (r, nz + nu) for every point: equalities and those that push.
-        node_rows: Those of the states at the ends of the intervals, (r, nz) each.
-        weak: Those that are active and do not push, (r', nz + nu) for every point.
+        normals: Of everything that limits the variations at the points. Shape (M, l, nz + nu). strong: Which of them
+            hold: equalities, and those that push. weak: Which are active and do not push. Both (M, l), bool.
+        node_normals, node_strong: Those of the states at the ends of the intervals, (N + 1, l', nz), (N + 1, l').
         moved: Controls that switch in an interval, (N, nu) bool. switching: What moving costs there, per squared
             area, in their own units. Shape (N, nu).
         unit: Of (z, u), in which the sweep is well conditioned. Shape (nz + nu,).
@@ -69,7 +67,7 @@ class AccessoryProblem:
     def _units(self) -> None:
         """Units in which a sweep is well conditioned: they judge nothing.
 
-        States and horizon by their sizes. Controls so that the Hamiltonian curves alike along each, however little it
+        Horizon and states by their sizes. Controls so that the Hamiltonian curves alike along each, however little it
         moves; by their sizes where it does not curve.
         """
         sizes, horizon = self.along.sizes, [self.along.solution.horizon] if self.free else []
@@ -78,7 +76,8 @@ class AccessoryProblem:
         largest = float(weight.max(initial=0.0))
         curves = weight > NOISE * largest
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, bend, 1.0)), sizes.control)
-        self.unit = np.concatenate([sizes.state, horizon, *([sizes.state] if self.tied else []), self.range])
+        state = self.along.state_size
+        self.unit = np.concatenate([state, horizon, *([state] if self.tied else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
         """Entries of y = (x, T, u), and where each stands in (z, u)."""
@@ -118,6 +117,13 @@ class AccessoryProblem:
         return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
 
     @property
+    def start_slope(self) -> np.ndarray:
+        """Slope of the cost in start and horizon, in scaled z. Shape (nz,)."""
+        into, nx = self.adjoint.ends.slope, self.nx
+        slope = np.concatenate([into[:nx], into[nx:] if self.free else [], np.zeros(nx * self.tied)])
+        return np.asarray(slope * self.unit[: self.nz])
+
+    @property
     def spread(self) -> float:
         """What the cost curves by over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
@@ -143,8 +149,8 @@ class AccessoryProblem:
         reach = np.abs(normals).max(axis=2)
 
         # a control that rests on its limit all along is near it by its own size, for it has no other
-        at_rest = np.abs(along.u).max(axis=0, initial=0.0)
-        held = np.append(np.maximum(along.sizes.control, at_rest), along.sizes.path[along.mixed])
+        largest = np.abs(along.u).max(axis=0, initial=0.0)
+        held = np.append(np.maximum(along.sizes.control, largest), along.sizes.path[along.mixed])
         rests = np.append(along.sizes.state, along.sizes.path[along.still])
 
         def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
@@ -156,21 +162,19 @@ class AccessoryProblem:
 
         strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], 0, held)
         self.fixed = strong[:, :nu] & touched[:, :nu]
-        at_rest, resting = pushing(along.stand, self.adjoint.standing, nh, rests)
-        strong = np.hstack([strong & touched | along.hold.equal[:nh], at_rest | along.stand.equal])
+        pushed, resting = pushing(along.stand, self.adjoint.standing, nh, rests)
+        strong = np.hstack([strong & touched | along.hold.equal[:nh], pushed | along.stand.equal])
         touched = np.hstack([touched, resting])
         n, q = along.shape
-        self.rows = [normals[k][strong[k]] for k in range(m)]
+        self.normals, self.strong, self.weak = normals, strong, touched & ~strong
         # on an arc the points alone leave the ends of the intervals free to go to and fro
-        pushed = (at_rest | along.stand.equal).reshape(n, q, -1)
-        arc = np.concatenate([pushed[:1, 0], pushed[:-1, -1] & pushed[1:, 0], pushed[-1:, -1]])
+        standing = (pushed | along.stand.equal).reshape(n, q, -1)
+        arc = np.concatenate([standing[:1, 0], standing[:-1, -1] & standing[1:, 0], standing[-1:, -1]])
         node = np.zeros((n + 1, len(along.stand.equal), self.nz))
         node[:, :, : self.nx] = along.node_stand_x[:, :, :-1]
         if self.free:
             node[:, :, self.nx] = along.node_stand_x[:, :, -1]
-        node *= self.unit[: self.nz]
-        self.node_rows = [node[k][arc[k] & along.node_stand.near[k]] for k in range(n + 1)]
-        self.weak = [normals[k][touched[k] & ~strong[k]] for k in range(m)]
+        self.node_normals, self.node_strong = node * self.unit[: self.nz], arc & along.node_stand.near
 
     def _switch(self) -> None:
         """Controls that go from one limit to the other within an interval, and what moving the switch costs."""
@@ -215,9 +219,10 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     at_end = (np.abs(ends.end) > FLAT * force) | form.end.equality
     at_start = (np.abs(ends.start) > FLAT * force) | form.start.equality
     fixed = {k: low[places[k]] == high[places[k]] for k in ("terminal", "initial")}
-    unit = accessory.unit[:nx]
     for k, x in (("terminal", x1), ("initial", x0)):
-        rests = (x <= low[places[k]] + AT_BOUND * unit) | (x >= high[places[k]] - AT_BOUND * unit)
+        rests = (x <= low[places[k]] + AT_BOUND * along.sizes.state) | (
+            x >= high[places[k]] - AT_BOUND * along.sizes.state
+        )
         fixed[k] = fixed[k] | rests
 
     # rows and columns of (x, T, x0) that z has; at the start x is the x0 of the conditions
@@ -238,22 +243,3 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
             extra.append(eye[nx : nx + 1])
     scale = z_unit * z_unit[:, None]
     return end_hessian * scale, end_rows * z_unit, start_hessian * scale, np.vstack([start_rows * z_unit, *extra])
-
-
-def dependent(rows: np.ndarray, rank: float = RANK) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Rank of rows (m, n) each of length 1 or less, and their singular vectors and values: left, values, right."""
-    left, sizes, right = np.linalg.svd(rows)
-    return int(np.sum(sizes > rank)), left, sizes, right
-
-
-def unseen(rows: np.ndarray, rank: float = RANK) -> np.ndarray:
-    """Orthonormal directions (n, k) that rows (m, n) do not see."""
-    count, _, _, right = dependent(rows_of_length_one(rows, rank), rank)
-    return np.asarray(right[count:].T)
-
-
-def rows_of_length_one(rows: np.ndarray, rank: float = RANK) -> np.ndarray:
-    """The same rows, each of length 1, without those that say nothing."""
-    sizes = np.linalg.norm(rows, axis=1)
-    keep = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
-    return np.asarray(rows[keep] / sizes[keep, None])

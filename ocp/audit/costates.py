@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
@@ -37,12 +36,14 @@ class Ends(NamedTuple):
     Attributes:
         transversality: What of the costates at the ends no multiplier of an end condition explains, in units of cost.
         horizon: What of the derivative in a free horizon none explains, times the horizon, in units of cost.
+        slope: What none explains of the derivative of the cost in the start and the horizon. Shape (nx + 1,).
         charge: What the multipliers win over the gaps to their limits, in units of cost.
         end, start: Multipliers of the end and start conditions. Shapes (m,).
     """
 
     transversality: float
     horizon: float
+    slope: np.ndarray
     charge: float
     end: np.ndarray
     start: np.ndarray
@@ -55,7 +56,7 @@ class Adjoint:
     Attributes:
         t: Ends of the intervals, s. Shape (N + 1,).
         costate: At the Gauss points, integrated backwards in every interval from the plan's own at its end. (N q, nx).
-        holding: Multipliers of the limits of the controls at the Gauss points, per unit of s. Shape (N q, nu + r).
+        holding: Multipliers of the limits of the controls at the Gauss points, per unit of s. Shape (N q, nu + r + a).
         standing: Multipliers of the limits of the states at the Gauss points, per unit of s, those at the ends of the
             intervals spread over their neighbours. Shape (N q, nx + r').
         error: Of the costates over each interval, from end to end. Shape (N,).
@@ -110,7 +111,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
         holding, across = holders(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (holding != 0)).all():
             break
-    size = along.sizes.state
+    size = along.state_size
     places, stand = along.share.reshape(n, q, 1), along.stand.charge(inside.reshape(n * q, m)).reshape(n, q, m)
     node = along.node_stand
     single = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
@@ -217,13 +218,18 @@ class Backwards:
         start = end + np.einsum("k,j,kja->ka", along.width, along.weight, flow) + force.sum(axis=1)
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
+    @property
+    def flow(self) -> tuple[np.ndarray, np.ndarray]:
+        """What costates at the ends of the intervals make at the points, (N, q, nx, nx), and at the starts, alone."""
+        (n, q), nx = self.along.shape, self.along.form.nx
+        points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
+        weight = self.along.weight[:, None, None]
+        return points, np.eye(nx) + self.along.width[:, None, None] * (weight * (self.feed @ points)).sum(axis=1)
+
     def chained(self, errors: np.ndarray) -> np.ndarray:
         """What errors (N, nx) at the start of each interval make together at its start, carried on backwards."""
-        (n, q), nx = self.along.shape, self.along.form.nx
-        answer = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
-        weight = self.along.weight[:, None, None]
-        flow = np.eye(nx) + self.along.width[:, None, None] * (weight * (self.feed @ answer)).sum(axis=1)
-        off, found = np.zeros(nx), np.zeros((n, nx))
+        (n, _), nx = self.along.shape, self.along.form.nx
+        off, found, (_, flow) = np.zeros(nx), np.zeros((n, nx)), self.flow
         with np.errstate(over="ignore", invalid="ignore"):
             for k in reversed(range(n)):
                 off = errors[k] + flow[k] @ off
@@ -236,7 +242,7 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.stand.lower.shape[1]
     mine = slice(k * q, (k + 1) * q)
-    size, unit = along.sizes.state, along.sizes.control
+    size, unit = along.state_size, along.sizes.control
     limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
     slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
     columns, charges, owners, free = [], [], [], []
@@ -294,7 +300,7 @@ def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.
     inner = (place > 1e-9) & (place < 1 - 1e-9)
     nodes, values = np.append(along.places, 1.0), np.concatenate([costate.reshape(n, q, nx), last[:, None]], axis=1)
     found = np.einsum("md,mdn->mn", lagrange(nodes, place[inner]), values[k[inner]])
-    off = np.abs(stack(along.solution.costates)[inner] - found) @ along.sizes.state
+    off = np.abs(stack(along.solution.costates)[inner] - found) @ along.state_size
     worst = np.zeros(n)
     np.maximum.at(worst, k[inner], off)
     return worst
@@ -313,19 +319,8 @@ def _ends(
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
     places, sizes = form.bounds.places, along.sizes
-    x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
-    u0, u1 = stack(solution.controls, 2)[[0, -1]]
     lam0 = _ends_of_intervals(along)[0][0]
-    y = ca.vertcat(form.x, form.x0, form.T)
-    begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
-    end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
-    rows = ca.vertcat(end, begin)
-    function = ca.Function(
-        "ends",
-        [form.x, form.x0, form.u, form.u0, form.T, form.p],
-        [rows, ca.densify(ca.jacobian(rows, y)), ca.densify(ca.gradient(final, y))],
-    )
-    value, slopes, gradient = (np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, along.p))
+    slopes, gradient = along.end_y, along.final_y
     # dT H/dT along the plan, what pushes included
     by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
     by_horizon += np.einsum(
@@ -336,13 +331,13 @@ def _ends(
     lasting += float(np.sum(inside.reshape(n * q, -1) * along.stand_x[:, :, nx]))
     for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
         lasting += float(np.sum(atoms[:, e] * along.node_stand_x[nodes, :, nx]))
-    target = np.concatenate([lam1 - gradient[:nx, 0], -lam0 - gradient[nx : 2 * nx, 0], [-lasting - gradient[-1, 0]]])
-    unit = np.concatenate([sizes.state, sizes.state, [solution.horizon]])
+    target = np.concatenate([lam1 - gradient[:nx], -lam0 - gradient[nx : 2 * nx], [-lasting - gradient[-1]]])
+    unit = np.concatenate([along.state_size, along.state_size, [solution.horizon]])
 
     index = np.concatenate([form.end.bounds, form.start.bounds])
     equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])
     row_size = np.concatenate([sizes.end, sizes.start])
-    conditions = Limits(value.T, low[index], high[index], equal, row_size)
+    conditions = Limits(along.end_row[None], low[index], high[index], equal, row_size)
     horizon = places["horizon"]
     at_horizon = Limits(
         np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
@@ -376,11 +371,13 @@ def _ends(
         nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges), np.array(unsigned, bool)) * cost
     )
     left = np.zeros(2 * nx + 1)
-    left[free] = np.abs((target * unit)[free] - matrix @ found)
+    left[free] = (target * unit)[free] - matrix @ found
     multipliers = np.zeros(len(index))
     for (owner, scale), force in zip(owners, found, strict=True):
         if owner >= 0:
             multipliers[owner] += scale * force
     charge = float(np.dot(charges, found)) if charges else 0.0
     cut = len(form.end)
-    return Ends(float(left[:-1].sum()), float(left[-1]), charge, multipliers[:cut], multipliers[cut:])
+    off = np.abs(left)
+    slope = left[nx:] / unit[nx:]
+    return Ends(float(off[:-1].sum()), float(off[-1]), slope, charge, multipliers[:cut], multipliers[cut:])

@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ocp.audit.accessory import RANK, AccessoryProblem, dependent, end_conditions, rows_of_length_one, unseen
-from ocp.audit.principle import FLAT
+from ocp.audit.accessory import AccessoryProblem, end_conditions
+from ocp.audit.principle import FLAT, groups
 from ocp.problem.formulation import Formulation
 
 __all__ = ["Curvature", "curvature"]
 
+RANK = 1e-9
+"""Size of a singular value, for rows of length 1, from which on constraints count as dependent."""
 NEARLY = "constraints are nearly dependent"
 TIED = 1e-4
 """Size of a singular value below which conditions may be implied by others but for the error of a plan."""
@@ -40,6 +42,8 @@ class Curvature:
         direction: For a negative curvature a variation that lowers the cost: of the controls at the points ``t``
             (M, nu) and of the states at the ends of the intervals (N + 1, nx); else None.
         t: Times of the Gauss points, s. Shape (M,).
+        starts: Variations of start and horizon, a column each, and the curvature of the cost along each, 0 where it is
+            none, controls following at their best. Shapes (nz, k), (k,). None where the sweep does not come so far.
     """
 
     least: float
@@ -47,6 +51,7 @@ class Curvature:
     flat: str
     direction: tuple[np.ndarray, np.ndarray] | None
     t: np.ndarray
+    starts: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def upwards(self) -> bool | None:
@@ -54,6 +59,18 @@ class Curvature:
         if self.flat:
             return None
         return bool(self.least > FLAT)
+
+    def lost(self, slope: np.ndarray) -> float:
+        """What start and horizon could win, to second order, where the cost has this slope (nz,) in them.
+
+        By their units at most where the cost does not curve.
+        """
+        if self.starts is None:
+            return 0.0
+        variations, curved = self.starts
+        pull = np.abs(slope @ variations)
+        bent = np.where(curved > 0, curved, 1.0)
+        return float(np.where(curved > 0, pull**2 / (2 * bent), pull).sum())
 
 
 def curvature(accessory: AccessoryProblem) -> Curvature:
@@ -66,29 +83,30 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
     if accessory.obstacle:
         return Curvature(np.nan, None, accessory.obstacle, None, along.t)
     found = _sweep(accessory, weak=False)
-    if found.least <= FLAT and any(len(rows) for rows in accessory.weak):
+    if found.least <= FLAT and accessory.weak.any():
         # a limit that is touched without a push takes away one side of a direction only
         inside = _sweep(accessory, weak=True)
         if inside.least > FLAT:
             why = "the cost curves upwards only because of limits that are touched without a push"
-            return Curvature(inside.least, inside.time, why, None, along.t)
+            return Curvature(inside.least, inside.time, why, None, along.t, inside.starts)
         found = inside
     if found.flat.startswith(NEARLY):
         # without what is left of conditions that others imply there is more to vary: upwards all the more
         wider = _sweep(accessory, weak=False, tied=TIED)
         if wider.least > FLAT and not wider.flat:
             found = wider
-    least, time, flat, direction = found
-    return Curvature(least, time, flat, direction, along.t)
+    least, time, flat, direction, starts = found
+    return Curvature(least, time, flat, direction, along.t, starts)
 
 
 class _Swept(NamedTuple):
-    """Least curvature, its time, why it is not decided, and a direction that lowers the cost."""
+    """Least curvature, its time, why it is not decided, a direction that lowers the cost, and `Curvature.starts`."""
 
     least: float
     time: float | None
     flat: str
     direction: tuple[np.ndarray, np.ndarray] | None
+    starts: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swept:
@@ -131,53 +149,44 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
 
     cost, rows, start_cost, start_rows = end_conditions(accessory)
     sweep = _Linearised(whole, step, stage, metric, cost, rows, start_cost)
-    bends = np.linalg.norm(stage[:, nz:, nz:], ord=2, axis=(1, 2)) if nu else np.zeros(n)
+    bends = np.abs(np.linalg.eigvalsh(stage[:, nz:, nz:])).max(axis=1) if nu else np.zeros(n)
     scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
     least, at, flat = np.inf, None, ""
     gains: list[np.ndarray] = []
-    for k in reversed(range(n)):
-        joined = stage[k] + step[k].T @ cost @ step[k]
-        own = [accessory.rows[k * q + j] @ whole[k, j] for j in range(q)]
-        own += [accessory.node_rows[k] @ np.eye(nz, step.shape[2]), accessory.node_rows[k + 1] @ step[k]]
-        if weak:
-            own += [accessory.weak[k * q + j] @ whole[k, j] for j in range(q)]
-        for i in np.flatnonzero(accessory.moved[k]):  # a switch moves: one variation, of the mean
-            own.append(whole[k, 1:, nz + i] - whole[k, :1, nz + i])
-        stacked = rows_of_length_one(np.vstack([*own, rows @ step[k]]), tied)
-        rank, left, sizes, right = dependent(stacked[:, nz:], tied)
-        basis = right[rank:].T
-        follow = -(right[:rank].T / sizes[:rank]) @ left[:, :rank].T @ stacked[:, :nz]
-        # what no control sees is for the stages before; what some see by less than counts is dropped, not passed on
-        unheld = left[:, max(rank, int(np.sum(sizes > RANK))) :]
-        rows = rows_of_length_one(unheld.T @ stacked[:, :nz], tied)
-        lift = np.vstack([np.eye(nz), follow])
-        free = basis.T @ joined[nz:, nz:] @ basis
-        mixed = basis.T @ joined[nz:] @ lift
-        cost = lift.T @ joined @ lift
-        gain = follow
-        if basis.shape[1]:
-            values, vectors = np.linalg.eigh((free + free.T) / 2)
+    for k, (lift, move, bend, above) in reversed(list(enumerate(_freed(accessory, sweep, weak, tied)))):
+        joined = bend + move.T @ cost @ move
+        if len(rows):
+            carried = rows_of_length_one(rows @ move, tied)
+            (inner,), (unheld,) = _eliminated(carried[None], nz, tied)
+            joined, lift = inner.T @ joined @ inner, lift @ inner
+            above = np.vstack([above, unheld])
+        rows = rows_of_length_one(above, tied)
+        mixed, gain, cost = joined[nz:, :nz], lift[nz:, :nz], joined[:nz, :nz]
+        if lift.shape[1] > nz:
+            values, vectors = np.linalg.eigh(joined[nz:, nz:])
             if values[0] / scale < least:
                 least, at = float(values[0] / scale), float(mesh[k] * along.solution.horizon)
             if values[0] < -FLAT * scale:
-                worst = basis @ vectors[:, 0]
+                worst = lift[nz:, nz:] @ vectors[:, 0]
                 why = _singular(accessory, k, worst)
                 if why:
                     return _Swept(least, at, why, None)
                 return _confirmed(least, at, _variation(accessory, sweep, k, worst, gains), scale)
             curved = values > FLAT * scale
             if not curved.all():
-                label = _label(form, basis @ vectors[:, 0], nu)
+                label = _label(form, lift[nz:, nz:] @ vectors[:, 0], nu)
                 flat = (
                     flat
                     or f"the cost does not curve along control {label!r} at {mesh[k] * along.solution.horizon:.4g} s"
                 )
-            inverse = (vectors[:, curved] / values[curved]) @ vectors[:, curved].T
-            gain = follow - basis @ inverse @ mixed
-            cost = cost - mixed.T @ inverse @ mixed
+            answer = (vectors[:, curved] / values[curved]) @ (vectors[:, curved].T @ mixed)
+            gain = gain - lift[nz:, nz:] @ answer
+            cost = cost - mixed.T @ answer
         cost = (cost + cost.T) / 2
         gains.append(gain)
-    basis = unseen(np.vstack([rows, start_rows]), tied)
+    _, sizes, right = np.linalg.svd(rows_of_length_one(np.vstack([rows, start_rows]), tied))
+    basis = right[int(np.sum(sizes > tied)) :].T
+    starts = basis, np.zeros(0)
     if basis.shape[1]:
         values, vectors = np.linalg.eigh(basis.T @ (cost + start_cost) @ basis)
         if values[0] / scale < least:
@@ -186,7 +195,63 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
             return _confirmed(least, at, _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
         if values[0] <= FLAT * scale:
             flat = flat or "the cost does not curve along a variation of the start"
-    return _Swept(least, at, flat, None)
+        starts = basis @ vectors, np.where(values > FLAT * scale, values, 0.0)
+    return _Swept(least, at, flat, None, starts)
+
+
+def _freed(
+    accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: float
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """What its own constraints leave free of each stage: those with the same constraints all at once.
+
+    Returns:
+        For each stage the variations at its start and of its controls from the former and from what is free,
+        (nz + q nu, nz + f); the step and the cost in these; and rows (r, nz) that are left for the stages before.
+    """
+    n, q = accessory.along.shape
+    nz, nu = accessory.nz, accessory.nu
+    normals = accessory.normals.reshape(n, q, -1, nz + nu)
+    held = (accessory.strong | accessory.weak if weak else accessory.strong).reshape(n, -1)
+    parts = [held, accessory.node_strong[:-1], accessory.node_strong[1:], accessory.moved]
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    found: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
+    for pattern, members in groups(np.hstack(parts)):
+        inside, first, last, moved = np.split(pattern, ends)
+        whole, step = sweep.whole[members], sweep.step[members]
+        own = [normals[members, j][:, at] @ whole[:, j] for j, at in enumerate(inside.reshape(q, -1))]
+        own.append(accessory.node_normals[members][:, first] @ np.eye(nz, step.shape[2]))
+        own.append(accessory.node_normals[members + 1][:, last] @ step)
+        for i in np.flatnonzero(moved):  # a switch moves: one variation, of the mean
+            own.append(whole[:, 1:, nz + i] - whole[:, :1, nz + i])
+        lifts, above = _eliminated(np.concatenate(own, axis=1), nz, tied)
+        for k, lift, rows in zip(members.tolist(), lifts, above, strict=True):
+            found[k] = lift, sweep.step[k] @ lift, lift.T @ sweep.stage[k] @ lift, rows
+    return [found[k] for k in range(n)]
+
+
+def _eliminated(rows: np.ndarray, nz: int, tied: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What rows (K, r, nz + m) of states and controls leave free at K stages.
+
+    Returns:
+        Of each stage states and controls from the states and from what is free of the controls, (nz + m, nz + f), and
+        the rows (r', nz) of the states that no control sees. What controls see by less than counts is dropped.
+    """
+    count, _, both = rows.shape
+    lengths = np.linalg.norm(rows, axis=2, keepdims=True)
+    keep = lengths > tied * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
+    rows = np.where(keep, rows / np.where(keep, lengths, 1.0), 0.0)
+    left, sizes, right = np.linalg.svd(rows[:, :, nz:])
+    ranks, seen = (sizes > tied).sum(axis=1), (sizes > RANK).sum(axis=1)
+    lifts, above = [], []
+    for k in range(count):
+        rank = ranks[k]
+        lift = np.zeros((both, both - rank))
+        lift[:nz, :nz] = np.eye(nz)
+        lift[nz:, :nz] = -(right[k, :rank].T / sizes[k, :rank]) @ (left[k, :, :rank].T @ rows[k, :, :nz])
+        lift[nz:, nz:] = right[k, rank:].T
+        lifts.append(lift)
+        above.append(left[k, :, max(rank, seen[k]) :].T @ rows[k, :, :nz])
+    return lifts, above
 
 
 class _Linearised(NamedTuple):
@@ -199,6 +264,13 @@ class _Linearised(NamedTuple):
     end_cost: np.ndarray
     end_rows: np.ndarray
     start_cost: np.ndarray
+
+
+def rows_of_length_one(rows: np.ndarray, rank: float) -> np.ndarray:
+    """The same rows, each of length 1, without those that say nothing."""
+    sizes = np.linalg.norm(rows, axis=1)
+    keep = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
+    return np.asarray(rows[keep] / sizes[keep, None])
 
 
 class _Variation(NamedTuple):
@@ -229,7 +301,9 @@ def _variation(
         values[k] = controls if controls is not None and k == first else gains[n - 1 - k] @ z
         both = np.concatenate([z, values[k]])
         cost += float(both @ sweep.stage[k] @ both)
-        slips += [np.abs(accessory.rows[k * q + j] @ sweep.whole[k, j] @ both).max(initial=0.0) for j in range(q)]
+        for j in range(k * q, (k + 1) * q):
+            held = accessory.normals[j][accessory.strong[j]] @ sweep.whole[k, j - k * q] @ both
+            slips.append(np.abs(held).max(initial=0.0))
         z = sweep.step[k] @ both
     states[n] = z
     cost += float(z @ sweep.end_cost @ z)

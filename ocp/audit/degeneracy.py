@@ -17,13 +17,14 @@ from ocp.audit.principle import DEPENDENT, slope
 __all__ = ["better_costates"]
 
 ROUNDS = 50
+"""Of least squares; each halves the width over which a hinge is rounded off."""
 
 
 def better_costates(along: Linearisation, costate: np.ndarray, holding: np.ndarray, flat: np.ndarray) -> np.ndarray:
     """Costates (M, nx) of the same plan that meet the same equation and ends, and fit its switches best.
 
     Args:
-        along: The plan. costate, holding: What it reports and what holds its controls there, (M, nx), (M, nu + r).
+        along: The plan. costate, holding: What it reports and what holds its controls there, (M, nx), (M, nu + r + a).
         flat: Controls along which the Hamiltonian does not curve. Shape (nu,), bool.
     """
     moves = _moves(along, holding)
@@ -66,10 +67,10 @@ def _moves(along: Linearisation, holding: np.ndarray) -> np.ndarray:
     back = Backwards(along, holding, np.zeros(len(holding), bool))
     end = np.eye(nx)[:, given]
     points = np.zeros((n, q, nx, end.shape[1]))
+    answer, flow = back.flow
     for k in reversed(range(n)):
-        known = np.broadcast_to(end, (q, *end.shape)).reshape(q * nx, -1)
-        points[k] = (back.inverse[k] @ known).reshape(q, nx, -1)
-        end = end + along.width[k] * np.einsum("j,jab,jbd->ad", along.weight, back.feed[k], points[k])
+        points[k] = answer[k] @ end
+        end = flow[k] @ end
     moves = points.reshape(n * q, nx, -1)
     conditions = [end[low[places["initial"]] < high[places["initial"]]]]
     if form.horizon_is_free:

@@ -16,7 +16,7 @@ import numpy as np
 from ocp.audit.sizes import Sizes
 from ocp.curves import lagrange, quadrature_weights
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.solution import Solution
+from ocp.solution import Solution, stack
 
 __all__ = ["NEAR", "Limits", "Linearisation", "gauss"]
 
@@ -78,10 +78,11 @@ class Linearisation:
         s, t: Fractions of the horizon and times of the M = N q points, s. Shape (M,).
         nodal: Whether the plan is reported at the ends of its intervals alone.
         x, u, costate: The plan at the points, as it reports them. Shape (M, n).
-        cost, cost_y: T L, and its derivatives in y = (x, T, u). Shapes (M,), (M, ny).
-        rate, rate_y: T f, (M, nx), and its derivatives, (M, nx, ny).
+        cost_y, rate_y: Derivatives of T L and T f in y = (x, T, u). Shapes (M, ny), (M, nx, ny).
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
-        sizes: Of all named things along the plan.
+        sizes: Of all named things along the plan. state_size: Of the states, by which costates are judged. Shape (nx,).
+        end_row, end_y: The end and start rows, in this order, and their derivatives in (x, x0, T), (m,), (m, 2 nx + 1).
+        final_y, final_yy: Derivatives of the terminal cost in these, (2 nx + 1,), and its second ones, squared.
         hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of states,
             in this order. Shape (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
@@ -107,6 +108,8 @@ class Linearisation:
         self.u = solution.control_interpolant.within(np.repeat(np.arange(n), q), np.tile(self.places, n))
         self.costate = solution.costate_interpolant(self.s)
         self._differentiate()
+        self._at_ends()
+        self.state_size = self._state_sizes()
         self._limits()
         self._arcs()
 
@@ -117,10 +120,9 @@ class Linearisation:
         self.scaled = ca.substitute(
             [form.T * form.running, form.T * form.f, form.path.expression], [form.t], [self.fraction * form.T]
         )
-        outputs = [*self.scaled, *(ca.jacobian(part, self.y) for part in self.scaled)]
-        cost, self.rate, self.row, cost_y, rate_y, row_y = form.sampled(outputs, *self.here)
+        outputs = [self.scaled[2], *(ca.jacobian(part, self.y) for part in self.scaled)]
+        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.here)
         ny = form.nx + 1 + form.nu
-        self.cost, self.cost_y = cost[:, 0], cost_y
         self.rate_y = rate_y.reshape(m, ny, form.nx).transpose(0, 2, 1)
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
 
@@ -139,13 +141,54 @@ class Linearisation:
     @property
     def slope_size(self) -> float:
         """What the running cost changes by over the sizes of states and controls, to first order, in units of cost."""
-        unit = np.concatenate([self.sizes.state, [0.0], self.sizes.control])
+        unit = np.concatenate([self.state_size, [0.0], self.sizes.control])
         return float(self.share @ (np.abs(self.cost_y) @ unit))
 
     @property
     def share(self) -> np.ndarray:
         """Weight of every point in an integral over s. Shape (M,)."""
         return np.asarray((self.width[:, None] * self.weight).ravel())
+
+    def _at_ends(self) -> None:
+        form, solution = self.form, self.solution
+        x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
+        u0, u1 = stack(solution.controls, 2)[[0, -1]]
+        begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
+        end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+        rows, y = ca.vertcat(end, begin), ca.vertcat(form.x, form.x0, form.T)
+        symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
+        outputs = [rows, ca.jacobian(rows, y), ca.gradient(final, y), ca.hessian(final, y)[0]]
+        function = ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
+        found = [np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, self.p)]
+        self.end_row, self.end_y, self.final_y, self.final_yy = found[0][:, 0], found[1], found[2][:, 0], found[3]
+
+    def _state_sizes(self) -> np.ndarray:
+        """Sizes of the states. Shape (nx,).
+
+        What stands still shows none. Where it is for the plan to choose, a length of a tool kept as a state say, its
+        size is the least that moves something else by its size, or the cost by itself to second order.
+        """
+        form, sizes, nx = self.form, self.sizes, self.form.nx
+        low, high = self.bounds
+        first, last = form.bounds.places["initial"], form.bounds.places["terminal"]
+        chosen = (low[first] < high[first]) & (low[last] < high[last])
+        still = np.flatnonzero(chosen & (np.ptp(self.x, axis=0) < sizes.state / 2))
+        if not still.size:
+            return sizes.state
+        rows = np.concatenate([sizes.end, sizes.start])[:, None]
+        speed = [np.abs(self.rate_y[:, :, still]).max(axis=0) / sizes.state[:, None]]
+        speed.append(np.abs(self.row_y[:, :, still]).max(axis=0, initial=0.0) / sizes.path[:, None])
+        speed += [np.abs(self.end_y[:, k]) / rows for k in (still, nx + still)]
+        lam = form.sym("lam", nx)
+        slopes = ca.gradient(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)
+        bends = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in still.tolist()])
+        bent = self.share @ form.sampled([bends], *self.here, (lam, self.costate))[0]
+        bent = bent + sum(np.diag(self.final_yy)[k] for k in (still, nx + still))
+        speed.append(np.sqrt(np.abs(bent[None]) / 2 / (abs(self.solution.cost) or 1.0)))
+        fastest = np.vstack(speed).max(axis=0)
+        found = sizes.state.copy()
+        found[still] = np.where(fastest > 0, 1.0 / np.where(fastest > 0, fastest, 1.0), found[still])
+        return found
 
     def _limits(self) -> None:
         form, sizes, (n, q) = self.form, self.sizes, self.shape

@@ -90,6 +90,7 @@ def optimality(
     total = np.maximum(total, 0.0) + first.charge
     total[0] += first.ends.charge
     second = curvature(accessory)
+    total[0] += second.lost(accessory.start_slope)
     return Optimality(
         total,
         cost,
@@ -126,7 +127,9 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
     """What is found where the problem is not a number along the plan: nothing that would pass."""
     (n, _), m = along.shape, len(along.s)
     nothing, form = np.full(n, np.inf), along.form
-    ends = Ends(np.inf, np.inf, np.inf, np.zeros(len(form.end)), np.zeros(len(form.start)))
+    ends = Ends(
+        np.inf, np.inf, np.full(form.nx + 1, np.nan), np.inf, np.zeros(len(form.end)), np.zeros(len(form.start))
+    )
     t = along.mesh * along.solution.horizon
     shapes = form.nx, along.hold_u.shape[1], along.stand_x.shape[1]
     costate, holding, standing = (np.full((m, k), np.nan) for k in shapes)

@@ -194,12 +194,16 @@ def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free:
 
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Distinct rows of patterns (M, m), bool, each with the indices of its members."""
-    if not len(patterns):
-        return []
-    distinct, member = np.unique(patterns, axis=0, return_inverse=True)
-    order = np.argsort(member.ravel(), kind="stable")
-    cuts = np.searchsorted(member.ravel()[order], np.arange(1, len(distinct)))
-    return list(zip(distinct, np.split(order, cuts), strict=True))
+    if not patterns.size:
+        return [(np.zeros(patterns.shape[1], bool), np.arange(len(patterns)))] if len(patterns) else []
+    packed = np.ascontiguousarray(np.packbits(patterns, axis=1))
+    if (packed == packed[0]).all():
+        return [(patterns[0], np.arange(len(patterns)))]
+    keys = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
+    _, first, member = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(member, kind="stable")
+    cuts = np.searchsorted(member[order], np.arange(1, len(first)))
+    return list(zip(patterns[first], np.split(order, cuts), strict=True))
 
 
 def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
@@ -207,7 +211,8 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
 
     Args:
         along: The plan. costate: (M, nx).
-        multipliers: Of the limits of the controls, (M, nu + r); what these win over the gaps to their limits counts.
+        multipliers: Of the limits of the controls, (M, nu + r + a). What these win over the gaps to their limits
+            counts.
         curved: T H_uu. Shape (M, nu, nu).
 
     A control moves within its limits, and by its size at most where the Hamiltonian does not curve along it. Rows that

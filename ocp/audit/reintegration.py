@@ -146,13 +146,8 @@ class Flow:
 
     def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, sizes: Sizes) -> None:
         curve = solution.control_interpolant
-        self._columns = np.vstack(
-            [
-                newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1).T,
-                curve.breaks[:-1],
-                np.diff(curve.breaks),
-            ]
-        )
+        differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
+        self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
         self._tolerance = TOLERANCE * np.append(sizes.state, sizes.cost)
         self._step = step_function(form, curve.nodes, solution.horizon, p).mapaccum("steps", BLOCK)
         self._intervals = len(curve.values)
@@ -202,17 +197,23 @@ class Flow:
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and cost behind each step, each from those before it or, where it is a first one, from its start."""
-        now, after, errors = starts[0], [], []
-        for at in range(0, len(first), BLOCK):
+        count, size = len(first), starts.shape[1]
+        whole = -(-count // BLOCK) * BLOCK
+        data = np.zeros((whole, self._step.size1_in(1)))  # what is left of the last block are steps of no width
+        data[:count] = np.column_stack([first, starts, place, width, self._columns[interval]])
+        now, after, errors = starts[0].copy(), np.empty((whole, size)), np.empty((whole, size))
+        memory, evaluate = self._step.buffer()
+        memory.set_arg(0, memoryview(now))
+        for at in range(0, whole, BLOCK):
             part = slice(at, at + BLOCK)
-            data = np.vstack([first[part], starts[part].T, place[part], width[part], self._columns[:, interval[part]]])
-            size = data.shape[1]
-            data = np.pad(data, ((0, 0), (0, BLOCK - size)))  # steps of no width
-            states, error = (np.asarray(out.full())[:, :size].T for out in self._step(now, data))
-            now = states[-1]
-            after.append(states)
-            errors.append(np.abs(error))
-        return np.vstack(after), np.vstack(errors)
+            memory.set_arg(1, memoryview(data[part]))
+            memory.set_res(0, memoryview(after[part]))
+            memory.set_res(1, memoryview(errors[part]))
+            evaluate()
+            if memory.ret():
+                raise RuntimeError(f"the dynamics failed at steps {at} to {at + BLOCK - 1}")
+            now[:] = after[part][-1]
+        return after[:count], np.abs(errors[:count])
 
 
 def step_function(form: Formulation, nodes: np.ndarray, horizon: float, p: np.ndarray) -> Any:

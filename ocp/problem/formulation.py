@@ -17,6 +17,8 @@ from ocp.problem.values import check_finite, check_horizon, check_inside, check_
 
 __all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "at_samples"]
 
+BLOCK = 512  # samples in one call of a function: a map of them all takes longer to make than to evaluate
+
 Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
 
@@ -324,19 +326,31 @@ class Formulation:
 
 
 def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """A casadi function of columns at M samples; each output (M, n).
+    """A casadi function of dense columns at M samples; each output (M, n).
 
     Args:
-        function: Its outputs are columns. columns: Its arguments: an array (M, n) of what differs from sample to
-            sample, or (n,) or a number of what does not.
+        function: Its inputs and outputs are dense columns. columns: Its arguments: an array (M, n) of what differs
+            from sample to sample, or (n,) or a number of what does not.
     """
     values = [np.asarray(column, dtype=float) for column in columns]
-    shared = [i for i, value in enumerate(values) if value.ndim < 2]
     m = next(len(value) for value in values if value.ndim == 2)
-    if m == 0:
-        return [np.zeros((0, function.numel_out(i))) for i in range(function.n_out())]
-    found = function.map("samples", "serial", m, shared, []).call([ca.DM(value.T) for value in values])
-    return [np.asarray(out.full()).T for out in found]
+    outputs = [np.empty((m, function.numel_out(i))) for i in range(function.n_out())]
+    inputs = [np.empty((m, function.numel_in(i))) for i in range(function.n_in())]
+    for into, value in zip(inputs, values, strict=True):
+        into[:] = value
+    for first in range(0, m, BLOCK):
+        if first + BLOCK > m or first == 0:
+            count = min(BLOCK, m - first)
+            memory, evaluate = (function.map(count) if count > 1 else function).buffer()
+        part = slice(first, first + BLOCK)
+        for i, value in enumerate(inputs):
+            memory.set_arg(i, memoryview(value[part]))
+        for i, value in enumerate(outputs):
+            memory.set_res(i, memoryview(value[part]))
+        evaluate()
+        if memory.ret():
+            raise RuntimeError(f"{function.name()} failed at samples {first} to {first + count - 1}")
+    return outputs
 
 
 def slices(pool: dict[str, Variable]) -> dict[str, slice]:
