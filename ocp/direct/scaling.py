@@ -179,7 +179,12 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
     horizon = float(form.horizon_at(p) if fragment.horizon is None else point[fragment.horizon])
     if fragment.horizon is None or "horizon" in given:
         seen[-1] = horizon
-    known = seen > 0
+    index = np.concatenate([places["state"], places["control"], places["horizon"]])
+    ends = np.abs([low[index], high[index]])
+    ends[0, -1] = 0.0  # the least horizon is a fence, no size
+    reach = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+    # what is rounding beside its own limits, or beside all else where it has none, has not been seen
+    known = seen > ROUNDING * np.where(reach > 0, reach, seen.max())
     if known.all():
         return Sizes(seen[:nx], seen[nx:-1], horizon)
 
@@ -192,10 +197,6 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
     equations[:, -1] -= 1.0
     logs = np.log(np.where(known, seen, 1.0))
     right = np.log(pull[to, source]) - np.log(horizon) - equations @ logs
-    index = np.concatenate([places["state"], places["control"], places["horizon"]])
-    ends = np.abs([low[index], high[index]])
-    ends[0, -1] = 0.0  # the least horizon is a fence, no size
-    reach = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
     bounded = np.flatnonzero((reach > 0) & ~known)
     eye = np.eye(len(seen))
     rows = np.vstack([equations, WEAK * eye[bounded], WEAK**2 * eye[~known]])[:, ~known]
@@ -237,6 +238,7 @@ def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     cost = min(usual, default=1.0)
     # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
     cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
+    largest = np.where(largest > ROUNDING * largest.max(initial=0.0), largest, 1.0)
     return Scales(_powers(by), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
@@ -263,8 +265,8 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """The nearest powers of two of sizes out of the usual; 1 of the others and of rounding beside the largest."""
-    odd = (sizes > ROUNDING * sizes.max(initial=0.0)) & ((sizes < 1 / USUAL) | (sizes > USUAL))
+    """The nearest powers of two of sizes out of the usual; 1 of the others."""
+    odd = (sizes < 1 / USUAL) | (sizes > USUAL)
     return np.where(odd, np.exp2(np.round(np.log2(np.where(odd, sizes, 1.0)))), 1.0)
 
 
