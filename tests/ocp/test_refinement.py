@@ -268,21 +268,23 @@ def beyond_the_conjugate_point() -> Problem:
     return problem
 
 
-@pytest.mark.parametrize(
-    ("declare", "method", "name"),
-    [(beyond_the_conjugate_point, Collocation(10), "curvature"), (van_der_pol, Collocation(4, 5), "integration error")],
-)
-def test_what_finer_intervals_do_not_mend_is_not_reached_and_named(
-    declare: Callable[[], Problem], method: Method, name: str
-) -> None:
-    """A stationary plan that is no minimum; an integration error below rounding."""
-    with pytest.warns(RefinementWarning, match=name) as told:
-        solution = refine(declare(), method, tolerance=1e-15)
+@pytest.mark.parametrize("method", [Collocation(10), MultipleShooting(10)])
+def test_a_problem_without_a_minimum_is_called_so(method: Method) -> None:
+    with pytest.raises(SolveError, match="stationary but no minimum.*may be unbounded below") as caught:
+        refine(beyond_the_conjugate_point(), method)
+    assert caught.value.solution is not None
+    assert caught.value.solution.audit().optimal is False
+
+
+def test_what_finer_intervals_do_not_mend_is_not_reached_and_named() -> None:
+    """An integration error below rounding."""
+    with pytest.warns(RefinementWarning, match="integration error") as told:
+        solution = refine(van_der_pol(), Collocation(4, 5), tolerance=1e-15)
     assert solution.refinement is not None
     assert not solution.refinement.reached
     assert len(solution.refinement.intervals) <= 5
     warning: Any = told[0].message
-    assert name in warning.name
+    assert "integration error" in warning.name
 
 
 def test_what_the_audit_does_not_decide_is_not_reached_though_every_row_holds() -> None:
@@ -299,7 +301,7 @@ def test_what_the_audit_does_not_decide_is_not_reached_though_every_row_holds() 
 
 @pytest.mark.parametrize("method", START)
 def test_reached_means_that_the_audit_passes(method: str) -> None:
-    for declare in (swing, layer, beyond_the_conjugate_point):
+    for declare in (swing, layer, van_der_pol):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RefinementWarning)
             given = SWING if declare is swing else None

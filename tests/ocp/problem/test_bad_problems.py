@@ -344,7 +344,7 @@ FRONTS = [
         integration=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         constraints=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         lost=but(NONNEGATIVE, "inf", "huge") | NOTHING,
-        costates=but(NONNEGATIVE, "inf", "huge") | NOTHING,
+        costates=but(NONNEGATIVE, "inf", "huge"),  # None: by what the plan loses
         stationarity=but(NONNEGATIVE, "inf", "huge"),  # None: it is told, and judged by no limit
         drift=but(NONNEGATIVE, "inf", "huge"),
     ),
