@@ -155,8 +155,10 @@ class TaskEquations:
 
         Errors of poses, "task position" and "task orientation"; of velocities the integral of what they are missed by,
         "task way" and "task turn"; each judged by the way of the tips. Where a task is held as an equation of
-        velocities or accelerations, errors too small for that equation may add up.
+        velocities or accelerations, errors too small for that equation may add up. A pose may be off by the gap at the
+        start that its task allows, which the feedback closes.
         """
+        gaps = np.repeat([part.task.start_gap for part in self.bound], [part.task.size for part in self.bound])
         error, missed = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         moving, found = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
         for posed, turning, name, unit in (
@@ -168,7 +170,8 @@ class TaskEquations:
             rows = np.flatnonzero((self.posed == posed) & (self._turning == turning)).tolist()
             if rows:
                 what = (error if posed else missed)[rows]
-                bounds = {"lower": 0.0, "upper": 0.0, "integral": not posed, "unit": unit}
+                off = gaps[rows] if posed else 0.0
+                bounds = {"lower": -off, "upper": off, "integral": not posed, "unit": unit}
                 found[name] = {"expression": what, "way": moving[rows], **bounds}
         return found
 

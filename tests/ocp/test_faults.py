@@ -100,7 +100,7 @@ print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success
 
 CHECKS = """
 long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
-plan = solve(long, Collocation(300))
+plan = solve(long, Collocation(4000))
 interrupted("audit", lambda: plan.audit())
 interrupted("audit again", lambda: plan.audit(), 0.6)
 interrupted("certificate", lambda: certificate(long, [plan, plan]))
@@ -256,7 +256,7 @@ def solved_from_zeros() -> Problem:
 def test_one_time_limit_covers_all_starts() -> None:
     """What ran out of time is told of, whichever start it was at; behind it there is no other."""
     assert solve(solved_from_zeros(), Collocation(20)).start == "zeros"
-    prepared = prepare(solved_from_zeros(), Collocation(1000, 4))
+    prepared = prepare(solved_from_zeros(), Collocation(4000, 4))
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         prepared.solve(time_limit=0.3)
     told = str(caught.value).splitlines()
