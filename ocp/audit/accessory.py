@@ -95,7 +95,8 @@ class AccessoryProblem:
         cost, rate, path = along.scaled
         total = cost + ca.dot(lam, rate) + ca.dot(mu, path)
         more = (lam, self.adjoint.costate), (mu, multipliers)
-        (hessian,) = form.sampled([ca.hessian(total, along.y)[0]], *along.here, *more)
+        own = ca.diag(ca.hessian(cost, form.x)[0])
+        hessian, self._cost_curves = form.sampled([ca.hessian(total, along.y)[0], own], *along.here, *more)
         ny = self.nx + 1 + self.nu
         hessian = hessian.reshape(m, ny, ny)
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
@@ -125,9 +126,16 @@ class AccessoryProblem:
 
     @property
     def spread(self) -> float:
-        """What the cost curves by over the sizes of states and controls, in units of cost."""
+        """What the Hamiltonian curves by over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
+
+    @property
+    def price(self) -> float:
+        """The same, of the states by the running cost alone: multipliers are no part of a size of the cost."""
+        sizes, bends = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
+        found = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + bends @ sizes.control**2)
+        return float(found) / 2
 
     @property
     def magnitude(self) -> float:

@@ -211,7 +211,7 @@ def audit(
     grid = fine_grid(solution)
     size = sizes_along(form, grid, solution.horizon, p, bounds)
     again = reintegrate(form, solution, p, grid, size)
-    found = optimality(form, solution, p, bounds, size)
+    found = optimality(form, solution, p, bounds, size, lost)
 
     findings = []
     off = again.carried_off(integration)
@@ -277,10 +277,10 @@ def optimality_findings(
     cost, errors = found.cost_size, found.error_size
     share = float(found.lost.sum()) / cost
     if costates is None:
-        costates = max(COSTATES, float(np.sqrt(share))) if np.isfinite(share) and share > 0 else COSTATES
+        costates = max(COSTATES, found.known_to)
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
-        Finding("costate equation, relative", found.adjoint.total / errors, costates),
+        Finding("costate equation, relative", found.adjoint.total / errors + found.unfit, costates),
         worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
         Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]

@@ -22,7 +22,7 @@ from ocp.audit.principle import DEPENDENT, holders, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "Backwards", "Ends", "adjoint"]
+__all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "between", "end_limits", "ends_of_intervals"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -91,7 +91,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
         taken: Lumps of an earlier look, taken from the costates reported at the ends, so that their pushes spread.
     """
     (n, q), m = along.shape, along.stand.lower.shape[1]
-    first, last = _ends_of_intervals(along)
+    first, last = ends_of_intervals(along)
     # what jumps between two intervals is for the pushes at the start of the second to explain
     first = np.vstack([first[:1], last[:-1]])
     if taken is not None:
@@ -130,7 +130,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
         standing.reshape(n * q, m),
         np.abs(first - start) @ size,
         total,
-        np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
+        np.maximum(between(along, costate, last) - force.sum(axis=1), 0.0),
         stand.sum(axis=(1, 2)) + single[0] + single[1],
         _lumps(along, holding, inside, atoms if taken is None else None),
         _ends(along, costate, holding, inside, atoms, cost, last[-1]),
@@ -157,7 +157,7 @@ def _lumps(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms:
     return found
 
 
-def _ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
+def ends_of_intervals(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
     """The reported costates at the start and at the end of every interval, (N, nx) each, each from its own side."""
     curve, mesh = along.solution.costate_interpolant, along.mesh
     if len(curve.breaks) == len(mesh) and np.array_equal(curve.breaks, mesh):
@@ -291,7 +291,7 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     return inside, atoms
 
 
-def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
+def between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Distance of the costates that a plan reports between the ends of its intervals, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     at = along.solution.t / along.solution.horizon
@@ -318,9 +318,9 @@ def _ends(
     """The conditions at the ends with the multipliers, of the right signs, that explain them best."""
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
-    places, sizes = form.bounds.places, along.sizes
-    lam0 = _ends_of_intervals(along)[0][0]
-    slopes, gradient = along.end_y, along.final_y
+    places = form.bounds.places
+    lam0 = ends_of_intervals(along)[0][0]
+    gradient = along.final_y
     # dT H/dT along the plan, what pushes included
     by_horizon = along.cost_y[:, nx] + np.einsum("ki,ki->k", along.rate_y[:, :, nx], costate)
     by_horizon += np.einsum(
@@ -334,50 +334,72 @@ def _ends(
     target = np.concatenate([lam1 - gradient[:nx], -lam0 - gradient[nx : 2 * nx], [-lasting - gradient[-1]]])
     unit = np.concatenate([along.state_size, along.state_size, [solution.horizon]])
 
-    index = np.concatenate([form.end.bounds, form.start.bounds])
-    equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])
-    row_size = np.concatenate([sizes.end, sizes.start])
-    conditions = Limits(along.end_row[None], low[index], high[index], equal, row_size)
-    horizon = places["horizon"]
-    at_horizon = Limits(
-        np.array([[solution.horizon]]), low[horizon], high[horizon], low[horizon] == high[horizon], unit[-1:]
-    )
-    columns, charges, owners, unsigned = [], [], [], []
-    eye = np.eye(2 * nx + 1)
-    node = along.node_stand
-    into = [*range(nx), 2 * nx], [*range(nx, 2 * nx), 2 * nx]
-    parts = [(conditions, slopes, np.arange(len(index)))]
-    parts.append((at_horizon, eye[-1:], np.array([-1])))
-    for k, where in ((n, into[0]), (0, into[1])):
-        wide = np.zeros((along.node_stand_x.shape[1], 2 * nx + 1))
-        wide[:, where] = along.node_stand_x[k]
-        parts.append((node.at(slice(k, k + 1)), wide, np.full(len(wide), -1)))
-    for limit, slope_y, own in parts:
-        lower = limit.lower[0] & ~limit.equal
-        for side, gap, sign in ((limit.upper[0], limit.above[0], 1.0), (lower, limit.below[0], -1.0)):
-            for i in np.flatnonzero(side):
-                reach = float(np.abs(slope_y[i]) @ unit)
-                if reach > 0:
-                    columns.append(sign * slope_y[i] / reach)
-                    charges.append(gap[i] / reach)
-                    owners.append((int(own[i]), sign / reach))
-                    unsigned.append(bool(limit.equal[i]))
+    limits = end_limits(along)
+    reach = np.abs(limits.slope) @ unit
     free = np.ones(2 * nx + 1, bool)
     free[:nx] = low[places["terminal"]] < high[places["terminal"]]
     free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
     free[-1] = form.horizon_is_free
-    matrix = (np.array(columns).reshape(len(columns), 2 * nx + 1) * unit).T[free]
-    found = (
-        nonnegative(matrix, (target * unit)[free] / cost, TRUSTED * np.array(charges), np.array(unsigned, bool)) * cost
-    )
+    matrix = (limits.slope * (limits.sign / reach)[:, None] * unit).T[free]
+    prices = TRUSTED * limits.gap / reach
+    found = nonnegative(matrix, (target * unit)[free] / cost, prices, limits.equal) * cost
     left = np.zeros(2 * nx + 1)
     left[free] = (target * unit)[free] - matrix @ found
-    multipliers = np.zeros(len(index))
-    for (owner, scale), force in zip(owners, found, strict=True):
-        if owner >= 0:
-            multipliers[owner] += scale * force
-    charge = float(np.dot(charges, found)) if charges else 0.0
-    cut = len(form.end)
+    charge = float(limits.gap / reach @ found)
+    multipliers = limits.table(found / reach)
     off = np.abs(left)
     slope = left[nx:] / unit[nx:]
-    return Ends(float(off[:-1].sum()), float(off[-1]), slope, charge, multipliers[:cut], multipliers[cut:])
+    return Ends(float(off[:-1].sum()), float(off[-1]), slope, charge, *multipliers)
+
+
+@dataclass(frozen=True)
+class EndLimits:
+    """What may push at the ends of a plan: end and start rows, bounds of the horizon, limits of the states there.
+
+    Attributes:
+        slope: Derivatives in (x, x0, T), one of each side that may push. Shape (K, 2 nx + 1).
+        sign: 1 of an upper limit, -1 of a lower one. gap: Distance to it. equal: Whether it is an equality, which
+            stands here once. row: Of the end and start rows, in this order, or -1. Shape (K,) each.
+        rows: Numbers of end and start rows.
+    """
+
+    slope: np.ndarray
+    sign: np.ndarray
+    gap: np.ndarray
+    equal: np.ndarray
+    row: np.ndarray
+    rows: tuple[int, int]
+
+    def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Multipliers of the end and the start rows with their signs."""
+        found = np.zeros(sum(self.rows))
+        own = self.row >= 0
+        np.add.at(found, self.row[own], (self.sign * multipliers)[own])
+        return found[: self.rows[0]], found[self.rows[0] :]
+
+
+def end_limits(along: Linearisation) -> EndLimits:
+    """What is near enough to push at the ends of a plan."""
+    form, sizes, nx, (low, high) = along.form, along.sizes, along.form.nx, along.bounds
+    index = np.concatenate([form.end.bounds, form.start.bounds])
+    equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])
+    size = np.concatenate([sizes.end, sizes.start])
+    horizon, place = along.solution.horizon, form.bounds.places["horizon"]
+    lasts = Limits(np.array([[horizon]]), low[place], high[place], low[place] == high[place], np.array([horizon]))
+    parts = [(Limits(along.end_row[None], low[index], high[index], equal, size), along.end_y, np.arange(len(index)))]
+    parts.append((lasts, np.eye(2 * nx + 1)[-1:], np.array([-1])))
+    for k, into in ((-1, [*range(nx), 2 * nx]), (0, [*range(nx, 2 * nx), 2 * nx])):
+        slope = np.zeros((along.node_stand_x.shape[1], 2 * nx + 1))
+        slope[:, into] = along.node_stand_x[k]
+        at = k % len(along.node_stand_x)
+        parts.append((along.node_stand.at(slice(at, at + 1)), slope, np.full(len(slope), -1)))
+    found: list[tuple[np.ndarray, ...]] = []
+    for limits, slope, row in parts:
+        says = np.abs(slope).max(axis=1, initial=0.0) > 0
+        for near, gap, sign in (
+            (limits.upper[0], limits.above[0], 1.0),
+            (limits.lower[0] & ~limits.equal, limits.below[0], -1.0),
+        ):
+            k = np.flatnonzero(near & says)
+            found.append((slope[k], np.full(len(k), sign), gap[k], limits.equal[k], row[k]))
+    return EndLimits(*(np.concatenate(part) for part in zip(*found, strict=True)), (len(form.end), len(form.start)))

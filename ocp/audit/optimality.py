@@ -10,9 +10,9 @@ import numpy as np
 from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import Adjoint, Ends, adjoint
 from ocp.audit.curvature import Curvature, curvature
-from ocp.audit.degeneracy import better_costates
+from ocp.audit.duality import best_multipliers
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import Hamiltonian, hamiltonian, holders, lost, reduced_slope
+from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope
 from ocp.audit.sizes import Sizes, sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
@@ -25,8 +25,8 @@ CONTROLS_KNOWN = 1e-3
 
 SPREADS = 4
 """Times that pushes at single nodes are spread: each finds them better by the width of an interval."""
-DEGENERATE = 1e-5
-"""Share of the cost from which on it is worth looking for costates that fit the plan better than those reported."""
+DEGENERATE = 1e-3
+"""Share of the cost from which on others than the reported costates are looked for."""
 ROUNDING = 1e-10
 """Share of what the controls themselves would cost, below which costates are rounding."""
 
@@ -42,6 +42,9 @@ class Optimality:
         error_size: What errors of the costates are judged against, in units of cost. They cost by their square.
         stationarity: Largest slope of the Hamiltonian that nothing holds at the Gauss points, relative to the sizes
             of its parts. t: their times, s. Both (N q,).
+        known_to: Share of the cost up to which a transcription that loses as much in its controls knows its costates.
+        unfit: Error of the costates reported, as a share of the cost, where others fit the plan better: their distance
+            from these, or what they lose more, by its root.
         adjoint: Costates and multipliers. hamiltonian: Along the plan. curvature: The second variation.
     """
 
@@ -53,16 +56,25 @@ class Optimality:
     adjoint: Adjoint
     hamiltonian: Hamiltonian
     curvature: Curvature
+    known_to: float
+    unfit: float
 
 
 def optimality(
-    form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, size: Sizes | None = None
+    form: Formulation,
+    solution: Solution,
+    p: np.ndarray,
+    bounds: Bounds,
+    size: Sizes | None = None,
+    allowed: float = DEGENERATE,
 ) -> Optimality:
     """Look for the multipliers of a plan, for what it loses and for how the cost curves.
 
     Args:
         form, p, bounds: The problem, its parameters and its bounds at these.
         solution: The plan. size: Sizes along it, where they are known already.
+        allowed: Share of the cost from which on it is worth looking for multipliers that fit the plan better than the
+            costates reported.
     """
     along = Linearisation(form, solution, p, bounds, size or sizes(form, solution, p, bounds))
     if not along.finite:
@@ -80,15 +92,20 @@ def optimality(
             first, told = found, now
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
-    cost = max(abs(solution.cost), CONTROLS_KNOWN * spread, CONTROLS_KNOWN**2 * along.slope_size)
+    cost = max(abs(solution.cost), CONTROLS_KNOWN * accessory.price, CONTROLS_KNOWN**2 * along.slope_size)
     cost = cost if cost > 0 else 1.0
     total = lost(along, first.costate, first.holding, accessory.curved)
-    if accessory.flat.any() and total.sum() > DEGENERATE * cost:
-        costate = better_costates(along, first.costate, first.holding, accessory.flat)
-        less = lost(along, costate, holders(along, costate, accessory.curved)[0], accessory.curved)
-        total = min(total, less, key=np.sum)
-    total = np.maximum(total, 0.0) + first.charge
-    total[0] += first.ends.charge
+    total, best = np.maximum(total, 0.0) + first.charge, first
+    told, unfit = _won(total, first), 0.0
+    if told > allowed * cost:
+        other = best_multipliers(along, first, accessory.curved, cost)
+        if other is not None and _won(*other[:2]) < told:
+            total, best, distance = other
+            unfit = min(distance / cost, float(np.sqrt((told - _won(total, best)) / cost)))
+            accessory = AccessoryProblem(along, best)
+    total[0] += best.ends.charge
+    loses = float(total.sum()) if unfit else told
+    known_to = float(np.sqrt(loses / cost)) if np.isfinite(loses) else 0.0
     second = curvature(accessory)
     total[0] += second.lost(accessory.start_slope)
     return Optimality(
@@ -96,11 +113,18 @@ def optimality(
         cost,
         max(float(np.sqrt(cost * max(cost, spread))), ROUNDING * accessory.magnitude),
         along.t,
-        reduced_slope(along, first.costate, first.holding),
-        first,
+        reduced_slope(along, best.costate, best.holding),
+        best,
         hamiltonian(form, solution, p),
         second,
+        known_to,
+        unfit,
     )
+
+
+def _won(by_interval: np.ndarray, multipliers: Adjoint) -> float:
+    """What a plan loses with these multipliers but for its start, in units of cost."""
+    return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _told(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
@@ -143,4 +167,6 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         Adjoint(t, costate, holding, standing, nothing, np.inf, nothing, nothing, np.zeros((n + 1, form.nx)), ends),
         values,
         curved,
+        0.0,
+        0.0,
     )

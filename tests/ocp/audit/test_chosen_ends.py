@@ -127,7 +127,7 @@ def test_what_a_worse_choice_loses_is_what_it_costs_more(what: str, off: float, 
         assert found.optimal is False
 
 
-@pytest.mark.parametrize("zero", [0.0, 3.0, -1e3])
+@pytest.mark.parametrize("zero", [0.0, 2.0, -1e3])
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("declare", [sprung, priced])
 def test_unit_and_origin_of_a_parameter_change_no_verdict(
