@@ -400,6 +400,7 @@ def end_limits(along: Linearisation) -> EndLimits:
             (limits.upper[0], limits.above[0], 1.0),
             (limits.lower[0] & ~limits.equal, limits.below[0], -1.0),
         ):
-            k = np.flatnonzero(near & says)
-            found.append((slope[k], np.full(len(k), sign), gap[k], limits.equal[k], row[k]))
-    return EndLimits(*(np.concatenate(part) for part in zip(*found, strict=True)), (len(form.end), len(form.start)))
+            own = near & says
+            found.append((slope[own], np.full(int(own.sum()), sign), gap[own], limits.equal[own], row[own]))
+    slopes, signs, gaps, equals, rows = (np.concatenate(part) for part in zip(*found, strict=True))
+    return EndLimits(slopes, signs, gaps, equals, rows, (len(form.end), len(form.start)))

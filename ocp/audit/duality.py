@@ -10,16 +10,16 @@ the slope of the Hamiltonian, by its square over the curvature.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ocp.audit.costates import Adjoint, end_limits, ends_of_intervals
+from ocp.audit.costates import Adjoint, EndLimits, end_limits, ends_of_intervals
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT
 
-__all__ = ["best_multipliers"]
+__all__ = ["Fit", "best_multipliers"]
 
 NEARNESS = 1e-6
 """Weight of the mean square distance from the costates reported, among multipliers that lose as much."""
@@ -35,57 +35,53 @@ SOLVER = {
 }
 
 
-@dataclass
-class _Columns:
-    """Nonnegative multipliers of limits: the point and the limit of each, its sign, and its gap."""
+class Fit(NamedTuple):
+    """Multipliers that lose least.
 
-    point: np.ndarray
-    limit: np.ndarray
-    sign: np.ndarray
-    gap: np.ndarray
+    Attributes:
+        lost: What the plan loses by them in each interval, its ends apart, in units of cost. Shape (N,).
+        adjoint: The multipliers. Errors are those of the costates reported, as they were.
+        distance: Of the costates reported from these, largest of all nodes, in units of cost; 0 beside equalities of
+            the states, where costates are known up to multiples of the gradients of these.
+    """
 
-    @classmethod
-    def of(cls, limits: Limits, chosen: np.ndarray) -> _Columns:
-        """Both sides of ``chosen`` limits, where there is a limit at all. Shape (M, m), bool."""
-        sides = []
-        for sign, gap in ((1.0, limits.above), (-1.0, limits.below)):
-            point, limit = np.nonzero(chosen & np.isfinite(gap))
-            sides.append((point, limit, np.full(len(point), sign), gap[point, limit]))
-        return cls(*(np.concatenate(parts) for parts in zip(*sides, strict=True)))
+    lost: np.ndarray
+    adjoint: Adjoint
+    distance: float
 
-    def __len__(self) -> int:
-        return len(self.point)
 
-    def table(self, values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-        """Multipliers with their signs. Shape (M, m)."""
-        found = np.zeros(shape)
-        np.add.at(found, (self.point, self.limit), self.sign * values)
-        return found
+def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float) -> Fit | None:
+    """The multipliers of a plan that lose least; None where none are found.
+
+    Args:
+        along: The plan. known: Multipliers that are known already.
+        curved: T H_uu of these. Shape (M, nu, nu).
+        cost: A size of the cost.
+    """
+    dual = _Dual(along, curved, cost)
+    x = dual.program.solve()
+    return None if x is None else dual.fit(x * cost, known)
 
 
 class _Program:
-    """A sparse program: least price . x + weight . x^2 / 2 where rows x = right, low <= x."""
+    """A sparse program: least price . x + weight . x^2 / 2 where rows x = right and low <= x."""
 
     def __init__(self) -> None:
-        self.size, self.rows = 0, 0
-        self._low: list[np.ndarray] = []
-        self._price: list[np.ndarray] = []
-        self._weight: list[np.ndarray] = []
+        self._variables: list[np.ndarray] = []  # low, price and weight of each, (3, count)
         self._right: list[np.ndarray] = []
         self._entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def variables(self, count: int, low: Any = -np.inf, price: Any = 0.0, weight: Any = 0.0) -> np.ndarray:
         """Indices of so many more."""
-        for pool, value in ((self._low, low), (self._price, price), (self._weight, weight)):
-            pool.append(np.broadcast_to(np.asarray(value, float), (count,)))
-        self.size += count
-        return np.arange(self.size - count, self.size)
+        first = sum(part.shape[1] for part in self._variables)
+        self._variables.append(np.array([np.broadcast_to(value, (count,)) for value in (low, price, weight)], float))
+        return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Indices of so many more."""
+        """Indices of more, in the shape of their right sides."""
+        first = sum(part.size for part in self._right)
         self._right.append(right)
-        self.rows += len(right)
-        return np.arange(self.rows - len(right), self.rows)
+        return np.arange(first, first + right.size).reshape(right.shape)
 
     def add(self, rows: Any, columns: Any, values: Any) -> None:
         """Entries, of arrays that are broadcast to one shape."""
@@ -96,174 +92,193 @@ class _Program:
     def solve(self) -> np.ndarray | None:
         """The best x; None where there is none."""
         rows, columns, values = (np.concatenate(part) for part in zip(*self._entries, strict=True))
-        matrix = ca.DM.triplet(rows.tolist(), columns.tolist(), ca.DM(values), self.rows, self.size)
-        x, right = ca.MX.sym("x", self.size), np.concatenate(self._right)
-        price, weight = ca.DM(np.concatenate(self._price)), ca.DM(np.concatenate(self._weight))
-        solver = ca.nlpsol(
-            "dual",
-            "ipopt",
-            {"x": x, "f": ca.dot(price, x) + ca.dot(weight, x**2) / 2, "g": ca.mtimes(matrix, x)},
-            SOLVER,
-        )
-        low = np.concatenate(self._low)
+        low, price, weight = np.hstack(self._variables)
+        right = np.concatenate([part.ravel() for part in self._right])
+        matrix = ca.DM.triplet(rows.tolist(), columns.tolist(), ca.DM(values), len(right), len(low))
+        x = ca.MX.sym("x", len(low))
+        paid = ca.dot(ca.DM(price), x) + ca.dot(ca.DM(weight), x**2) / 2
+        solver = ca.nlpsol("dual", "ipopt", {"x": x, "f": paid, "g": ca.mtimes(matrix, x)}, SOLVER)
         found = solver(x0=np.where(np.isfinite(low), 1e-2, 0.0), lbx=low, ubx=np.inf, lbg=right, ubg=right)
         if not solver.stats()["success"]:
             return None
-        return np.maximum(np.asarray(found["x"].full()).ravel(), low)
+        return np.asarray(np.maximum(found["x"].full().ravel(), low))
 
 
-def best_multipliers(
-    along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float
-) -> tuple[np.ndarray, Adjoint, float] | None:
-    """What a plan loses in each interval by the multipliers that lose least; these; how far reported costates are off.
+@dataclass
+class _Pushes:
+    """Multipliers of limits, at least zero, each priced by the gap to its limit.
 
-    None where none are found.
-
-    Args:
-        along: The plan. known: Multipliers that are known already, whose errors of the costates stay.
-        curved: T H_uu of these. Shape (M, nu, nu).
-        cost: A size of the cost.
+    Attributes:
+        point, limit: Where each is, and of what. sign: 1 at an upper limit, -1 at a lower one. Shape (K,) each.
+        slope: Of what is limited, times the sign, over ``reach``. Shape (K, n).
+        reach: What a multiplier of one moves, in units of cost. price: Gap over reach. Shape (K,) each.
+        index: In the program. Shape (K,).
     """
-    form, (n, q), nx, nu = along.form, along.shape, along.form.nx, along.form.nu
-    m, mixed, horizon = n * q, along.mixed, along.solution.horizon
-    size, unit, share = along.state_size, along.sizes.control, along.share
-    program = _Program()
-    # costates at the points, and behind each node; all in units of cost
-    costate = program.variables(m * nx).reshape(m, nx)
-    first, last = ends_of_intervals(along)
-    told = np.vstack([first, last[-1:]]) * size / cost
-    near = NEARNESS / (n + 1)
-    nodes = program.variables((n + 1) * nx, price=-near * told.ravel(), weight=near).reshape(n + 1, nx)
-    point = np.arange(m)
-    interval = point // q
 
-    held = along.hold.near.copy()
-    held[:, :nu], held[:, nu + len(mixed) :] = True, False  # what pushes along arcs of states is among their limits
-    held &= np.abs(along.hold_u).max(axis=2) > 0
-    hold = _Columns.of(along.hold, held)
-    across = along.hold_u[hold.point, hold.limit] * unit
-    reach = np.abs(across).max(axis=1)
-    force = program.variables(len(hold), 0.0, share[hold.point] * hold.gap / reach)
-    beside = np.zeros((len(hold), nx + 1))
-    path = hold.limit >= nu
-    beside[path] = along.row_y[hold.point[path], mixed[hold.limit[path] - nu], : nx + 1]
-    beside *= (hold.sign / reach)[:, None]
+    point: np.ndarray
+    limit: np.ndarray
+    sign: np.ndarray
+    slope: np.ndarray
+    reach: np.ndarray
+    price: np.ndarray
+    index: np.ndarray
 
-    stand = _Columns.of(along.stand, along.stand.near)
-    inner = along.node_stand.near.copy()
-    inner[[0, -1]] = False  # the conditions at the ends have their own
-    inner &= ~along.node_stand.equal if not along.nodal else True
-    node = _Columns.of(along.node_stand, inner)
-    slopes = [
-        table[limits.point, limits.limit] for table, limits in ((along.stand_x, stand), (along.node_stand_x, node))
-    ]
-    lengths = [np.abs(slope[:, :nx]) @ size for slope in slopes]
-    push, atom = (
-        program.variables(len(limits), 0.0, limits.gap / np.where(length > 0, length, 1.0))
-        for limits, length in zip((stand, node), lengths, strict=True)
-    )
-    pushed, struck = (
-        slope * (limits.sign / np.where(length > 0, length, 1.0))[:, None]
-        for slope, limits, length in zip(slopes, (stand, node), lengths, strict=True)
-    )
+    @classmethod
+    def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
+           share: Any = 1.0) -> _Pushes:  # fmt: skip
+        """Both sides of ``chosen`` limits (M, m), bool, with their derivatives (M, m, n) in what has these sizes (n,).
 
-    # lambda' = - dH/dx, backwards over every interval
-    rate_x = along.rate_y[:, :, :nx] * size / size[:, None]
-    given = along.cost_y[:, :nx] * size / cost
-    ahead = along.weight - along.matrix
-    at_points = program.equations(np.einsum("k,ij,kja->kia", along.width, ahead, given.reshape(n, q, nx)).ravel())
-    at_nodes = program.equations(np.einsum("k,j,kja->ka", along.width, along.weight, given.reshape(n, q, nx)).ravel())
-    at_points, at_nodes = at_points.reshape(m, nx), at_nodes.reshape(n, nx)
-    program.add(at_points, costate, 1.0)
-    program.add(at_points, nodes[interval + 1], -1.0)
-    program.add(at_nodes, nodes[:-1], 1.0)
-    program.add(at_nodes, nodes[1:], -1.0)
-    before = node.point - 1  # the interval in front of a node meets its atom too
-    for j in range(q):
-        program.add(at_points[before * q + j], atom[:, None], -struck[:, :nx] * size)
-    program.add(at_nodes[before], atom[:, None], -struck[:, :nx] * size)
-    weights = [(at_points.reshape(n, q, nx)[:, i], ahead[i]) for i in range(q)] + [(at_nodes, along.weight)]
-    for rows, weight in weights:
-        by_point = along.width[interval] * weight[point % q]
-        program.add(
-            rows[interval][:, :, None], costate[:, None, :], -by_point[:, None, None] * rate_x.transpose(0, 2, 1)
+        Those per unit of s cost their gap times the ``share`` (M,) of their point.
+        """
+        reach = (np.abs(slopes) * size).sum(axis=2)
+        sides = []
+        for sign, gap in ((1.0, limits.above), (-1.0, limits.below)):
+            point, limit = np.nonzero(chosen & np.isfinite(gap) & (reach > 0))
+            sides.append((point, limit, np.full(len(point), sign), gap[point, limit]))
+        point, limit, signs, gaps = (np.concatenate(part) for part in zip(*sides, strict=True))
+        moved = reach[point, limit]
+        price = np.broadcast_to(share, len(slopes))[point] * gaps / moved
+        slope = slopes[point, limit] * (signs / moved)[:, None]
+        return cls(point, limit, signs, slope, moved, price, program.variables(len(point), 0.0, price))
+
+    def table(self, x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Multipliers with their signs. Shape (M, m)."""
+        found = np.zeros(shape)
+        np.add.at(found, (self.point, self.limit), self.sign * x[self.index] / self.reach)
+        return found
+
+
+class _Dual:
+    """The program for the multipliers of a plan; costates times the sizes of their states, all in units of cost."""
+
+    def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
+        self.along, self.cost, self.program = along, cost, _Program()
+        (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
+        self.interval = np.arange(n * q) // q
+        self.costate = self.program.variables(n * q * nx).reshape(n * q, nx)
+        first, last = ends_of_intervals(along)
+        self.told = np.vstack([first, last[-1:]]) * along.state_size
+        near = NEARNESS / (n + 1)
+        price = -near * self.told.ravel() / cost
+        self.nodes = self.program.variables(self.told.size, price=price, weight=near).reshape(n + 1, nx)
+
+        # what pushes along arcs of the states is among their own limits
+        held = along.hold.near & (np.arange(along.hold_u.shape[1]) < nu + len(along.mixed))
+        held[:, :nu] = True
+        self.hold = _Pushes.of(self.program, along.hold, held, along.hold_u, along.sizes.control, along.share)
+        wide = np.append(along.state_size, 0.0)
+        self.stand = _Pushes.of(self.program, along.stand, along.stand.near, along.stand_x, wide)
+        inner = along.node_stand.near & (along.nodal | ~along.node_stand.equal)
+        inner[[0, -1]] = False  # the conditions at the ends have their own
+        self.node = _Pushes.of(self.program, along.node_stand, inner, along.node_stand_x, wide)
+        self.beside = np.zeros((len(self.hold.point), nx + 1))  # derivatives of path rows that hold controls, in (x, T)
+        path = self.hold.limit >= nu
+        row = along.mixed[self.hold.limit[path] - nu]
+        self.beside[path] = along.row_y[self.hold.point[path], row, : nx + 1]
+        self.beside *= (self.hold.sign / self.hold.reach)[:, None]
+        self._costate_equation()
+        self._stationarity(curved)
+        self._ends()
+
+    def _costate_equation(self) -> None:
+        """lambda' = -dH/dx over every interval, backwards from behind its last node to behind its first."""
+        along, program, hold, stand, node = self.along, self.program, self.hold, self.stand, self.node
+        (n, q), nx, size = along.shape, along.form.nx, along.state_size
+        fed = (along.rate_y[:, :, :nx] * size / size[:, None]).transpose(0, 2, 1)
+        given = (along.cost_y[:, :nx] * size / self.cost).reshape(n, q, nx)
+        before = node.point - 1  # the interval in front of a node meets its push too
+        steps = [(self.costate.reshape(n, q, nx)[:, i], along.weight - along.matrix[i]) for i in range(q)]
+        for left, weight in [*steps, (self.nodes[:-1], along.weight)]:
+            rows = program.equations(along.width[:, None] * np.einsum("j,kja->ka", weight, given))
+            program.add(rows, left, 1.0)
+            program.add(rows, self.nodes[1:], -1.0)
+            program.add(rows[before], node.index[:, None], -node.slope[:, :nx] * size)
+            by_point, at_once = np.outer(along.width, weight).ravel(), np.tile(weight / along.weight, n)
+            mine = rows[self.interval]
+            program.add(mine[:, :, None], self.costate[:, None, :], -by_point[:, None, None] * fed)
+            force = by_point[hold.point, None] * self.beside[:, :nx] * size
+            program.add(mine[hold.point], hold.index[:, None], -force)
+            force = at_once[stand.point, None] * stand.slope[:, :nx] * size
+            program.add(mine[stand.point], stand.index[:, None], -force)
+
+    def _stationarity(self, curved: np.ndarray) -> None:
+        """dH/du is what is left of it: paid by its square where the Hamiltonian curves, else for a step of one size."""
+        along, program, hold = self.along, self.program, self.hold
+        nx, unit, share = along.form.nx, along.sizes.control, along.share[:, None]
+        rows = program.equations(-along.cost_y[:, nx + 1 :] * unit / self.cost)
+        rate = along.rate_y[:, :, nx + 1 :] * unit / along.state_size[:, None]
+        program.add(rows[:, :, None], self.costate[:, None, :], rate.transpose(0, 2, 1))
+        program.add(rows[hold.point], hold.index[:, None], hold.slope * unit)
+        bends, vectors = np.linalg.eigh(curved * unit * unit[:, None] / self.cost)
+        solid = bends > FLAT * float(np.abs(bends).max(initial=0.0))
+        self.price = np.where(solid, 0.0, share)
+        self.weight = np.where(solid, share / np.where(solid, bends, 1.0), 0.0)
+        self.left = []
+        for sign in (-1.0, 1.0):
+            part = program.variables(rows.size, 0.0, self.price.ravel(), self.weight.ravel()).reshape(rows.shape)
+            program.add(rows[:, :, None], part[:, None, :], sign * vectors)
+            self.left.append(part)
+
+    def _ends(self) -> None:
+        """What is left of the conditions at the ends is paid for a step of one size."""
+        along, program, nx = self.along, self.program, self.along.form.nx
+        form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
+        places, share = form.bounds.places, along.share
+        given = [low[places[k]] == high[places[k]] for k in ("terminal", "initial")]
+        self.free = ~np.append(np.concatenate(given), not form.horizon_is_free)
+        self.scale = np.concatenate([along.state_size, along.state_size, [horizon]])
+        self.ends: EndLimits = end_limits(along)
+        self.reach = np.abs(self.ends.slope) @ self.scale
+        self.grip = program.variables(
+            len(self.reach), np.where(self.ends.equal, -np.inf, 0.0), self.ends.gap / self.reach
         )
-        program.add(rows[interval[hold.point]], force[:, None], -by_point[hold.point][:, None] * beside[:, :nx] * size)
-        at_once = (weight / along.weight)[stand.point % q]
-        program.add(rows[interval[stand.point]], push[:, None], -at_once[:, None] * pushed[:, :nx] * size)
+        right = along.final_y * self.scale / self.cost
+        right[-1] += horizon / self.cost * float(share @ along.cost_y[:, nx])
+        rows = np.full(2 * nx + 1, -1)
+        rows[self.free] = program.equations(right[self.free])
+        own = np.flatnonzero(self.free[:-1])
+        at_ends = np.concatenate([self.nodes[-1], self.nodes[0]])
+        program.add(rows[own], at_ends[own], np.where(own < nx, 1.0, -1.0))
+        slope = self.ends.slope * (self.ends.sign / self.reach)[:, None] * self.scale
+        program.add(rows[self.free], self.grip[:, None], -slope[:, self.free])
+        if form.horizon_is_free:
+            program.add(rows[-1], self.costate, -horizon * share[:, None] * along.rate_y[:, :, nx] / along.state_size)
+            program.add(rows[-1], self.hold.index, -horizon * share[self.hold.point] * self.beside[:, nx])
+            for pushes in (self.stand, self.node):
+                program.add(rows[-1], pushes.index, -horizon * pushes.slope[:, nx])
+        self.missed = []
+        for sign in (-1.0, 1.0):
+            self.missed.append(program.variables(int(self.free.sum()), 0.0, 1.0))
+            program.add(rows[self.free], self.missed[-1], sign)
 
-    # dH/du = what is left of it, paid for by its square where the Hamiltonian curves
-    rate_u = along.rate_y[:, :, nx + 1 :] * unit / size[:, None]
-    stationary = program.equations((-along.cost_y[:, nx + 1 :] * unit / cost).ravel()).reshape(m, nu)
-    program.add(stationary[:, :, None], costate[:, None, :], rate_u.transpose(0, 2, 1))
-    program.add(stationary[hold.point], force[:, None], across * (hold.sign / reach)[:, None])
-    bends, vectors = np.linalg.eigh(curved * unit * unit[:, None] / cost)
-    solid = bends > FLAT * float(np.abs(bends).max(initial=0.0))
-    price = np.where(solid, 0.0, share[:, None])
-    weight = np.where(solid, share[:, None] / np.where(solid, bends, 1.0), 0.0)
-    left = [program.variables(m * nu, 0.0, price.ravel(), weight.ravel()).reshape(m, nu) for _ in range(2)]
-    for sign, part in zip((-1.0, 1.0), left, strict=True):
-        program.add(stationary[:, :, None], part[:, None, :], sign * vectors)
-
-    # the conditions at the ends
-    low, high = along.bounds
-    places = form.bounds.places
-    scale = np.concatenate([size, size, [horizon]])
-    ends = end_limits(along)
-    reach_end = np.abs(ends.slope) @ scale
-    low_end = np.where(ends.equal, -np.inf, 0.0)
-    grip = program.variables(len(ends.sign), low_end, ends.gap / reach_end)
-    right = np.concatenate([along.final_y[:nx], along.final_y[nx:]]) * scale / cost
-    right[-1] += horizon / cost * float(share @ along.cost_y[:, nx])
-    free = np.append(
-        np.concatenate([low[places[k]] < high[places[k]] for k in ("terminal", "initial")]), form.horizon_is_free
-    )
-    total = np.concatenate([nodes[-1], nodes[0]])
-    rows = np.full(2 * nx + 1, -1)
-    rows[free] = program.equations(right[free])
-    own = np.flatnonzero(free[: 2 * nx])
-    program.add(rows[own], total[own], np.where(own < nx, 1.0, -1.0))
-    program.add(rows[free][None], grip[:, None], (-ends.slope * (ends.sign / reach_end)[:, None] * scale)[:, free])
-    if form.horizon_is_free:
-        program.add(rows[-1], costate, -horizon * share[:, None] * along.rate_y[:, :, nx] / size)
-        program.add(rows[-1], force, -horizon * share[hold.point] * beside[:, nx])
-        program.add(rows[-1], push, -horizon * pushed[:, nx])
-        program.add(rows[-1], atom, -horizon * struck[:, nx])
-    missed = [program.variables(int(free.sum()), 0.0, 1.0) for _ in range(2)]
-    for sign, part in zip((-1.0, 1.0), missed, strict=True):
-        program.add(rows[free], part, sign)
-
-    x = program.solve()
-    if x is None:
-        return None
-    x *= cost
-    paid = np.zeros(n)
-    for part in left:
-        rest = x[part]
-        np.add.at(paid, interval, (price * rest + weight * rest**2 / (2 * cost)).sum(axis=1))
-    np.add.at(paid, interval[hold.point], share[hold.point] * hold.gap / reach * x[force])
-    np.add.at(paid, interval[stand.point], stand.gap / lengths[0] * x[push])
-    np.add.at(paid, before, node.gap / lengths[1] * x[atom])
-    holding = hold.table(x[force] / reach, held.shape)
-    at_nodes_pushed = node.table(x[atom] / lengths[1], along.node_stand.lower.shape)
-    standing = stand.table(x[push] / lengths[0], along.stand.lower.shape) / share[:, None]
-    standing.reshape(n, q, -1)[:, -1] += at_nodes_pushed[1:] / share.reshape(n, q)[:, -1, None]
-    slope = np.zeros(2 * nx + 1)
-    slope[free] = (x[missed[1]] - x[missed[0]]) / scale[free]
-    multipliers = ends.table(x[grip] / reach_end)
-    behind = x[nodes] / size
-    before_node = behind.copy()
-    for k, push_x in zip(node.point, struck[:, :nx] * x[atom][:, None], strict=True):
-        before_node[k] += push_x
-    off = np.minimum(np.abs(first - behind[:-1]), np.abs(first - before_node[:-1])) @ size
-    found = replace(
-        known,
-        costate=x[costate] / size,
-        holding=holding,
-        standing=standing,
-        ends=known.ends._replace(
-            slope=slope[nx:], charge=float(ends.gap / reach_end @ x[grip]), end=multipliers[0], start=multipliers[1]
-        ),
-    )
-    # beside equalities of the states costates are known up to multiples of the gradients of these
-    return paid, found, 0.0 if along.stand.equal.any() else float(off.max())
+    def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
+        """What a solution of the program, in units of cost, says."""
+        along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
+        lost = np.zeros(n)
+        for part in self.left:
+            paid = self.price * x[part] + self.weight * x[part] ** 2 / (2 * self.cost)
+            np.add.at(lost, self.interval, paid.sum(axis=1))
+        for pushes, place in ((self.hold, self.interval), (self.stand, self.interval), (self.node, np.arange(-1, n))):
+            np.add.at(lost, place[pushes.point], pushes.price * x[pushes.index])
+        standing = self.stand.table(x, along.stand.lower.shape) / along.share[:, None]
+        at_nodes = self.node.table(x, along.node_stand.lower.shape)
+        standing.reshape(n, q, -1)[:, -1] += at_nodes[1:] / along.share.reshape(n, q)[:, -1:]
+        slope = np.zeros(2 * nx + 1)
+        slope[self.free] = (x[self.missed[1]] - x[self.missed[0]]) / self.scale[self.free]
+        end, start = self.ends.table(x[self.grip] / self.reach)
+        charge = float(self.ends.gap / self.reach @ x[self.grip])
+        behind = x[self.nodes]
+        before = behind.copy()
+        np.add.at(before, self.node.point, self.node.slope[:, :nx] * size * x[self.node.index, None])
+        off = np.minimum(np.abs(self.told - behind), np.abs(self.told - before))[:-1].sum(axis=1)
+        return Fit(
+            lost,
+            replace(
+                known,
+                costate=x[self.costate] / size,
+                holding=self.hold.table(x, along.hold.lower.shape),
+                standing=standing,
+                ends=known.ends._replace(slope=slope[nx:], charge=charge, end=end, start=start),
+            ),
+            0.0 if along.stand.equal.any() else float(off.max()),
+        )

@@ -98,10 +98,10 @@ def optimality(
     total, best = np.maximum(total, 0.0) + first.charge, first
     told, unfit = _won(total, first), 0.0
     if told > allowed * cost:
-        other = best_multipliers(along, first, accessory.curved, cost)
-        if other is not None and _won(*other[:2]) < told:
-            total, best, distance = other
-            unfit = min(distance / cost, float(np.sqrt((told - _won(total, best)) / cost)))
+        fit = best_multipliers(along, first, accessory.curved, cost)
+        if fit is not None and _won(fit.lost, fit.adjoint) < told:
+            total, best = fit.lost, fit.adjoint
+            unfit = min(fit.distance / cost, float(np.sqrt((told - _won(total, best)) / cost)))
             accessory = AccessoryProblem(along, best)
     total[0] += best.ends.charge
     loses = float(total.sum()) if unfit else told

@@ -203,12 +203,12 @@ class Flow:
         data[:count] = np.column_stack([first, starts, place, width, self._columns[interval]])
         now, after, errors = starts[0].copy(), np.empty((whole, size)), np.empty((whole, size))
         memory, evaluate = self._step.buffer()
-        memory.set_arg(0, memoryview(now))
+        memory.set_arg(0, now.data)
         for at in range(0, whole, BLOCK):
             part = slice(at, at + BLOCK)
-            memory.set_arg(1, memoryview(data[part]))
-            memory.set_res(0, memoryview(after[part]))
-            memory.set_res(1, memoryview(errors[part]))
+            memory.set_arg(1, data[part].data)
+            memory.set_res(0, after[part].data)
+            memory.set_res(1, errors[part].data)
             evaluate()
             if memory.ret():
                 raise RuntimeError(f"the dynamics failed at steps {at} to {at + BLOCK - 1}")

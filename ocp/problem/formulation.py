@@ -344,9 +344,9 @@ def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
             memory, evaluate = (function.map(count) if count > 1 else function).buffer()
         part = slice(first, first + BLOCK)
         for i, value in enumerate(inputs):
-            memory.set_arg(i, memoryview(value[part]))
+            memory.set_arg(i, value[part].data)
         for i, value in enumerate(outputs):
-            memory.set_res(i, memoryview(value[part]))
+            memory.set_res(i, value[part].data)
         evaluate()
         if memory.ret():
             raise RuntimeError(f"{function.name()} failed at samples {first} to {first + count - 1}")

@@ -43,7 +43,7 @@ def lasting(horizon: float | None = None) -> Problem:
 def starting(place: float | None = None) -> Problem:
     """From anywhere, at rest, to 1; being away from zero costs."""
     problem = Problem("free start")
-    q = problem.state("q", terminal=1.0, **({} if place is None else {"initial": place}))
+    q = problem.state("q", terminal=1.0, initial=place)
     v, u = problem.state("v", initial=0.0, terminal=0.0), problem.control("u")
     problem.dynamics(q, v)
     problem.dynamics(v, u)
@@ -55,7 +55,7 @@ def starting(place: float | None = None) -> Problem:
 def drifting(place: float | None = None) -> Problem:
     """A start that hardly moves along the best plan, which its own spread makes look small."""
     problem = Problem("hardly moving")
-    x = problem.state("x", **({} if place is None else {"initial": place}))
+    x = problem.state("x", initial=place)
     y, u = problem.state("y", initial=0.0, terminal=3.0), problem.control("u")
     problem.dynamics(x, u)
     problem.dynamics(y, x)
@@ -68,7 +68,7 @@ def sprung(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0)
     """A mass on a spring whose stiffness is for the plan to choose: a state that stands still."""
     problem = Problem("sprung")
     q, v = problem.state("q", initial=1.0), problem.state("v", initial=0.0, terminal=0.0)
-    given = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
+    given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
     k, u = problem.state("k", guess=(5.0 - zero) * unit, **given), problem.control("u")
     stiff = k / unit + zero
     problem.dynamics(q, v)
@@ -83,7 +83,7 @@ def priced(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0)
     """The same where the choice is paid for at the end, and enters nothing else."""
     problem = Problem("priced")
     q, v = problem.state("q", initial=1.0, terminal=0.0), problem.state("v", initial=0.0, terminal=0.0)
-    given = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
+    given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
     k, u = problem.state("k", guess=(5.0 - zero) * unit, **given), problem.control("u")
     problem.dynamics(q, v)
     problem.dynamics(v, u)

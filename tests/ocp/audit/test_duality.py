@@ -1,0 +1,132 @@
+"""Multipliers that lose least: what they lose is what a plan costs more, whatever costates it reports."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ocp import Collocation, MultipleShooting, Problem, Solution, solve
+from ocp.audit.accessory import AccessoryProblem
+from ocp.audit.costates import adjoint
+from ocp.audit.duality import Fit, best_multipliers
+from ocp.audit.linearisation import Linearisation
+from ocp.audit.sizes import sizes
+from ocp.curves import PiecewisePolynomial
+from ocp.problem.formulation import Formulation
+
+METHODS: dict[str, Any] = {
+    "radau": Collocation(15),
+    "radau, held": Collocation(24, control="held"),
+    "held": MultipleShooting(31),
+    "linear": MultipleShooting(17, control="linear"),
+}
+every_method = pytest.mark.parametrize("method", METHODS)
+
+
+def told(declare: str, unit: float = 1.0, second: float = 1.0) -> Problem:
+    """A metre (of so many units) in a second from rest to rest; the cost has no unit."""
+    problem = Problem(declare)
+    speed = {"upper": 1.2 * unit / second} if declare == "speed limit" else {}
+    q = problem.state("q", initial=0.0, terminal=unit)
+    v = problem.state("v", initial=0.0, terminal=0.0, **speed)
+    most = {"effort": 5.0, "speed limit": 30.0, "late": 6.0, "both ways": 6.0}[declare] * unit / second**2
+    problem.dynamics(q, v)
+    if declare == "both ways":
+        forth = problem.control("forth", lower=0.0, upper=most)
+        back = problem.control("back", lower=0.0, upper=most)
+        problem.path("together", forth + back, upper=0.8 * most)
+        problem.dynamics(v, forth - back)
+        running = (forth + 2 * back) / most
+    else:
+        u = problem.control("u", lower=-most, upper=most)
+        problem.dynamics(v, u)
+        running = (u / most) ** 2
+        if declare == "late":
+            running = running / 1e4 + q / unit
+    problem.horizon(second)
+    problem.minimize(running / second)
+    return problem
+
+
+def fitted(plan: Solution) -> Fit:
+    problem = plan.problem
+    assert problem is not None
+    form = Formulation(problem)
+    p = form.parameter_vector(plan.parameters)
+    bounds = form.bound_values(p)
+    along = Linearisation(form, plan, p, bounds, sizes(form, plan, p, bounds))
+    known = adjoint(along, None if along.form.path.equality.all() and not along.nodal else bent(along), abs(plan.cost))
+    found = best_multipliers(along, known, AccessoryProblem(along, known).curved, abs(plan.cost))
+    assert found is not None
+    return found
+
+
+def bent(along: Linearisation) -> np.ndarray:
+    return np.zeros((len(along.s), along.form.nu, along.form.nu))
+
+
+def lost(found: Fit) -> float:
+    return float(found.lost.sum()) + found.adjoint.ends.charge
+
+
+def without_costates(plan: Solution) -> Solution:
+    """The same plan, of which nothing is known but its motion."""
+    curve = plan.costate_interpolant
+    nothing = PiecewisePolynomial(curve.breaks, curve.nodes, np.zeros_like(curve.values))
+    return replace(
+        plan, costates={name: np.zeros_like(part) for name, part in plan.costates.items()}, costate_interpolant=nothing
+    )
+
+
+CASES = ["effort", "speed limit", "late", "both ways"]
+
+
+@pytest.mark.parametrize("declare", CASES)
+@every_method
+def test_what_is_lost_is_what_the_plan_costs_more(declare: str, method: str) -> None:
+    """Convex problems: the best multipliers leave no gap but that of the plan to the optimum.
+
+    Points of an interval in which a control switches see the slope of the Hamiltonian turn: they tell up to twice.
+    """
+    least = solve(told(declare), Collocation(400, 2)).cost
+    plan = solve(told(declare), METHODS[method])
+    more, found, rounded = plan.cost - least, lost(fitted(plan)), 3e-4 * abs(least)
+    assert 0.85 * more - rounded <= found <= (2.0 if declare in ("late", "both ways") else 1.15) * more + rounded
+
+
+@pytest.mark.parametrize("declare", CASES)
+@every_method
+def test_it_does_not_matter_which_costates_are_reported(declare: str, method: str) -> None:
+    plan = solve(told(declare), METHODS[method])
+    before, after = fitted(plan), fitted(without_costates(plan))
+    assert lost(after) == pytest.approx(lost(before), rel=1e-2, abs=3e-6 * abs(plan.cost))
+    assert after.distance > 0.3 * abs(plan.cost)
+    assert before.distance < after.distance
+
+
+@pytest.mark.parametrize(("unit", "second"), [(1e3, 1.0), (1e-3, 60.0), (1.0, 1e-3)])
+@pytest.mark.parametrize("declare", CASES)
+def test_units_change_nothing(declare: str, unit: float, second: float) -> None:
+    one, other = (fitted(solve(told(declare, *units), METHODS["held"])) for units in ((1.0, 1.0), (unit, second)))
+    assert lost(other) == pytest.approx(lost(one), rel=2e-2, abs=1e-6)
+
+
+def test_multipliers_push_their_own_way_and_only_where_a_limit_is_near() -> None:
+    plan = solve(told("speed limit"), METHODS["radau"])
+    found = fitted(plan).adjoint
+    speed = found.standing[:, 1]
+    assert speed.min() >= -1e-6
+    at_limit = plan.state_interpolant(np.repeat(0.5, 1))[0, 1] > 1.2 - 1e-6
+    assert at_limit
+    middle = len(speed) // 2
+    assert speed[middle] > 1e-3 * abs(plan.cost)
+    assert abs(speed[0]) < 1e-6
+
+
+def test_a_plan_far_from_the_best_loses_more() -> None:
+    plan = solve(told("effort"), MultipleShooting(6))
+    finer = solve(told("effort"), MultipleShooting(60))
+    assert lost(fitted(plan)) > 20 * lost(fitted(finer))
