@@ -118,6 +118,13 @@ class AccessoryProblem:
         return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
 
     @property
+    def left(self) -> np.ndarray:
+        """Slope of T H along the controls that curve it, which nothing holds, in scaled controls. Shape (M, nu)."""
+        along = self.along
+        found = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.hold_u, self.adjoint.holding)
+        return np.asarray(np.where(self.flat, 0.0, found * self.range))
+
+    @property
     def start_slope(self) -> np.ndarray:
         """Slope of the cost in start and horizon, in scaled z. Shape (nz,)."""
         into, nx = self.adjoint.ends.slope, self.nx

@@ -26,6 +26,7 @@ from ocp.solution import Solution, check_belongs, check_structure, in_order_of, 
 __all__ = ["Audit", "Finding", "audit"]
 
 COSTATES = 1e-2  # share of the cost that errors of costates may be
+UNFIT = 0.1  # share of the cost that reported costates may be beside others that fit the plan better
 HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
@@ -129,7 +130,7 @@ class Audit:
         if not self.optimal:
             worst = next(f for f in self.failures if f.verdict == "optimal")
             return f"may be run, but is no local minimum: {worst.name} is {worst.value:.3g}, {worst.limit:.3g} allowed"
-        share = float(self.lost.sum()) / self.optimality.cost_size
+        share = self["cost lost, relative"].value
         return f"may be run; a local minimum; at most {share:.2g} of its cost dearer than the extremal beside it"
 
     def __str__(self) -> str:
@@ -218,7 +219,8 @@ def audit(
     findings.append(integration_finding(again, integration, off))
     findings.append(worst("integration error of one interval", again.local_errors, again.t, integration))
     along, running = (again.local, again.local_cost) if off else (again.states, again.cost)
-    findings.append(cost_finding(form, solution, along, running, again.controls[0], size, p, integration))
+    final = form.terminal_cost(along[-1], along[0], again.controls[0], solution.horizon, p)
+    findings.append(cost_finding(solution, running, final, size, integration))
     findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
 
@@ -235,7 +237,7 @@ def audit(
 
     findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
-    findings += optimality_findings(form, found, lost, costates, stationarity, drift)
+    findings += optimality_findings(form, found, solution.cost - running - final, lost, costates, stationarity, drift)
     undecided = found.curvature.flat
     if not solution.success:
         undecided = f"the solver says {solution.status}"
@@ -264,6 +266,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 def optimality_findings(
     form: Formulation,
     found: Optimality,
+    over: float,
     lost: float,
     costates: float | None,
     stationarity: float | None,
@@ -272,15 +275,18 @@ def optimality_findings(
     """First and second order.
 
     Errors of the costates cost by their square: a transcription that loses a share of the cost knows its costates to
-    the root of it, which is no fault of its own. Curvature says something at an extremal alone.
+    the root of it, which is no fault of its own. Curvature says something at an extremal alone. ``over`` is what the
+    plan costs less than it reports.
     """
     cost, errors = found.cost_size, found.error_size
-    share = float(found.lost.sum()) / cost
+    wrong = max(over, 0.0) if np.isfinite(over) else 0.0  # what is reported too much is none of an extremal's either
+    share = (float(found.lost.sum()) + wrong) / cost
     if costates is None:
         costates = max(COSTATES, found.known_to)
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
-        Finding("costate equation, relative", found.adjoint.total / errors + found.unfit, costates),
+        Finding("costate equation, relative", found.adjoint.total / errors, costates),
+        Finding("costates beside the best, relative", found.unfit, UNFIT),
         worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
         Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]
@@ -327,20 +333,10 @@ def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None,
     return Finding(name, float(clean[k]), limit, float(times[k]) if clean[k] > 0 else None, note)
 
 
-def cost_finding(
-    form: Formulation,
-    solution: Solution,
-    states: np.ndarray,
-    running: float,
-    first: np.ndarray,
-    sizes: Sizes,
-    p: np.ndarray,
-    limit: float,
-) -> Finding:
-    """The cost of the re-integrated plan against the one the solver reports."""
-    end = form.terminal_cost(states[-1], states[0], first, solution.horizon, p)
-    cost = running + end
-    size = max(abs(cost), abs(end), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
+def cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
+    """The cost of the re-integrated plan, along it and at its end, against the one the solver reports."""
+    cost = running + final
+    size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
     off = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
     return Finding("cost, relative", off, limit, None, f"reported {solution.cost:.8g}, integrated {cost:.8g}")
 

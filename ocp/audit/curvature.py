@@ -44,6 +44,8 @@ class Curvature:
         t: Times of the Gauss points, s. Shape (M,).
         starts: Variations of start and horizon, a column each, and the curvature of the cost along each, 0 where it is
             none, controls following at their best. Shapes (nz, k), (k,). None where the sweep does not come so far.
+        won: What the controls could win in each interval, states following: by the best variation, active constraints
+            held, in units of cost (N,). pull: Slope of the cost in the start that is left by it. Shape (nz,).
     """
 
     least: float
@@ -52,6 +54,8 @@ class Curvature:
     direction: tuple[np.ndarray, np.ndarray] | None
     t: np.ndarray
     starts: tuple[np.ndarray, np.ndarray] | None = None
+    won: np.ndarray | None = None
+    pull: np.ndarray | None = None
 
     @property
     def upwards(self) -> bool | None:
@@ -68,7 +72,7 @@ class Curvature:
         if self.starts is None:
             return 0.0
         variations, curved = self.starts
-        pull = np.abs(slope @ variations)
+        pull = np.abs((slope if self.pull is None else slope + self.pull) @ variations)
         bent = np.where(curved > 0, curved, 1.0)
         return float(np.where(curved > 0, pull**2 / (2 * bent), pull).sum())
 
@@ -88,25 +92,26 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
         inside = _sweep(accessory, weak=True)
         if inside.least > FLAT:
             why = "the cost curves upwards only because of limits that are touched without a push"
-            return Curvature(inside.least, inside.time, why, None, along.t, inside.starts)
+            return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:])
         found = inside
     if found.flat.startswith(NEARLY):
         # without what is left of conditions that others imply there is more to vary: upwards all the more
         wider = _sweep(accessory, weak=False, tied=TIED)
         if wider.least > FLAT and not wider.flat:
             found = wider
-    least, time, flat, direction, starts = found
-    return Curvature(least, time, flat, direction, along.t, starts)
+    return Curvature(*found[:4], along.t, *found[4:])
 
 
 class _Swept(NamedTuple):
-    """Least curvature, its time, why it is not decided, a direction that lowers the cost, and `Curvature.starts`."""
+    """Least curvature, its time, why it is not decided, a direction that lowers the cost; the rest of `Curvature`."""
 
     least: float
     time: float | None
     flat: str
     direction: tuple[np.ndarray, np.ndarray] | None
     starts: tuple[np.ndarray, np.ndarray] | None = None
+    won: np.ndarray | None = None
+    pull: np.ndarray | None = None
 
 
 def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swept:
@@ -153,15 +158,20 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
     scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
     least, at, flat = np.inf, None, ""
     gains: list[np.ndarray] = []
+    share = (metric**2).reshape(n, q, 1)
+    slopes = np.einsum("kju,kjuc->kc", share * accessory.left.reshape(n, q, nu), whole[:, :, nz:])
+    pull, won = np.zeros(nz), np.zeros(n)
     for k, (lift, move, bend, above) in reversed(list(enumerate(_freed(accessory, sweep, weak, tied)))):
         joined = bend + move.T @ cost @ move
         if len(rows):
             carried = rows_of_length_one(rows @ move, tied)
             (inner,), (unheld,) = _eliminated(carried[None], nz, tied)
-            joined, lift = inner.T @ joined @ inner, lift @ inner
+            joined, lift, move = inner.T @ joined @ inner, lift @ inner, move @ inner
             above = np.vstack([above, unheld])
         rows = rows_of_length_one(above, tied)
         mixed, gain, cost = joined[nz:, :nz], lift[nz:, :nz], joined[:nz, :nz]
+        slope = lift.T @ slopes[k] + move.T @ pull
+        pull = slope[:nz]
         if lift.shape[1] > nz:
             values, vectors = np.linalg.eigh(joined[nz:, nz:])
             if values[0] / scale < least:
@@ -181,6 +191,8 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
                 )
             answer = (vectors[:, curved] / values[curved]) @ (vectors[:, curved].T @ mixed)
             gain = gain - lift[nz:, nz:] @ answer
+            pull = pull - answer.T @ slope[nz:]
+            won[k] = ((vectors[:, curved].T @ slope[nz:]) ** 2 / values[curved]).sum() / 2
             cost = cost - mixed.T @ answer
         cost = (cost + cost.T) / 2
         gains.append(gain)
@@ -196,7 +208,7 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
         if values[0] <= FLAT * scale:
             flat = flat or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT * scale, values, 0.0)
-    return _Swept(least, at, flat, None, starts)
+    return _Swept(least, at, flat, None, starts, won, pull)
 
 
 def _freed(

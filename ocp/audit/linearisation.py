@@ -22,6 +22,8 @@ __all__ = ["NEAR", "Limits", "Linearisation", "gauss"]
 
 POINTS = (3, 5)
 """Least and largest number of Gauss points of an interval."""
+MOST_NEEDED = 150
+"""Gauss points of a plan from which on the least of an interval are enough: few intervals are wide ones."""
 MOST_DERIVATIVES = 3
 """Of a limit of the states, looked at for a control."""
 NEAR = 1e-2
@@ -97,7 +99,7 @@ class Linearisation:
         n = len(self.width)
         pieces = (len(solution.state_interpolant.breaks) - 1) / n
         degree = max(len(solution.control_interpolant.nodes), solution.state_interpolant.values.shape[1] - 1)
-        q = POINTS[1] if pieces > 1 else int(np.clip(degree, *POINTS))
+        q = POINTS[1] if pieces > 1 else int(np.clip(max(degree, MOST_NEEDED / n), *POINTS))
         self.shape = n, q
         self.places = np.array(ca.collocation_points(q, "legendre"))
         self.matrix, self.weight = gauss(self.places)

@@ -12,7 +12,7 @@ from ocp.audit.costates import Adjoint, Ends, adjoint
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.duality import best_multipliers
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope
+from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope, turning
 from ocp.audit.sizes import Sizes, sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
@@ -100,13 +100,17 @@ def optimality(
     if told > allowed * cost:
         fit = best_multipliers(along, first, accessory.curved, cost)
         if fit is not None and _won(fit.lost, fit.adjoint) < told:
-            total, best = fit.lost, fit.adjoint
+            best = fit.adjoint
+            total = np.maximum(fit.lost + turning(along, best.costate, accessory.curved), 0.0)
             unfit = min(fit.distance / cost, float(np.sqrt((told - _won(total, best)) / cost)))
             accessory = AccessoryProblem(along, best)
     total[0] += best.ends.charge
     loses = float(total.sum()) if unfit else told
     known_to = float(np.sqrt(loses / cost)) if np.isfinite(loses) else 0.0
     second = curvature(accessory)
+    if second.upwards and second.won is not None:  # near a conjugate point states that follow win more
+        more = float(second.won.sum() - total.sum())
+        total += max(more, 0.0) * second.won / (float(second.won.sum()) or 1.0)
     total[0] += second.lost(accessory.start_slope)
     return Optimality(
         total,

@@ -28,6 +28,7 @@ __all__ = [
     "nonnegative",
     "reduced_slope",
     "slope",
+    "turning",
 ]
 
 DEPENDENT = 1e-9
@@ -225,7 +226,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     unit = along.sizes.control
     won = along.hold.charge(multipliers).sum(axis=1)
     gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
-    gradient, curved = gradient * unit, curved * (unit * unit[:, None])
+    gradient, curved_u, curved = gradient * unit, curved, curved * (unit * unit[:, None])
     low, high = (np.clip((side - along.u) / unit, -1e3, 1e3) for side in (along.low, along.high))
     low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
@@ -247,18 +248,24 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
         if (blocked == fixed).all():
             break
         fixed = blocked
-    by_interval = ((won + best) * along.share).reshape(n, -1).sum(axis=1)
-    if along.mixed.size:
-        return np.asarray(by_interval)
-    free = slope(along, costate) * unit
-    flat = np.abs(curved).max(axis=(0, 2)) <= FLAT * max(scale, float(np.abs(free).max(initial=0.0)))
-    return np.asarray(by_interval + _kinks(along, free[:, flat], -low[:, flat], high[:, flat]))
+    return np.asarray(((won + best) * along.share).reshape(n, -1).sum(axis=1) + turning(along, costate, curved_u))
 
 
-def _kinks(along: Linearisation, pull: np.ndarray, down: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """What the quadrature of max(pull, 0) down + max(-pull, 0) up (M, m) misses of intervals where pull turns. (N,)."""
-    (n, q), m = along.shape, pull.shape[1]
-    pull = pull.reshape(n, q, m)
+def turning(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
+    """What a quadrature misses of intervals in which the slope along a control that does not curve turns. Shape (N,).
+
+    The loss there is that of max(slope, 0) and max(-slope, 0) times the ways to both limits. Args as of `lost`.
+    """
+    (n, q), unit = along.shape, along.sizes.control
+    pull, bends = slope(along, costate) * unit, curved * (unit * unit[:, None])
+    largest = max(float(np.abs(bends).max(initial=0.0)), float(np.abs(pull).max(initial=0.0)))
+    flat = np.abs(bends).max(axis=(0, 2), initial=0.0) <= FLAT * largest
+    if along.mixed.size or not flat.any():
+        return np.zeros(n)
+    m, pull = int(flat.sum()), pull[:, flat].reshape(n, q, -1)
+    down, up = (
+        np.maximum(sign * (side - along.u) / unit, 0.0)[:, flat] for sign, side in ((-1, along.low), (1, along.high))
+    )
     turns = (pull.min(axis=1) < 0) & (pull.max(axis=1) > 0)
     off = along.places - along.weight @ along.places
     steep = np.einsum("j,kjm->km", along.weight * off, pull) / (along.weight @ off**2)

@@ -18,6 +18,8 @@ from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import balance
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
+from tests.ocp.audit.drawn import drawn
+from tests.ocp.problems import Array
 
 METHOD = Collocation(intervals=20, degree=3)
 
@@ -315,3 +317,40 @@ def test_an_entry_that_stands_still_is_curved_as_its_neighbours_are() -> None:
     solution, found = look(problem)
     assert np.abs(solution["rates"][:, 1]).max() < 1e-9
     assert found.upwards is True
+
+
+# ---- what a plan loses where its variations hardly curve -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bump", [0.05, 0.3])
+@pytest.mark.parametrize("weight", [1.0, 7.0, 9.0, 9.6])
+def test_near_a_conjugate_point_a_plan_loses_more_than_its_controls_alone_could_win(weight: float, bump: float) -> None:
+    """Least int (u^2 - w x^2) / 2 from 1 to 0.5 in 1 s, w below pi^2; beside it by bump sin(pi t).
+
+    The second variation says exactly what this costs more, bump^2 (pi^2 - w) / 4; it is bump^2 (pi - w / pi)^2 / 4
+    by the slope of the Hamiltonian alone.
+    """
+    problem = Problem("nearly conjugate")
+    x, u = problem.state("x", initial=1.0, terminal=0.5), problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.minimize((u**2 - weight * x**2) / 2 + 20)
+    k = np.sqrt(weight)
+    b = (0.5 - np.cos(k)) / np.sin(k)
+
+    def place(t: Array) -> Array:
+        return np.asarray(np.cos(k * t) + b * np.sin(k * t) + bump * np.sin(np.pi * t))
+
+    def speed(t: Array) -> Array:
+        return np.asarray(k * (b * np.cos(k * t) - np.sin(k * t)) + bump * np.pi * np.cos(np.pi * t))
+
+    def costate(t: Array) -> Array:  # of lambda' = w x, zero mean of u + lambda
+        way = (np.sin(k * t) + b * (1 - np.cos(k * t))) / k + bump * (1 - np.cos(np.pi * t)) / np.pi
+        return np.asarray(weight * way - weight * bump / np.pi - k * b)
+
+    plan = drawn(problem, {"x": place}, {"u": speed}, {"x": costate}, 1.0, 40)
+    found = plan.audit()
+    more = bump**2 * (np.pi**2 - weight) / 4
+    assert found.feasible
+    assert found["cost lost, relative"].value * found.optimality.cost_size == pytest.approx(more, rel=0.02)
+    assert found.optimal is (more < 1e-3 * found.optimality.cost_size)

@@ -29,7 +29,7 @@ every_method = pytest.mark.parametrize("method", METHODS)
 def told(declare: str, unit: float = 1.0, second: float = 1.0) -> Problem:
     """A metre (of so many units) in a second from rest to rest; the cost has no unit."""
     problem = Problem(declare)
-    speed = {"upper": 1.2 * unit / second} if declare == "speed limit" else {}
+    speed: dict[str, Any] = {"upper": 1.2 * unit / second} if declare == "speed limit" else {}
     q = problem.state("q", initial=0.0, terminal=unit)
     v = problem.state("v", initial=0.0, terminal=0.0, **speed)
     most = {"effort": 5.0, "speed limit": 30.0, "late": 6.0, "both ways": 6.0}[declare] * unit / second**2
