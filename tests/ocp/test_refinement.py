@@ -270,7 +270,7 @@ def beyond_the_conjugate_point() -> Problem:
 
 @pytest.mark.parametrize("method", [Collocation(10), MultipleShooting(10)])
 def test_a_problem_without_a_minimum_is_called_so(method: Method) -> None:
-    with pytest.raises(SolveError, match="stationary but no minimum.*may be unbounded below") as caught:
+    with pytest.raises(SolveError, match=r"stationary but no minimum.*may be unbounded below") as caught:
         refine(beyond_the_conjugate_point(), method)
     assert caught.value.solution is not None
     assert caught.value.solution.audit().optimal is False
