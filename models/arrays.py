@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite, isnan
 from numbers import Real
 from typing import Any, TypeAlias, TypeVar
@@ -20,6 +20,9 @@ ArrayInput: TypeAlias = Any
 IDENTITY = np.eye(3)
 MOST = 100_000
 """Of what is counted: more than these take longer than anybody waits."""
+MOST_NUMBERS = 2**22
+"""Of one array that a user gives."""
+MOST_DIMENSIONS = 64  # of an array of numpy
 TWO_TURNS, ENDLESS = 4 * np.pi, 1e4
 """rad: angles between the two look like degrees; beyond the second they are written for no limit at all."""
 LONGEST_PART = 50.0
@@ -80,12 +83,32 @@ def checked_array(
     return frozen(array)
 
 
+def check_entries(value: Any) -> None:
+    """Raise ValueError of more than MOST_NUMBERS entries: a view or a range may be larger than all memory.
+
+    Nothing is copied or gone through: the first entry of a list stands for all.
+    """
+    entries, part = 1, value
+    for _ in range(MOST_DIMENSIONS):
+        if isinstance(part, np.ndarray):
+            entries *= part.size
+        if not isinstance(part, Sequence) or isinstance(part, str | bytes):
+            break
+        entries *= len(part)
+        if not 0 < entries <= MOST_NUMBERS:
+            break
+        part = part[0]
+    if entries > MOST_NUMBERS:
+        raise ValueError(f"{entries} entries, at most {MOST_NUMBERS} are read")
+
+
 def floats(value: ArrayInput) -> Array:
     """`value` as a new array of floats; one of NOT_NUMBERS where it is none.
 
-    That is also where numpy would read a number all the same: in a text, in True, in None and in a symbol (nan), in the
-    real part of a complex number.
+    That is also where they are more than MOST_NUMBERS, which are not copied, and where numpy would read a number all
+    the same: in a text, in True, in None and in a symbol (nan), in the real part of a complex number.
     """
+    check_entries(value)
     plain = np.asarray(value)
     if plain.dtype.kind == "O":
         fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
@@ -164,7 +187,11 @@ def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int =
 
 def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np.intp]:
     """`value` as an array of indices; ModelError naming `owner` and `what` unless they are whole, from 0 to `count`."""
-    found = np.asarray(value)
+    try:
+        check_entries(value)
+        found = np.asarray(value)
+    except NOT_NUMBERS:  # refused below
+        found = np.array(np.nan)
     if found.dtype.kind not in "iu" or ((found < 0) | (found >= count)).any():
         message = f"{owner}: {what} must be whole numbers from 0, below {count}, not {value!r}"
         raise ModelError(message, name=what, value=value, limit=(0, count))
@@ -248,8 +275,9 @@ def checked_instance(value: Any, kind: type[_Kind], owner: str, what: str) -> _K
 def checked_each(values: Any, kind: type[_Kind], owner: str, what: str) -> tuple[_Kind, ...]:
     """`values` as a tuple; ModelError naming `owner` and `what` unless they are several (or none) of a `kind`."""
     try:
+        check_entries(values)
         each = tuple(values)
-    except TypeError as error:
+    except NOT_NUMBERS as error:
         message = f"{owner}: {what} must be a list of {kind.__name__}, not {values!r}"
         raise ModelError(message, name=what, value=values, limit=kind.__name__) from error
     for value in each:

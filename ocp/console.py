@@ -27,8 +27,10 @@ __all__ = [
     "INTERRUPTED",
     "LOG",
     "OUT_OF_TIME",
+    "OutOfTime",
     "Progress",
     "Watch",
+    "check_time",
     "interruptible",
     "limited",
     "listening",
@@ -176,6 +178,16 @@ def limited(seconds: float | None) -> Iterator[None]:
 def time_left() -> float:
     """Seconds until the time limit, infinite without one; negative behind it."""
     return _DEADLINE.get() - time.monotonic()
+
+
+class OutOfTime(Exception):
+    """What has no word of its own for it is behind its time limit; who set the limit says what was found."""
+
+
+def check_time() -> None:
+    """Raise OutOfTime behind the time limit."""
+    if time_left() <= 0:
+        raise OutOfTime(OUT_OF_TIME)
 
 
 # ---- progress ----------------------------------------------------------------------------------------------------

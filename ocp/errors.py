@@ -24,6 +24,7 @@ __all__ = [
     "RefinementWarning",
     "SolveError",
     "about",
+    "check_entries",
     "checked_choice",
     "checked_count",
     "checked_each",
@@ -43,6 +44,9 @@ NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplemente
 """What numpy and casadi raise of values that are no numbers."""
 MOST = 1_000_000
 """Of what is counted: more than these take longer than anybody waits."""
+MOST_NUMBERS = 2**22
+"""Of one array that a user gives."""
+MOST_DIMENSIONS = 64  # of an array of numpy
 _Kind = TypeVar("_Kind")
 
 
@@ -121,12 +125,32 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
     return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name) or kind, limit=tuple(names))
 
 
+def check_entries(value: Any) -> None:
+    """Raise ValueError of more than MOST_NUMBERS entries: a view or a range may be larger than all memory.
+
+    Nothing is copied or gone through: the first entry of a list stands for all.
+    """
+    entries, part = 1, value
+    for _ in range(MOST_DIMENSIONS):
+        if isinstance(part, np.ndarray):
+            entries *= part.size
+        if not isinstance(part, Sequence) or isinstance(part, str | bytes):
+            break
+        entries *= len(part)
+        if not 0 < entries <= MOST_NUMBERS:
+            break
+        part = part[0]
+    if entries > MOST_NUMBERS:
+        raise ValueError(f"{entries} entries, at most {MOST_NUMBERS} are read")
+
+
 def floats(value: Any) -> np.ndarray:
     """``value`` as a new array of floats; one of NOT_NUMBERS where it is none.
 
-    That is also where numpy would read a number all the same: in a text, in True, in None and in a symbol (nan), in the
-    real part of a complex number.
+    That is also where they are more than MOST_NUMBERS, which are not copied, and where numpy would read a number all
+    the same: in a text, in True, in None and in a symbol (nan), in the real part of a complex number.
     """
+    check_entries(value)
     plain = np.asarray(value)
     if plain.dtype.kind == "O":
         fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
@@ -210,8 +234,9 @@ def checked_instance(what: str, value: Any, kind: type[_Kind]) -> _Kind:
 def checked_each(what: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
     """``values`` as a tuple, or ProblemError unless they are several (or none) of a ``kind``."""
     try:
+        check_entries(values)
         each = tuple(values)
-    except TypeError as error:
+    except NOT_NUMBERS as error:
         words = f"{what} must be a list of {kind.__name__}, not {values!r}"
         raise ProblemError(words, name=_last(what), value=values, limit=kind.__name__) from error
     for value in each:

@@ -6,14 +6,24 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from inspect import Parameter, signature
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
+from ocp.console import OUT_OF_TIME, OutOfTime, limited, time_left
 from ocp.direct.prepared import DirectMethod, check_meshed
-from ocp.errors import ProblemError, RefinementWarning, about, checked_count, checked_mapping, unknown_name
+from ocp.errors import (
+    ProblemError,
+    RefinementWarning,
+    SolveError,
+    about,
+    checked_count,
+    checked_mapping,
+    checked_time_limit,
+    unknown_name,
+)
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -44,6 +54,7 @@ def refine(
     solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
+    time_limit: float | None = None,
 ) -> Solution:
     """Solve, and split intervals until no row of the audit is beyond its limit.
 
@@ -63,20 +74,26 @@ def refine(
         breaks: Times at which there have to be nodes, because something jumps or bends there, s. Of a fixed horizon
             only; for a free one give ``method.with_nodes_at(fractions)``.
         max_intervals: Cap on the number of intervals.
+        time_limit: After so many seconds, all rounds and their audits included, it stops: a solve between two
+            iterations, an audit between two of its parts. None for no limit.
 
     Returns:
-        The last solution; its ``refinement`` says how the mesh came about, and whether the audit passes in the end.
+        The last solution, or at the time limit the last that was audited; its ``refinement`` says how the mesh came
+        about, and whether the audit passes in the end.
 
     Raises:
         ProblemError: tolerance not positive, a limit that the audit does not have, breaks outside the horizon or of a
-            free one, cap below the first mesh.
-        SolveError: A round failed.
+            free one, cap below the first mesh, a time limit that is none.
+        SolveError: A round failed, or the time limit was reached in the first, before there was an audited plan; then
+            it names ``time_limit`` and carries the plan as an unsuccessful one.
 
     Warns:
-        RefinementWarning: It stopped with a row beyond its limit, at the cap or where finer intervals do not help, and
-            names the worst; or with all rows within theirs where the audit does not decide whether it is an optimum.
+        RefinementWarning: It stopped with a row beyond its limit, at the cap, at the time limit or where finer
+            intervals do not help, and names the worst; or with all rows within theirs where the audit does not decide
+            whether it is an optimum.
     """
     check_meshed("refine", method, tolerance)
+    checked_time_limit(time_limit)
     settings = checked_mapping("refine: limits", limits)
     for name in settings:
         if name not in LIMITS:
@@ -95,28 +112,35 @@ def refine(
     intervals: list[int] = []
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     best: dict[str, float] = {}
-    idle = 0
-    while True:
-        solution = solve(problem, method, parameters=parameters, solver=solver, options=options, guess=guess)
-        audit = judge(problem, solution, **settings)
-        rows = _rows(form, p, solution, audit, tolerance, method)
-        beyond = [row for row in rows if not row.value <= 1.0]
-        intervals.append(method.intervals)
-        for kind, values in errors.items():
-            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
-        nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
-        best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
-        idle = 0 if nearer else idle + 1
-        finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
-        if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
-            break
-        method = method.with_mesh(finer)
-        guess = solution
+    idle, late = 0, False
+    given = {"parameters": parameters, "solver": solver, "options": options}
+    with limited(time_limit):
+        solution, audit = _first(problem, method, {**given, "guess": guess}, settings, time_limit)
+        while True:
+            rows = _rows(form, p, solution, audit, tolerance, method)
+            beyond = [row for row in rows if not row.value <= 1.0]
+            intervals.append(method.intervals)
+            for kind, values in errors.items():
+                values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+            nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
+            best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
+            idle = 0 if nearer else idle + 1
+            finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
+            if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
+                break
+            method = method.with_mesh(finer)
+            found = _next(problem, method, {**given, "guess": solution}, settings)
+            if found is None:
+                late = True
+                break
+            solution, audit = found
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "raise max_intervals"
-        if idle == PATIENCE:
+        if late:
+            hint = "the time limit is reached: raise time_limit"
+        elif idle == PATIENCE:
             hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
         words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
         warnings.warn(RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0), stacklevel=2)
@@ -127,6 +151,46 @@ def refine(
     return dataclasses.replace(
         solution, refinement=Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
     )
+
+
+def _first(
+    problem: Problem, method: DirectMethod, given: dict[str, Any], settings: dict[str, Any], time_limit: float | None
+) -> tuple[Solution, Audit]:
+    """The plan on the first mesh, and its audit.
+
+    Raises:
+        SolveError: The solve failed, or the time limit is reached.
+    """
+    solution = solve(problem, method, **given)
+    try:
+        return solution, judge(problem, solution, **settings)
+    except OutOfTime as error:
+        words = f"{OUT_OF_TIME}: raise time_limit"
+        raise SolveError(
+            f"refinement of {problem.name!r} ended in the audit of its first plan with {words}",
+            dataclasses.replace(solution, success=False, status=words),
+            name="time_limit",
+            value=time_limit,
+        ) from error
+
+
+def _next(
+    problem: Problem, method: DirectMethod, given: dict[str, Any], settings: dict[str, Any]
+) -> tuple[Solution, Audit] | None:
+    """The plan on a finer mesh, and its audit; None where the time limit is reached before there are both.
+
+    Raises:
+        SolveError: The solve failed while there was time.
+    """
+    if time_left() <= 0:
+        return None  # nothing is built
+    try:
+        solution = solve(problem, method, **given)
+        return solution, judge(problem, solution, **settings)
+    except (SolveError, OutOfTime) as error:
+        if isinstance(error, SolveError) and time_left() > 0:
+            raise
+        return None
 
 
 class _Row(NamedTuple):

@@ -35,6 +35,7 @@ __all__ = [
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 2
+MOST_HEAD = 2**24  # bytes of its text: a mesh of half a million intervals
 SLACK = 1e-12  # relative, of what rounding may do to times
 HEAD = {
     "name": str,
@@ -216,7 +217,8 @@ class Solution:
         A problem whose expressions CasADi cannot write, such as one that calls a function of Python, is left out.
 
         Raises:
-            ProblemError: path is a folder, a pipe or a device, or the plan is larger than :meth:`load` reads.
+            ProblemError: path is a folder, a pipe or a device, or the plan or its head is larger than :meth:`load`
+                reads.
             OSError: The file cannot be written.
         """
         arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in PLAIN}
@@ -235,6 +237,9 @@ class Solution:
             function = head["problem"].pop("function")  # long, and apart from what a reader of the head looks for
             arrays["problem"] = np.frombuffer(function.encode(), dtype=np.uint8)
         arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
+        if arrays["head"].nbytes > MOST_HEAD:
+            words = f"{path}: the settings of the plan take more than the {MOST_HEAD:.3g} bytes that are read"
+            raise ProblemError(words, name="head", value=arrays["head"].nbytes, limit=MOST_HEAD)
         write_arrays(path, arrays)
 
     @classmethod
@@ -251,7 +256,7 @@ class Solution:
         """
         arrays = read_arrays(path)
         try:
-            head = json.loads(arrays.pop("head").tobytes().decode())
+            head = read_head(path, arrays.pop("head"))
             version = head.pop("version")
             if isinstance(version, bool) or version not in (1, VERSION):
                 words = f"{path}: written by another version of the format ({version}, not {VERSION})"
@@ -319,6 +324,17 @@ class Solution:
     def __deepcopy__(self, memo: Any) -> Solution:
         """A solution of arrays of its own, of a copy of the problem."""
         return replace(self, **{f.name: deepcopy(getattr(self, f.name), memo) for f in dataclass_fields(self)})
+
+
+def read_head(path: Any, text: np.ndarray) -> Any:
+    """What stands in the head of a file; ProblemError where it is longer than that of any plan.
+
+    JSON takes up to thirty times its length when it is read.
+    """
+    if text.nbytes > MOST_HEAD:
+        words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MOST_HEAD:.3g} at most"
+        raise ProblemError(words, name="head", value=text.nbytes, limit=MOST_HEAD)
+    return json.loads(text.tobytes().decode())
 
 
 def by_name(kind: str, name: Any, pool: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import interruptible
+from ocp.console import OUT_OF_TIME, interruptible, limited, time_left
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
-from ocp.errors import SolveError, checked_mapping
+from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution
 
@@ -36,6 +36,7 @@ def tighten(
     solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
+    time_limit: float | None = None,
 ) -> Solution:
     """Solve so that every inequality holds between the points of the grid as well.
 
@@ -47,12 +48,31 @@ def tighten(
         problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
         method: Collocation or MultipleShooting.
         tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
+        time_limit: After so many seconds, the build and all solves included, the solver is stopped between two
+            iterations, which counts as a failure. None for no limit.
 
     Raises:
-        ProblemError: tolerance not positive, another method.
-        SolveError: A solve failed, or the excess does not fall under the tolerance; says what remains and where.
+        ProblemError: tolerance not positive, another method, a time limit that is none.
+        SolveError: A solve failed, or the excess does not fall under the tolerance, or not in time; says what remains
+            and where. Where there was a plan before the time limit, it names ``time_limit`` and carries, as an
+            unsuccessful one, the plan that exceeds its bounds least.
     """
     check_meshed("tighten", method, tolerance)
+    with limited(checked_time_limit(time_limit)):
+        return _tightened(problem, method, tolerance, parameters, solver, options, guess, time_limit)
+
+
+def _tightened(
+    problem: Any,
+    method: DirectMethod,
+    tolerance: float,
+    parameters: ByName,
+    solver: str,
+    options: ByName,
+    guess: Guess,
+    time_limit: float | None,
+) -> Solution:
+    """:func:`tighten` inside its time limit."""
     prepared = method.prepare(problem, solver=solver, options=options)
     form, fragment = prepared.formulation, prepared.fragment
     p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
@@ -64,33 +84,47 @@ def tighten(
     places = _places(form, fragment, shared=method.control == "linear")
     drawn = np.zeros((2, len(fragment.mesh) - 1, len(index)))
     move, before, followed = np.zeros_like(drawn), np.zeros_like(drawn), np.full_like(drawn, FOLLOWED)
+    best: tuple[Solution, str, dict[str, Any]] | None = None  # a plan, and what it exceeds most
     for _ in range(MOST_ROUNDS):
         moves = {}
         for kind, (entry, left, right) in places.items():
             both = np.maximum(drawn[:, left, entry], drawn[:, right, entry])
             moves[f"lb{kind}"], moves[f"ub{kind}"] = np.where(entry >= 0, both, 0.0)
-        solution = prepared.solve(parameters, guess, tighter=moves)
+        try:
+            solution = prepared.solve(parameters, guess, tighter=moves)
+        except SolveError as error:
+            if best is None or time_left() > 0:
+                raise
+            plan, remains, _ = best
+            words = f"{OUT_OF_TIME}: raise time_limit"
+            plan = replace(plan, success=False, status=words)
+            told = f"problem {form.name!r}: tightening ended with {words}; {remains}"
+            raise SolveError(told, plan, name="time_limit", value=time_limit) from error
         beyond, times = _excess(form, solution, p, low, high)
+        solution = replace(solution, drawn_in=drawn) if drawn.any() else solution
         if beyond.max(initial=0.0) <= tolerance:
-            return replace(solution, drawn_in=drawn) if drawn.any() else solution
+            return solution
+        remains, details = _worst(form, beyond, times)
+        if best is None or details["value"] < best[2]["value"]:
+            best = solution, remains, details
         # as in the secant method, each bound by itself; one that its neighbours moved says nothing
         share = (before - beyond) / np.where(move > 0, move, np.inf)
         followed = np.where((beyond > 0) & (share > LEAST_SHARE), np.minimum(share, 1.0), followed)
         drawn_before, before, guess = drawn, beyond, solution
         drawn = np.minimum(drawn + np.where(beyond > tolerance / 2, beyond / followed, 0.0), most)
         move = drawn - drawn_before
+    told = f"problem {form.name!r}: after {MOST_ROUNDS} rounds {remains}; take more intervals"
+    raise SolveError(told, solution, limit=tolerance, **details)
+
+
+def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
+    """What goes furthest beyond its bound, in words and as the details of an error; see :func:`_excess`."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
-    raise SolveError(
-        f"problem {form.name!r}: after {MOST_ROUNDS} rounds {labels[i]} still goes {either[k, i]:.3g} beyond its bound "
-        f"between {times[k]:.4g} and {times[k + 1]:.4g} s; take more intervals",
-        solution,
-        name=labels[i],
-        value=float(either[k, i]),
-        limit=tolerance,
-        time=float(times[k]),
-    )
+    worst = float(either[k, i])
+    words = f"{labels[i]} still goes {worst:.3g} beyond its bound between {times[k]:.4g} and {times[k + 1]:.4g} s"
+    return words, {"name": labels[i], "value": worst, "time": float(times[k])}
 
 
 def _places(

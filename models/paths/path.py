@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_indices, checked_numbers
+from models.arrays import NOT_NUMBERS, Array, ArrayInput, check_entries, checked_array, checked_indices, checked_numbers
 from models.errors import ModelError
 from models.paths.orientation import rotation_vector
 from models.paths.segments import Arc, Line, Segment, constant_curvature
@@ -51,8 +51,9 @@ class Path:
 
     def __post_init__(self) -> None:
         try:
+            check_entries(self.segments)
             segments = tuple(self.segments)
-        except TypeError as error:
+        except NOT_NUMBERS as error:
             message = f"the path {self.segments!r} is no sequence of segments"
             raise ModelError(message, name="segments", value=self.segments) from error
         if not segments:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, floats
+from models.arrays import NOT_NUMBERS, check_entries, floats
 from models.errors import ModelError
 from models.robot.kinematics import joint_vector
 from models.robot.robot import Robot
@@ -71,6 +71,7 @@ def manipulability_of(task: Expression) -> Expression:
 def checked_rows(rows: Sequence[int]) -> list[int]:
     """`rows` as a list; ModelError unless they are different indices of a twist, 0..5, and at least one."""
     try:
+        check_entries(rows)
         given = floats(list(rows))
     except NOT_NUMBERS:
         given = np.array([np.nan])

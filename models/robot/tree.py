@@ -110,7 +110,7 @@ def reroot(
         ModelError: The new root is no link; a name that is needed is taken.
     """
     names = [link.name for link in links]
-    if new not in names:
+    if not isinstance(new, str) or new not in names:
         raise absent("root link", new, names)
     above = {joint.child: joint for joint in joints}
     turned: dict[str, list[Joint]] = {}

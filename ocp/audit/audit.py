@@ -16,7 +16,7 @@ from ocp.audit.principle import FLAT
 from ocp.audit.reintegration import Reintegration, reintegrate
 from ocp.audit.sizes import Sizes, fine_grid, sizes_along
 from ocp.audit.violations import Violation, violations
-from ocp.console import interruptible
+from ocp.console import check_time, interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
@@ -195,6 +195,7 @@ def audit(
     Raises:
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
             unknown.
+        OutOfTime: Inside :func:`ocp.console.limited` alone, behind its limit.
     """
     limits = checked_mapping("audit: tolerances", tolerances)
     named = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
@@ -212,6 +213,7 @@ def audit(
     grid = fine_grid(solution)
     size = sizes_along(form, grid, solution.horizon, p, bounds)
     again = reintegrate(form, solution, p, grid, size)
+    check_time()
     found = optimality(form, solution, p, bounds, size, lost)
 
     findings = []

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.sizes import FineGrid, Sizes
+from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
@@ -205,6 +206,7 @@ class Flow:
         memory, evaluate = self._step.buffer()
         memory.set_arg(0, now.data)
         for at in range(0, whole, BLOCK):
+            check_time()
             part = slice(at, at + BLOCK)
             memory.set_arg(1, data[part].data)
             memory.set_res(0, after[part].data)

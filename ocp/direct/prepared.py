@@ -21,17 +21,20 @@ from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
 from ocp.direct.known import Known
-from ocp.direct.nlp import Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
+from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
 from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.direct.starts import ELASTIC, GUESS, other_starts
 from ocp.errors import (
+    NOT_NUMBERS,
     Interrupted,
     ProblemError,
     about,
+    checked_choice,
     checked_count,
     checked_mapping,
     checked_positive,
     checked_time_limit,
+    floats,
 )
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
@@ -132,8 +135,8 @@ class DirectMethod(ABC):
             return
         told: dict[str, Any] = {"name": "mesh", "value": self.mesh}
         try:
-            at = np.asarray(self.mesh, dtype=float)
-        except (TypeError, ValueError) as error:
+            at = floats(self.mesh)
+        except NOT_NUMBERS as error:
             words = f"{kind}: mesh must be fractions from 0 to 1, not {self.mesh!r}"
             raise ProblemError(words, **told) from error
         if at.shape != (self.intervals + 1,):
@@ -167,6 +170,7 @@ class Prepared:
         began = time.monotonic()
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation(problem)
+        checked_choice("solver", solver, SOLVERS)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
         own = checked_mapping("options", options)

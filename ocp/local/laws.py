@@ -70,7 +70,7 @@ class Stabiliser:
 
     def __post_init__(self) -> None:
         poles = self.poles if isinstance(self.poles, Sequence | np.ndarray) else ()
-        if len(poles) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
+        if len(poles[:4]) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
             words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
             raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
         for what in ("damping", "gradient"):

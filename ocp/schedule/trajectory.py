@@ -118,7 +118,7 @@ class JointTrajectory:
             t = np.array([(stamp["sec"] * 10**9 + stamp["nanosec"]) / 1e9 for stamp in stamps])
             values = [floats([p[kind] for p in points]) for kind in KINDS]
             names = tuple(message["joint_names"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, IndexError, TypeError, ValueError) as error:
             text = f"this is no joint trajectory message: {error!r}"
             raise ProblemError(text, name="message", value=message) from error
         return cls(names, t, *values)

@@ -17,10 +17,25 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Collocation, Indirect, Problem, ProblemError, SolveError, prepare, solve
-from ocp.console import interruptible, limited, quiet, time_left
+import ocp.refinement
+import ocp.tightening
+from ocp import (
+    Collocation,
+    Indirect,
+    Problem,
+    ProblemError,
+    RefinementWarning,
+    SolveError,
+    prepare,
+    refine,
+    solve,
+    tighten,
+)
+from ocp.console import OutOfTime, check_time, interruptible, limited, quiet, time_left
+from ocp.direct.prepared import Prepared
 from ocp.errors import Interrupted
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
+from tests.ocp.test_tightening import beyond, walled
 
 ROOT = Path(__file__).parents[2]
 
@@ -280,8 +295,10 @@ def test_the_time_limit_holds_for_all_of_a_solve() -> None:
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf, "soon", True])
 def test_a_time_limit_that_cannot_be_right_is_named(limit: Any) -> None:
-    with pytest.raises(ProblemError, match="time_limit must be positive and finite"):
-        solve(energy(), Collocation(3), time_limit=limit)
+    for call in (solve, refine, tighten):
+        with pytest.raises(ProblemError, match="time_limit must be positive and finite") as caught:
+            call(energy(), Collocation(3), time_limit=limit)
+        assert caught.value.name == "time_limit"
 
 
 def test_an_outer_time_limit_holds_inside() -> None:
@@ -294,6 +311,119 @@ def test_an_outer_time_limit_holds_inside() -> None:
         with limited(1.0):
             assert time_left() <= 1.0
     assert time_left() == np.inf
+    check_time()
+    with limited(1e-9), pytest.raises(OutOfTime, match="Maximum_WallTime_Exceeded"):
+        check_time()
+
+
+def long() -> Problem:
+    """Bounded from both sides for a long time: a mesh that is good enough takes many rounds."""
+    return van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
+
+
+def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int, module: Any = ocp.refinement) -> None:
+    """A function that the time limit, whatever it is, overtakes at that call; ``module`` looks at the time then."""
+    real, calls = getattr(owner, name), []
+
+    def slow(*arguments: Any, **named: Any) -> Any:
+        calls.append(name)
+        if len(calls) < call:
+            return real(*arguments, **named)
+        with limited(1e-9):
+            return real(*arguments, **named)
+
+    monkeypatch.setattr(owner, name, slow)
+    monkeypatch.setattr(module, "time_left", lambda: -1.0 if len(calls) >= call else np.inf)
+
+
+def test_refinement_ends_at_its_time_limit_with_the_plan_that_it_has() -> None:
+    began = time.monotonic()
+    with pytest.warns(RefinementWarning, match="the time limit is reached: raise time_limit") as told:
+        plan = refine(long(), Collocation(20), tolerance=1e-13, max_intervals=100_000, time_limit=1.0)
+    assert time.monotonic() - began < 4.0
+    assert plan.success
+    assert plan.refinement is not None
+    assert not plan.refinement.reached
+    assert len(plan.control_interpolant.breaks) == plan.refinement.intervals[-1] + 1
+    warning = told[0].message
+    assert isinstance(warning, RefinementWarning)
+    assert warning.name
+    assert warning.value > 1.0
+
+
+@pytest.mark.parametrize("slow", ["solve", "judge"])
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_refinement_keeps_the_last_audited_plan_whatever_the_limit_meets(
+    slow: str, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = van_der_pol()
+    with pytest.warns(RefinementWarning):
+        cut = refine(problem, Collocation(3), tolerance=1e-8, max_intervals=400, limits={"lost": 0.0})
+    assert cut.refinement is not None
+    assert len(cut.refinement.intervals) > rounds
+    overtaken(monkeypatch, ocp.refinement, slow, rounds + 1)
+    with pytest.warns(RefinementWarning, match="time_limit"):
+        plan = refine(problem, Collocation(3), tolerance=1e-8, limits={"lost": 0.0}, time_limit=100.0)
+    assert plan.refinement is not None
+    assert plan.refinement.intervals == cut.refinement.intervals[:rounds]
+    assert {len(values) for values in plan.refinement.errors.values()} == {rounds}
+    assert len(plan.control_interpolant.breaks) == plan.refinement.intervals[-1] + 1
+    assert not plan.refinement.reached
+
+
+def test_refinement_without_a_plan_at_its_time_limit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        refine(long(), Collocation(200), time_limit=1e-6)
+    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+    overtaken(monkeypatch, ocp.refinement, "judge", 1)
+    with pytest.raises(
+        SolveError, match="audit of its first plan with Maximum_WallTime_Exceeded: raise time"
+    ) as caught:
+        refine(van_der_pol(), Collocation(3), time_limit=100.0)
+    assert (caught.value.name, caught.value.value) == ("time_limit", 100.0)
+    plan = caught.value.solution
+    assert not plan.success
+    assert plan.status.startswith("Maximum_WallTime_Exceeded")
+    assert plan.cost == pytest.approx(solve(van_der_pol(), Collocation(3)).cost)
+
+
+def test_a_failure_within_the_time_limit_is_no_matter_of_time() -> None:
+    for call in (refine, tighten):
+        with pytest.raises(SolveError, match="Maximum_Iterations_Exceeded") as caught:
+            call(van_der_pol(), Collocation(3), options={"max_iter": 1}, time_limit=100.0)
+        assert "time_limit" not in str(caught.value)
+
+
+def test_tightening_ends_at_its_time_limit_with_its_best_plan() -> None:
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        tighten(long(), Collocation(200), time_limit=1e-6)
+    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_tightening_carries_its_best_plan_and_says_what_remains(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    method = Collocation(10, scheme="legendre")  # takes four rounds
+    overtaken(monkeypatch, Prepared, "solve", rounds + 1, ocp.tightening)
+    with pytest.raises(
+        SolveError, match=r"Maximum_WallTime_Exceeded: raise time_limit; .* still goes .* beyond"
+    ) as told:
+        tighten(walled(), method, tolerance=1e-10, time_limit=100.0)
+    assert (told.value.name, told.value.value) == ("time_limit", 100.0)
+    plan = told.value.solution
+    assert not plan.success
+    assert plan.status.startswith("Maximum_WallTime_Exceeded")
+    assert (plan.drawn_in is None) == (rounds == 1)  # under the bounds of its own round
+    monkeypatch.undo()
+    plain, tight = solve(walled(), method), tighten(walled(), method, tolerance=1e-10)
+    assert beyond(tight) < beyond(plan)
+    assert beyond(plan) == beyond(plain) if rounds == 1 else beyond(plan) < beyond(plain)
+
+
+def test_enough_time_changes_nothing() -> None:
+    for call in (refine, tighten):
+        free, timed = (call(van_der_pol(upper=0.8), Collocation(8), time_limit=limit) for limit in (None, 100.0))
+        assert timed.cost == free.cost
+        np.testing.assert_array_equal(timed.variables, free.variables)
 
 
 # ---- threads -----------------------------------------------------------------------------------------------------

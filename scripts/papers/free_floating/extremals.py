@@ -14,7 +14,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp import Collocation, Indirect, Problem, Solution, certificate, solve
-from scripts.papers.free_floating.false_optima import INTERVALS, MAX_ITERATIONS, Settled, first_guess, settle, solvers
+from scripts.papers.free_floating.false_optima import INTERVALS, MAX_ITERATIONS, Settled, Solvers, first_guess, settle
 from scripts.papers.run import Row
 
 MakeProblem: TypeAlias = Callable[..., Problem]  # (horizon, guess_damping=...) -> the "rates" formulation
@@ -37,7 +37,7 @@ DIRECT_ONLY = "direct only: not confirmed by the minimum principle"
 
 @dataclass(frozen=True)
 class Extremal:
-    """A plan that passes its audit and keeps its cost on a finer mesh.
+    """A plan that passes its audit and keeps its cost on finer meshes, until it is exact.
 
     Attributes:
         horizon: s.
@@ -79,7 +79,8 @@ class Search:
     Attributes:
         horizon: s.
         starts: Number of first guesses. solved: How many the solver calls optimal.
-        rejected: How many of these do not integrate, or change their cost or fail their audit on finer meshes.
+        rejected: How many of these do not integrate, or change their cost or fail their audit on finer meshes, or are
+            not exact on the finest.
         extremals: By cost.
     """
 
@@ -120,7 +121,7 @@ def search(make: MakeProblem, horizon: float, start_base: Array, start_joints: A
         start_base: Shape (3,). start_joints: Shape (n,).
     """
     problem = make(horizon)
-    prepared = solvers(problem, "legendre")
+    prepared = Solvers(problem, "legendre")
     groups: list[Group] = []
     solved = 0
     for name, start in _starts(make, horizon, start_base, start_joints):
@@ -133,7 +134,7 @@ def search(make: MakeProblem, horizon: float, start_base: Array, start_joints: A
     meshes: dict[int, int] = {}
     for group in groups:
         settled = _settled(prepared, group.plan)
-        if settled is not None and settled.sound:
+        if settled is not None and settled.sound and settled.exact:
             meshes[id(settled.plan)] = settled.intervals
             sound = _joined(sound, replace(group, plan=settled.plan))
     extremals = sorted((_polished(problem, group, meshes[id(group.plan)]) for group in sound), key=lambda e: e.cost)
@@ -157,7 +158,7 @@ def _starts(
             yield f"smooth random, spread {spread:g}, seed {seed}", guess
 
 
-def _settled(prepared: Any, plan: Solution) -> Settled | None:
+def _settled(prepared: Solvers, plan: Solution) -> Settled | None:
     """The plan on a finer mesh; None if it is not worth one, its states not following from its controls."""
     if not plan.audit()["integration error, relative"].passed:
         return None

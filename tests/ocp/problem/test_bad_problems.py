@@ -284,6 +284,7 @@ FRONTS = [
         max_intervals=COUNT | NOTHING | {"few": 2},
         limits=MAPPING | {"unknown": {"no_such": 1.0}, "nan": {"lost": NAN}, "negative": {"lost": -1.0}},
         breaks={"number": 3, "word": "a", "outside": [9.0], "nan": [NAN], "texts": ["0.5"], "None": None},
+        time_limit=POSITIVE,
     ),
     on_line(
         tighten,
@@ -293,6 +294,7 @@ FRONTS = [
         parameters=PARAMETERS,
         guess=START,
         tolerance=POSITIVE | NOTHING,
+        time_limit=POSITIVE,
     ),
     Case(
         "Indirect.prepare",

@@ -1,0 +1,114 @@
+"""Bad input takes little memory: what is too large is refused before anything of it is copied or unpacked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import models.arrays
+import ocp.errors
+from models import ModelError, Robot
+from ocp import ProblemError, Solution
+from tests.bad_values import WHOLE, Bad, Case, panel
+from tests.models.robot.test_bad_urdf import TEXTS, URDF
+from tests.ocp.test_faults import run
+from tests.ocp.test_storage import BROKEN, archive, header, npy
+
+SEED, SHARE = 7, 0.2  # of the panels' cases
+MOST_MEMORY = 2**30  # bytes
+VAST: Bad = {  # of which no memory is taken until they are copied
+    "wide view": np.broadcast_to(1.0, (2**15, 2**15)),
+    "long view of nan": np.broadcast_to(np.nan, (2**30,)),
+    "long range": range(10**12),
+    "endless range": range(10**30),
+    "list of a long range": [range(10**12)],
+}
+COUNTLESS: Bad = {"countless": 10**12, "more than a machine word": 10**30}
+TAKEN = {("TipTask", "velocity"), ("inverse_kinematics", "seed")}
+"""Where something vast may be taken: what is looked at when it is used, and a seed, which may be any whole number."""
+
+
+def plan_file(path: Path, text: bytes) -> Path:
+    """A file whose head is so long a text."""
+    return archive(path, {"head.npy": npy(np.frombuffer(text, dtype=np.uint8))})
+
+
+FILES = BROKEN | {
+    "as large as is read": lambda p: archive(p, {"a.npy": header(f"({2**25 - 100},)") + bytes(8 * (2**25 - 100))}),
+    "long list in the head": lambda p: plan_file(p, b"[" + b"0," * 2**26 + b"0]"),
+    "many lists in the head": lambda p: plan_file(p, b"[" + b"[]," * 2**25 + b"0]"),
+    "many lists in a short head": lambda p: plan_file(p, b"[" + b"{}," * (2**24 // 3 - 2) + b"0]"),
+}
+
+
+def refusal(case: Case, argument: str, value: Any) -> str:
+    """ "" where the argument is refused by name, else what happens."""
+    try:
+        case.call(**{**case.good, argument: value})
+    except (ModelError, ProblemError) as error:
+        return "" if error.name else f"names nothing: {error}"
+    except Exception as error:
+        return repr(error)
+    return "" if (case.what, argument) in TAKEN else "is taken"
+
+
+def ill_treated(folder: Path) -> tuple[int, list[str]]:
+    """How much bad input was given, with the plan files of a folder; what is not refused by name, and how it ends."""
+    from tests.test_bad_input import CASES
+
+    rng = np.random.default_rng(SEED)
+    asked = [(case.values, case.id) for case in panel(CASES) if rng.random() < SHARE]
+    for case in CASES:
+        for argument, bad in case.bad.items():
+            vast = VAST | (COUNTLESS if WHOLE.keys() <= bad.keys() else {})
+            asked += [((case, argument, value), f"{case.what}-{argument}-{label}") for label, value in vast.items()]
+    found = [f"{name}: {word}" for (case, argument, value), name in asked if (word := refusal(case, argument, value))]
+    for name, (part, wrong) in TEXTS.items():
+        found += [f"{name}: {word}" for word in [refusal(READ, "source", URDF.replace(part, wrong))] if word]
+    for path in sorted(folder.iterdir()):
+        found += [f"{path.name}: {word}" for word in [refusal(LOAD, "path", path)] if word]
+    return len(asked) + len(TEXTS) + len(FILES), found
+
+
+LOAD = Case("Solution.load", Solution.load, {}, {})
+READ = Case("from_urdf", Robot.from_urdf, {}, {})
+
+
+def peak() -> int:
+    """Largest resident memory of this process so far, bytes; ru_maxrss would count what its parent had."""
+    told = Path("/proc/self/status").read_text(encoding="utf-8")
+    return 1024 * int(told.split("VmHWM:")[1].split()[0])
+
+
+def test_bad_input_and_hostile_files_take_less_than_a_gigabyte(tmp_path: Path) -> None:
+    for name, write in FILES.items():
+        write(tmp_path / f"{name}.npz")
+    done = run(f"""
+        from pathlib import Path
+        from tests.test_memory import ill_treated, peak
+        count, found = ill_treated(Path({str(tmp_path)!r}))
+        print(count, peak())
+        print(*found, sep="\\n")
+    """)
+    assert done.returncode == 0, done.stderr
+    numbers, *found = done.stdout.splitlines()
+    count, most = map(int, numbers.split())
+    assert [line for line in found if line] == []
+    assert count > 4000
+    assert most < MOST_MEMORY
+
+
+def test_what_a_user_gives_is_counted_before_it_is_copied() -> None:
+    endless: list[Any] = []
+    endless.append(endless)
+    for checks in (models.arrays, ocp.errors):
+        for value in VAST.values():
+            with pytest.raises((ValueError, OverflowError)):
+                checks.check_entries(value)
+        for value in (3, "a" * 10**7, None, [], [[]], [1.0, 2.0], np.zeros((3, 0)), range(10**6), endless):
+            checks.check_entries(value)
+        most = np.broadcast_to(1.0, (checks.MOST_NUMBERS,))
+        assert checks.floats(most).size == most.size
