@@ -27,9 +27,11 @@ from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 
 __all__ = [
+    "HELD",
     "LIFT_LIMITS",
     "LIMITS",
     "PLANS",
+    "Held",
     "Plan",
     "Request",
     "convergence_rows",
@@ -100,6 +102,14 @@ class Plan:
     motion: StandingMotion
     tip_error: float
     audit: Audit
+
+
+@dataclass(frozen=True)
+class Held:
+    """A plan as the reference has it, with accelerations held, and its motion on a grid ten times its own."""
+
+    solution: Solution
+    motion: StandingMotion
 
 
 PLANS: Mapping[str, Mapping[str, Request]] = {
@@ -210,18 +220,19 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
     return standing_motion(machine(), times, q, qd, qdd, external, ROWS), progress
 
 
-def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Solution]]:
+def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:
     """The plans as the reference has them, accelerations held over as many intervals. By task and summary key."""
-    found: dict[str, dict[str, Solution]] = {}
+    found: dict[str, dict[str, Held]] = {}
     for task, group in plans.items():
         there = {one.request.rule: one.solution for one in group.values() if one.request.transcription == "held"}
         for key, plan in progress(group.items(), f"held, {task}"):
             request = replace(plan.request, transcription="held", intervals=HELD[task])
-            found.setdefault(task, {})[key] = there.get(request.rule) or solved(request)
+            solution = there.get(request.rule) or solved(request)
+            found.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
     return found
 
 
-def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str, Mapping[str, Solution]]) -> list[Row]:
+def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str, Mapping[str, Held]]) -> list[Row]:
     """Cost by mesh and transcription, and its distance from that of the finest mesh of the better transcription."""
     work: list[tuple[str, str, Transcription, int]] = []
     for task, key in CONVERGING:
@@ -233,7 +244,7 @@ def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str,
         for key, plan in group.items():
             known[task, key, plan.request.transcription, plan.request.intervals] = plan.solution
     for task, answers in held.items():
-        known |= {(task, key, "held", HELD[task]): one for key, one in answers.items()}
+        known |= {(task, key, "held", HELD[task]): one.solution for key, one in answers.items()}
     costs: dict[tuple[str, str, Transcription, int], float] = {}
     for item in progress(work, "convergence"):
         task, key, kind, intervals = item

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ocp import Solution
 from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import Local, layer_rows, local_motions, stabiliser_rows
 from scripts.papers.standing.checks import check
-from scripts.papers.standing.plans import PLANS, Plan, convergence_rows, held_plans, make
+from scripts.papers.standing.plans import PLANS, Held, Plan, convergence_rows, held_plans, make
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Results:
 
     local: Mapping[str, Mapping[str, Local]]
     plans: Mapping[str, Mapping[str, Plan]]
-    held: Mapping[str, Mapping[str, Solution]]
+    held: Mapping[str, Mapping[str, Held]]
     checks: list[Row]
     layers: list[Row]
     stabiliser: list[Row]
