@@ -10,7 +10,7 @@ from scripts.papers.run import Row
 from scripts.papers.standing.cases import machine
 from scripts.papers.standing.plans import FINER, LIFT_LIMITS, LIMITS, METHOD_NAMES, Plan
 
-__all__ = ["ALLOWED", "LOST", "check", "failures", "region_excess"]
+__all__ = ["ALLOWED", "check", "failures", "region_excess"]
 
 ALLOWED = {
     "zmp_excess_m": 1e-3,
@@ -23,10 +23,6 @@ ALLOWED = {
     "vertical_force_missing_n": 1e-6,
 }
 """What a plan may be off by, at any of the ten times as many instants."""
-
-LOST = "cost lost, relative"
-"""The finding that a plan of held accelerations may miss: where a constraint of the ground is active they cost more
-than free ones, in proportion to the width of the intervals (ocp.builders.standing.problem)."""
 
 
 def check(key: str, plan: Plan) -> Row:

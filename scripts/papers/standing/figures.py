@@ -251,13 +251,13 @@ def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
     names = {(row["task"], row["plan"]): None for row in rows}
     colors = ("sky", "green", "black", "blue", "orange", "purple", "yellow")
     note = (
-        "Costs against those of Legendre 3 at 40 intervals; lifts (cost T + 1e-5 ∫|q''|² dt) against held ones at 100. "
-        "Held accelerations converge with about the first order where a constraint of the ground is active."
+        "Costs against those of Legendre 3 at 40 intervals; lifts (cost T + 1e-5 ∫|q''|² dt) against linear ones at "
+        "100. Held accelerations converge with about the first order where a constraint of the ground is active."
     )
     with sheet(folder / "convergence.png", (1, 1), (8.4, 3.9), note) as (_, axes):
         ax = axes[0, 0]
         for (task, plan), color in zip(names, colors, strict=True):
-            for marker, dash, method in (("o", "-", "held"), ("s", "--", "points")):
+            for marker, dash, method in (("o", "-", "held"), ("s", "--", "points"), ("^", ":", "linear")):
                 mine = [
                     (row["intervals"], abs(row["percent"]))
                     for row in rows

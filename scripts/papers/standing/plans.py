@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from models import STANDING_STARTS
 from models.machines.standing_motion import StandingMotion, standing_motion
-from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve
+from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve, tighten
 from ocp.builders.standing import (
     Anywhere,
     FreeTime,
@@ -27,18 +27,21 @@ from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 
 __all__ = [
+    "HELD",
     "LIFT_LIMITS",
     "LIMITS",
     "PLANS",
+    "Held",
     "Plan",
     "Request",
     "convergence_rows",
     "fine_motion",
+    "held_plans",
     "make",
     "plan_problem",
 ]
 
-Transcription: TypeAlias = Literal["held", "points"]
+Transcription: TypeAlias = Literal["held", "linear", "points"]
 Task: TypeAlias = Literal["table1", "table2", "minimum_time"]
 
 LIMITS = Limits(velocity=6.0, acceleration=60.0, vertical_force=60.0)
@@ -46,16 +49,18 @@ LIFT_LIMITS = Limits(velocity=3.0, acceleration=20.0, torque=(200, 350, 250, 60,
 LIFT_WEIGHTS = Weights(acceleration=1e-5, velocity=0.0, joint_limits=0.0, manipulability=0.0, time=1.0)
 LIFT = 0.8  # m
 MARGIN = 0.02  # m, inside the foot: -0.08 .. 0.18
+HELD: Mapping[str, int] = {"table1": 80, "table2": 80, "minimum_time": 50}  # the reference's, all held
 FINER = 10  # of the grid that plans are checked on
 EDGE = 1e-9  # of an interval: where its own end is looked at, and not its neighbour's
 
 SETTINGS = (
     "Chosen: cost ∫ 0.01|q''|² + 0.01|q'|² + p1 − 0.5 p2 dt, rest at both ends, |q'| ≤ 6 rad/s, |q''| ≤ 60 rad/s², "
-    "vertical force ≥ 60 N"
+    "vertical force ≥ 60 N; accelerations free at 3 Legendre points of 100 intervals"
 )
 LIFT_SETTINGS = (
     "Chosen: tip 0.8 m straight up from rest to rest, cost T + 1e-5 ∫|q''|² dt, |torque| ≤ 200, 350, 250, 60, 30 N m, "
-    "|q'| ≤ 3 rad/s, |q''| ≤ 20 rad/s², vertical force ≥ 60 N, friction ≤ 0.6; 50 intervals, accelerations held"
+    "|q'| ≤ 3 rad/s, |q''| ≤ 20 rad/s², vertical force ≥ 60 N, friction ≤ 0.6; 100 intervals, accelerations linear, "
+    "limits drawn in until they hold between the nodes"
 )
 
 
@@ -65,16 +70,18 @@ class Request:
 
     Attributes:
         task: What the tip does. title: For the reader. rule: Where the zero moment point may be.
-        transcription: ``held``: accelerations held over the intervals; ``points``: free at Legendre points.
+        transcription: ``points``: accelerations free at Legendre points, for plans that are smooth; ``linear``: linear
+            between the nodes, limits drawn in to hold there too, for plans that switch; ``held``: held over the
+            intervals, as the reference has them, which costs more where a constraint of the ground is active.
         intervals: Of the plan.
-        drawn: Whether figures and animations show it; such plans must stand every check.
+        drawn: Whether figures and animations show it; such plans must stand every check and their audit.
     """
 
     task: Task
     title: str
     rule: ZmpRule
-    transcription: Transcription = "held"
-    intervals: int = 80
+    transcription: Transcription = "points"
+    intervals: int = 100
     drawn: bool = True
 
 
@@ -97,26 +104,34 @@ class Plan:
     audit: Audit
 
 
+@dataclass(frozen=True)
+class Held:
+    """A plan as the reference has it, with accelerations held, and its motion on a grid ten times its own."""
+
+    solution: Solution
+    motion: StandingMotion
+
+
 PLANS: Mapping[str, Mapping[str, Request]] = {
     "table1": {
         "optimal_range": Request("table1", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_index_half": Request("table1", "index ≥ 0.5", IndexAtLeast(0.5)),
         "optimal_index_nine_tenths": Request("table1", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), drawn=False),
-        "optimal_pinned_points": Request("table1", "pinned at 0", Pinned(), "points", 100),
+        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), "held", HELD["table1"], drawn=False),
+        "optimal_pinned_points": Request("table1", "pinned at 0", Pinned()),
         "optimal_free": Request("table1", "no ZMP rule", Anywhere()),
     },
     "table2": {
         "optimal_spring": Request("table2", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_spring_index_nine_tenths": Request("table2", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_spring_pinned": Request("table2", "pinned at 0, held", Pinned(), drawn=False),
-        "optimal_spring_pinned_points": Request("table2", "pinned at 0", Pinned(), "points", 100),
+        "optimal_spring_pinned": Request("table2", "pinned at 0, held", Pinned(), "held", HELD["table2"], drawn=False),
+        "optimal_spring_pinned_points": Request("table2", "pinned at 0", Pinned()),
         "optimal_spring_free": Request("table2", "no ZMP rule", Anywhere()),
     },
     "minimum_time": {
-        "free": Request("minimum_time", "no ZMP rule", Anywhere(), intervals=50),
-        "in_foot": Request("minimum_time", "in the foot less 0.02 m", InFoot(MARGIN), intervals=50),
-        "index_nine_tenths": Request("minimum_time", "index ≥ 0.9", IndexAtLeast(0.9), intervals=50),
+        "free": Request("minimum_time", "no ZMP rule", Anywhere(), "linear"),
+        "in_foot": Request("minimum_time", "in the foot less 0.02 m", InFoot(MARGIN), "linear"),
+        "index_nine_tenths": Request("minimum_time", "index ≥ 0.9", IndexAtLeast(0.9), "linear"),
     },
 }
 """Plans by summary key."""
@@ -128,8 +143,12 @@ CONVERGING = (
     ("table2", "optimal_spring"),
 )
 MESHES: Mapping[Transcription, tuple[int, ...]] = {"held": (40, 80, 160), "points": (10, 20, 40)}
-LIFT_MESHES = (25, 50, 100)
-METHOD_NAMES: Mapping[Transcription, str] = {"held": "shooting, held", "points": "Legendre 3, points"}
+LIFT_MESHES: Mapping[Transcription, tuple[int, ...]] = {"held": (25, 50, 100), "linear": (25, 50, 100)}
+METHOD_NAMES: Mapping[Transcription, str] = {
+    "held": "shooting, held",
+    "linear": "shooting, linear",
+    "points": "Legendre 3, points",
+}
 
 
 def task_of(request: Request) -> TipTask:
@@ -155,21 +174,28 @@ def plan_problem(request: Request) -> Problem:
 
 def method(transcription: Transcription, intervals: int) -> Any:
     """The transcription of that name."""
-    if transcription == "held":
-        return MultipleShooting(intervals, control="held")
-    return Collocation(intervals, degree=3, scheme="legendre")
+    if transcription == "points":
+        return Collocation(intervals, degree=3, scheme="legendre")
+    return MultipleShooting(intervals, control=transcription)
+
+
+def solved(request: Request) -> Solution:
+    """The answer to a request."""
+    # linear accelerations carry joints beyond limits that bind between the nodes, and torques with them
+    find = tighten if request.transcription == "linear" else solve
+    return find(plan_problem(request), method(request.transcription, request.intervals))
 
 
 def make(request: Request) -> Plan:
     """Solve, evaluate between the nodes and audit."""
-    solution = solve(plan_problem(request), method(request.transcription, request.intervals))
+    solution = solved(request)
     motion, progress = fine_motion(request, solution)
     errors = task_errors(machine(), task_of(request), progress, None, motion.joints)
     error = float(np.linalg.norm(errors, axis=1).max())
     limits = {"joints": 1e-6, "velocities": 1e-6, "accelerations": 1e-6}
     if not isinstance(request.rule, Anywhere):
         limits["zero moment point"] = 1e-3
-    if request.transcription == "held":
+    if request.transcription != "points":  # else the tip's acceleration is constrained, its position watched
         limits["tip"] = 1e-5
     return Plan(request, solution, motion, error, solution.audit(tolerances=limits))
 
@@ -177,11 +203,14 @@ def make(request: Request) -> Plan:
 def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, Array]:
     """The plan on a grid FINER times its own, at both ends of every interval with the controls of that interval.
 
+    The intervals are the plan's own, be they equal or not.
+
     Returns:
         The motion, and where on the tip's path it is: times, or path parameters. Shape (M,).
     """
     parts = np.clip(np.linspace(0.0, 1.0, FINER + 1), EDGE, 1.0 - EDGE)
-    fractions = ((np.arange(request.intervals)[:, None] + parts) / request.intervals).ravel()
+    breaks = solution.control_interpolant.breaks
+    fractions = (breaks[:-1, None] + np.diff(breaks)[:, None] * parts).ravel()
     fractions[0], fractions[-1] = 0.0, 1.0
     values = solution.at_fraction(fractions)
     times = fractions * solution.horizon
@@ -191,27 +220,41 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
     return standing_motion(machine(), times, q, qd, qdd, external, ROWS), progress
 
 
-def convergence_rows(plans: Mapping[str, Mapping[str, Plan]]) -> list[Row]:
-    """Cost by mesh and transcription, and its distance from that of the finest Legendre mesh."""
+def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:
+    """The plans as the reference has them, accelerations held over as many intervals. By task and summary key."""
+    found: dict[str, dict[str, Held]] = {}
+    for task, group in plans.items():
+        there = {one.request.rule: one.solution for one in group.values() if one.request.transcription == "held"}
+        for key, plan in progress(group.items(), f"held, {task}"):
+            request = replace(plan.request, transcription="held", intervals=HELD[task])
+            solution = there.get(request.rule) or solved(request)
+            found.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
+    return found
+
+
+def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str, Mapping[str, Held]]) -> list[Row]:
+    """Cost by mesh and transcription, and its distance from that of the finest mesh of the better transcription."""
     work: list[tuple[str, str, Transcription, int]] = []
     for task, key in CONVERGING:
         work += [(task, key, kind, n) for kind, meshes in MESHES.items() for n in meshes]
-    work += [("minimum_time", key, "held", n) for key in PLANS["minimum_time"] for n in LIFT_MESHES]
-    known = {(p.request.task, p.request.rule, p.request.transcription, p.request.intervals): p for p in _all(plans)}
+    for key in PLANS["minimum_time"]:
+        work += [("minimum_time", key, kind, n) for kind, meshes in LIFT_MESHES.items() for n in meshes]
+    known: dict[tuple[str, str, Transcription, int], Solution] = {}
+    for task, group in plans.items():
+        for key, plan in group.items():
+            known[task, key, plan.request.transcription, plan.request.intervals] = plan.solution
+    for task, answers in held.items():
+        known |= {(task, key, "held", HELD[task]): one.solution for key, one in answers.items()}
     costs: dict[tuple[str, str, Transcription, int], float] = {}
     for item in progress(work, "convergence"):
         task, key, kind, intervals = item
-        rule = PLANS[task][key].rule
-        request = Request(PLANS[task][key].task, "", rule, kind, intervals)
-        done = known.get((request.task, rule, kind, intervals))
-        found = done.solution if done else solve(plan_problem(request), method(kind, intervals))
+        found = known.get(item) or solved(replace(PLANS[task][key], transcription=kind, intervals=intervals))
         costs[item] = found.cost
     rows: list[Row] = []
     for (task, key, kind, intervals), cost in costs.items():
-        finest: tuple[str, str, Transcription, int] = (task, key, "points", MESHES["points"][-1])
-        if task == "minimum_time":
-            finest = (task, key, "held", LIFT_MESHES[-1])
-        reference = costs[finest]
+        best: Transcription = "linear" if task == "minimum_time" else "points"
+        finest = (LIFT_MESHES if task == "minimum_time" else MESHES)[best][-1]
+        reference = costs[task, key, best, finest]
         rows.append(
             {
                 "task": task,
@@ -224,7 +267,3 @@ def convergence_rows(plans: Mapping[str, Mapping[str, Plan]]) -> list[Row]:
             }
         )
     return rows
-
-
-def _all(plans: Mapping[str, Mapping[str, Plan]]) -> list[Plan]:
-    return [plan for group in plans.values() for plan in group.values()]
