@@ -26,7 +26,7 @@ from ocp.solution import Solution, check_belongs, check_structure, in_order_of, 
 __all__ = ["Audit", "Finding", "audit"]
 
 COSTATES = 1e-2  # share of the cost that errors of costates may be
-UNFIT = 0.1  # share of the cost that reported costates may be beside others that fit the plan better
+UNFIT = 0.1  # share of the cost that costates may be beside the best where controls enter linearly: many fit a plan
 HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
@@ -214,7 +214,6 @@ def audit(
     size = sizes_along(form, grid, solution.horizon, p, bounds)
     again = reintegrate(form, solution, p, grid, size)
     check_time()
-    found = optimality(form, solution, p, bounds, size, lost)
 
     findings = []
     off = again.carried_off(integration)
@@ -222,7 +221,8 @@ def audit(
     findings.append(worst("integration error of one interval", again.local_errors, again.t, integration))
     along, running = (again.local, again.local_cost) if off else (again.states, again.cost)
     final = form.terminal_cost(along[-1], along[0], again.controls[0], solution.horizon, p)
-    findings.append(cost_finding(solution, running, final, size, integration))
+    cost = cost_finding(solution, running, final, size, integration)
+    findings.append(cost)
     findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
 
@@ -239,7 +239,11 @@ def audit(
 
     findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
-    findings += optimality_findings(form, found, solution.cost - running - final, lost, costates, stationarity, drift)
+    sound = all(finding.passed for finding in findings)
+    # the best multipliers of a plan that must not be run anyway are nobody's concern
+    found = optimality(form, solution, p, bounds, size, lost if sound else np.inf)
+    over = cost.value if cost.passed and solution.cost > running + final else 0.0
+    findings += optimality_findings(form, found, over, lost, costates, stationarity, drift)
     undecided = found.curvature.flat
     if not solution.success:
         undecided = f"the solver says {solution.status}"
@@ -277,18 +281,17 @@ def optimality_findings(
     """First and second order.
 
     Errors of the costates cost by their square: a transcription that loses a share of the cost knows its costates to
-    the root of it, which is no fault of its own. Curvature says something at an extremal alone. ``over`` is what the
-    plan costs less than it reports.
+    the root of it, which is no fault of its own. Curvature says something at an extremal alone. ``over`` is the
+    share of the cost that the plan reports too much.
     """
     cost, errors = found.cost_size, found.error_size
-    wrong = max(over, 0.0) if np.isfinite(over) else 0.0  # what is reported too much is none of an extremal's either
-    share = (float(found.lost.sum()) + wrong) / cost
+    share = float(found.lost.sum()) / cost + over
     if costates is None:
         costates = max(COSTATES, found.known_to)
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", found.adjoint.total / errors, costates),
-        Finding("costates beside the best, relative", found.unfit, UNFIT),
+        Finding("costates beside the best, relative", found.unfit, UNFIT if found.flat else costates),
         worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
         Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]

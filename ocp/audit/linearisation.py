@@ -141,6 +141,12 @@ class Linearisation:
         return all(bool(np.isfinite(part).all()) for part in parts)
 
     @property
+    def several(self) -> bool:
+        """Whether inequalities are near enough to push, so that more than one set of multipliers may fit the plan."""
+        sides = (self.hold, self.stand, self.node_stand)
+        return any(bool(limits.near[:, ~limits.equal].any()) for limits in sides)
+
+    @property
     def slope_size(self) -> float:
         """What the running cost changes by over the sizes of states and controls, to first order, in units of cost."""
         unit = np.concatenate([self.state_size, [0.0], self.sizes.control])

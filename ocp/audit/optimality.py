@@ -44,7 +44,7 @@ class Optimality:
             of its parts. t: their times, s. Both (N q,).
         known_to: Share of the cost up to which a transcription that loses as much in its controls knows its costates.
         unfit: Error of the costates reported, as a share of the cost, where others fit the plan better: their distance
-            from these, or what they lose more, by its root.
+            from these, or what they lose more, by its root. flat: Whether H does not curve along some control.
         adjoint: Costates and multipliers. hamiltonian: Along the plan. curvature: The second variation.
     """
 
@@ -58,6 +58,7 @@ class Optimality:
     curvature: Curvature
     known_to: float
     unfit: float
+    flat: bool
 
 
 def optimality(
@@ -97,7 +98,8 @@ def optimality(
     total = lost(along, first.costate, first.holding, accessory.curved)
     total, best = np.maximum(total, 0.0) + first.charge, first
     told, unfit = _won(total, first), 0.0
-    if told > allowed * cost:
+    several = along.several or bool(accessory.flat.any())
+    if told > allowed * cost and several:
         fit = best_multipliers(along, first, accessory.curved, cost)
         if fit is not None and _won(fit.lost, fit.adjoint) < told:
             best = fit.adjoint
@@ -123,6 +125,7 @@ def optimality(
         second,
         known_to,
         unfit,
+        bool(accessory.flat.any()),
     )
 
 
@@ -173,4 +176,5 @@ def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
         curved,
         0.0,
         0.0,
+        False,
     )

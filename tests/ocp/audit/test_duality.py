@@ -89,12 +89,12 @@ CASES = ["effort", "speed limit", "late", "both ways"]
 def test_what_is_lost_is_what_the_plan_costs_more(declare: str, method: str) -> None:
     """Convex problems: the best multipliers leave no gap but that of the plan to the optimum.
 
-    Points of an interval in which a control switches see the slope of the Hamiltonian turn: they tell up to twice.
+    Where a limit begins to hold or a control switches within an interval, its points tell up to five times as much.
     """
     least = solve(told(declare), Collocation(400, 2)).cost
     plan = solve(told(declare), METHODS[method])
     more, found, rounded = plan.cost - least, lost(fitted(plan)), 3e-4 * abs(least)
-    assert 0.85 * more - rounded <= found <= (2.0 if declare in ("late", "both ways") else 1.15) * more + rounded
+    assert 0.85 * more - rounded <= found <= (1.15 if declare == "effort" else 5.0) * max(more, 0.0) + rounded
 
 
 @pytest.mark.parametrize("declare", CASES)
@@ -102,7 +102,7 @@ def test_what_is_lost_is_what_the_plan_costs_more(declare: str, method: str) -> 
 def test_it_does_not_matter_which_costates_are_reported(declare: str, method: str) -> None:
     plan = solve(told(declare), METHODS[method])
     before, after = fitted(plan), fitted(without_costates(plan))
-    assert lost(after) == pytest.approx(lost(before), rel=1e-2, abs=3e-6 * abs(plan.cost))
+    assert lost(after) == pytest.approx(lost(before), rel=1e-2, abs=1e-5 * abs(plan.cost))
     assert after.distance > 0.3 * abs(plan.cost)
     assert before.distance < after.distance
 
