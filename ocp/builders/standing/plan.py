@@ -14,6 +14,7 @@ from models.machines.standing import External, Standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
+from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
@@ -28,15 +29,15 @@ __all__ = ["Asked", "Attempt", "plan_standing"]
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 """Controls at the points: smooth plans, certified on few intervals."""
-HELD = Collocation(50, degree=3, scheme="legendre", control="held")
-"""Held controls: plans that switch between limits, as those of least time do."""
+LINEAR = MultipleShooting(50, control="linear")
+"""Controls linear between the nodes: plans that switch between limits, as those of least time do."""
 MESHES = 3
 """Of each formulation, each twice as fine as the one before."""
 STRAY = 1e-5
 """Pose error, m and rad, that the re-integrated plan may have anywhere, if its task allows no gap at the start."""
 IPOPT = {"max_iter": 300}
 
-Formulation = tuple[Literal["position", "acceleration"], Collocation]
+Formulation = tuple[Literal["position", "acceleration"], Collocation | MultipleShooting]
 
 
 class Asked(TypedDict, total=False):
@@ -86,9 +87,9 @@ def plan_standing(
     """Solve `standing_problem` and audit the plan, by the formulation that works for it.
 
     The first plan that passes its audit, its tips nowhere further than 1e-5 (m, rad) from their poses, is returned.
-    Accelerations at collocation points come first, held accelerations where the final time is free; jerks are at
-    points. A plan that does no more than exceed its limits between the points of its grid is tightened there; one that
-    fails otherwise is solved again from itself on up to two meshes, each twice as fine.
+    Accelerations at collocation points come first, accelerations linear between the nodes where the final time is
+    free; jerks are at points. A plan that does no more than exceed its limits between the points of its grid is
+    tightened there; one that fails otherwise is solved again from itself on up to two meshes, each twice as fine.
 
     Args:
         machine, tasks, start_joints, horizon, asked: As for standing_problem.
@@ -135,16 +136,22 @@ def plan_standing(
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Formulation]:
     """How the tips are kept to their tasks, and the first mesh, in the order in which they are worth their time."""
     at_points: Formulation = ("acceleration" if control == "acceleration" else "position", method or POINTS)
-    held: Formulation = ("position", method or HELD)
     if method is not None:
-        return [held if method.control == "held" else at_points]
+        return [("position", method) if method.control == "held" else at_points]
     if control == "jerk":
         return [at_points]
-    return [held, at_points] if free_time else [at_points, held]
+    linear: Formulation = ("position", LINEAR)
+    return [linear, at_points] if free_time else [at_points, linear]
 
 
 def _attempts(
-    problem: Problem, level: str, mesh: Collocation, settings: Mapping[str, Any], judge: _Judge, *, diagnosed: bool
+    problem: Problem,
+    level: str,
+    mesh: Collocation | MultipleShooting,
+    settings: Mapping[str, Any],
+    judge: _Judge,
+    *,
+    diagnosed: bool,
 ) -> Iterator[Attempt]:
     """Attempts at one formulation; whoever takes them stops at the first that holds.
 

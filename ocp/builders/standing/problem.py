@@ -5,11 +5,12 @@ any task of `tip_task`: positions, orientations, free tool axes, several arms.
 
 Joint accelerations (or jerks) are the control. Two ways to keep the tips to their tasks:
 
-tip_level "position": for controls held over intervals, `MultipleShooting(..., control="held")` or `Collocation(...,
-    control="held")`. The tip is on its path at the nodes; what the ground and the joints bear is constrained at both
-    ends of every interval; a pinned zero moment point is where it should be at the start of every interval. Converges
-    with the first order of the interval where a constraint of the ground is active: the audit then finds the motion
-    feasible, and more of the cost lost than an optimum may lose.
+tip_level "position": for controls held over intervals, or linear in them: `MultipleShooting(..., control="held")` or
+    `"linear"`, `Collocation(..., control="held")`. The tip is on its path at the nodes; what the ground and the joints
+    bear is constrained at both ends of every interval; a pinned zero moment point is where it should be at the start
+    of every interval. Held controls converge with the first order of the interval where a constraint of the ground is
+    active: the audit then finds the motion feasible, and more of the cost lost than an optimum may lose. Linear ones
+    are nearer to plans that switch; take `ocp.tighten` with them.
 tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
     tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
     nearer to the optimum for the same number of intervals, and certified by the audit. The one to take where slides

@@ -75,13 +75,15 @@ def test_the_formulation_that_works_is_found(
     assert tip_error(machine(), sampled(machine(), solution), table_task(1)) < 1e-5
 
 
-def test_the_fastest_lift_is_planned_with_held_accelerations() -> None:
+def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
     settings: dict[str, Any] = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", "zmp": IN_RANGE}
     horizon = FreeTime(0.2, 3.0, 1.0)
     solution = plan_standing(machine(), straight(0.0, 0.8), STANDING_STARTS[1], horizon, **settings)
-    assert solution.audit().passed
-    assert solution.method["control"] == "held"
-    assert solution.horizon == pytest.approx(0.503, rel=2e-3)
+    audit = solution.audit()
+    assert audit.feasible
+    assert not audit.failures
+    assert solution.method["control"] == "linear"
+    assert solution.horizon == pytest.approx(0.5003, rel=2e-3)  # the limit of fine meshes, by collocation
 
 
 def test_a_failure_says_what_became_of_every_attempt() -> None:
