@@ -95,8 +95,7 @@ def holders(
         return found, across
     left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
     steep = float(np.abs(gradient).max())
-    won = hold.charge(found).sum(axis=1)
-    for k in np.flatnonzero((left > STEEP * steep) | (won > STEEP * steep)):
+    for k in np.flatnonzero(left > STEEP * steep):
         bend = curved[k] * unit * unit[:, None]
         values, vectors = np.linalg.eigh((bend + bend.T) / 2)
         root = vectors / np.sqrt(np.maximum(values, np.abs(gradient[k]).max() * FLAT + FLAT * np.abs(values).max()))

@@ -41,7 +41,7 @@ SECONDS = 2.5
 MARGIN = 0.005  # m
 SHARE = 0.97  # of the limits of velocity and torque: room for what happens between the points of the grid
 WEIGHTS = Weights(acceleration=0.02, velocity=0.2, joint_limits=0.5, manipulability=0.2)
-METHOD = Collocation(30, degree=3, scheme="legendre")
+METHOD = Collocation(45, degree=3, scheme="legendre")
 TOLERANCES = {"tip": 0.06, "velocities": 1e-3, "zero moment point": 1e-3}
 """Of the audit, m/s^2, m/s (rad/s) and m: how far polynomials stray between the points of the grid."""
 
