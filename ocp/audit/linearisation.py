@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import Sizes
+from ocp.audit.sizes import FLOOR, Sizes
 from ocp.curves import lagrange, quadrature_weights
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution, stack
@@ -195,7 +195,8 @@ class Linearisation:
         speed.append(np.sqrt(np.abs(bent[None]) / 2 / (abs(self.solution.cost) or 1.0)))
         fastest = np.vstack(speed).max(axis=0)
         found = sizes.state.copy()
-        found[still] = np.where(fastest > 0, 1.0 / np.where(fastest > 0, fastest, 1.0), found[still])
+        with np.errstate(divide="ignore"):  # what moves nothing but by rounding is as large as its floor says
+            found[still] = np.minimum(1.0 / fastest, found[still] / FLOOR)
         return found
 
     def _limits(self) -> None:

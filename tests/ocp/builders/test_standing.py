@@ -150,7 +150,7 @@ def test_the_audit_of_a_held_plan_finds_its_motion_sound_and_what_it_loses() -> 
     assert not audit["cost lost, relative"].passed
     excess = solution.cost - points(table_plan(1, IN_RANGE, tip_level="acceleration"), 40).cost
     assert excess == pytest.approx(1.46e-3, rel=0.01)
-    assert audit.lost.sum() == pytest.approx(excess, rel=0.15)
+    assert audit.lost.sum() == pytest.approx(excess, rel=0.2)
 
 
 def test_collocation_with_held_controls_gives_the_same_plan_as_shooting() -> None:
