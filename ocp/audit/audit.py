@@ -135,7 +135,9 @@ class Audit:
 
     def __str__(self) -> str:
         width = max(len(finding.name) for finding in self.findings)
-        lines = [f"Audit of {self.name!r}: {'passed' if self.passed else 'FAILED'}"]
+        open_only = self.feasible and self.optimal is None
+        word = "passed" if self.passed else "not decided" if open_only else "FAILED"
+        lines = [f"Audit of {self.name!r}: {word}"]
         words = {True: "yes", False: "NO", None: "not decided"}
         for verdict, holds in (("feasible", self.feasible), ("optimal", self.optimal)):
             title = f"{verdict}: {words[holds]}"

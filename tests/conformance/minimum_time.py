@@ -32,8 +32,8 @@ RUNS = (
     # held controls and an even number of intervals: the switch lies on a node, the optimum is held exactly
     *within(*held(20), cost=(2e-9, 2e-9), state=2e-9, control=1e-8, costate=1e-8, time=1e-8),
     # an odd number: the switch lies inside an interval; still every plan is admissible
-    *within(radau(21, control="held"), cost=(1e-8, 3e-3), state=5e-2, control=1e-8, costate=5e-3, time=5e-3),
-    *within(shooting(21, "held"), cost=(1e-8, 3e-3), state=3e-3, control=1e-8, costate=5e-3, time=5e-3),
+    *within(radau(31, control="held"), cost=(1e-8, 3e-3), state=5e-2, control=1e-8, costate=5e-3, time=5e-3),
+    *within(shooting(31, "held"), cost=(1e-8, 3e-3), state=3e-3, control=1e-8, costate=5e-3, time=5e-3),
 )
 CASE = Case(
     "minimum time", build, 2.0, RUNS, horizon=2.0, optimum=optimum, switches=(Switch(1.0, lambda x, lam: lam["v"]),)

@@ -108,7 +108,7 @@ RUNS_IN_ANGLE = (
     *within(radau(20, degree=7), cost=(1e-10, 1e-10), state=1e-8, control=5e-7, costate=1e-5),
     *within(legendre(30, degree=4), cost=(2e-9, 2e-9), state=5e-6, control=1e-4, costate=1e-4),
     *within(shooting(60, "linear"), cost=(1e-6, 5e-4), state=1e-4, control=2e-2, costate=2e-3),
-    *within(shooting(60, "held"), cost=(1e-6, 5e-2), state=3e-3, control=0.3, costate=0.1),
+    *within(shooting(100, "held"), cost=(1e-6, 5e-2), state=3e-3, control=0.3, costate=0.1),
 )
 CASE_IN_ANGLE = Case(
     "pendulum in its angle", build_in_angle, COST, RUNS_IN_ANGLE, horizon=HORIZON, optimum=optimum_in_angle
