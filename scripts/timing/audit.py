@@ -1,4 +1,8 @@
-"""How long an audit takes beside the solve that it checks, and how both grow with the number of intervals."""
+"""How long an audit takes beside the solve that it checks, and how both grow with the number of intervals.
+
+What a user waits for is the whole solve: the program is built, then solved. The solve alone is what remains where one
+program is solved many times.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +58,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
         "rows": rows,
         "growth_over_linear": [{"case": case, "audit": value} for case, value in by_case.items()],
         "worst_ratio": max(row["audit_over_solve"] for row in rows),
+        "worst_ratio_to_whole": max(row["audit_over_whole"] for row in rows),
         "worst_growth_over_linear": max(by_case.values()),
         "goals": {"worst_ratio": GOAL_RATIO, "worst_growth_over_linear": GOAL_GROWTH},
     }
@@ -74,6 +79,7 @@ def audit_times(case: str, intervals: int, repeats: int) -> dict[str, Any]:
         "solve_s": solve,
         "audit_s": judge,
         "audit_over_solve": judge / solve,
+        "audit_over_whole": judge / (solve + plan.seconds["build"]),
         "audit_ms_an_interval": 1e3 * judge / intervals,
         "passed": audit.passed,
     }
@@ -84,7 +90,8 @@ def report(summary: dict[str, Any]) -> str:
     goals = summary["goals"]
     return (
         f"{text_table(summary['rows'], 4)}\n"
-        f"audit over solve, worst: {summary['worst_ratio']:.2f}, goal {goals['worst_ratio']:g}\n"
+        f"audit over solve, worst: {summary['worst_ratio']:.2f}, goal {goals['worst_ratio']:g}; "
+        f"over the solve with its build: {summary['worst_ratio_to_whole']:.2f}\n"
         f"growth of the audit from 100 to {max(INTERVALS)} intervals over linear, worst: "
         f"{summary['worst_growth_over_linear']:.2f}, goal {goals['worst_growth_over_linear']:g}"
     )
