@@ -143,7 +143,7 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     for _ in range(MOST_DESCENTS):
         if not solution.regularised:
             break
-        found = optimality(form, solution, p, bounds).curvature
+        found = optimality(form, solution, p, bounds, allowed=np.inf).curvature
         if not found.least < -FLAT:
             break
         others = [

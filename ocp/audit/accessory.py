@@ -234,11 +234,9 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     at_end = (np.abs(ends.end) > FLAT * force) | form.end.equality
     at_start = (np.abs(ends.start) > FLAT * force) | form.start.equality
     fixed = {k: low[places[k]] == high[places[k]] for k in ("terminal", "initial")}
+    slack = AT_BOUND * along.sizes.state
     for k, x in (("terminal", x1), ("initial", x0)):
-        rests = (x <= low[places[k]] + AT_BOUND * along.sizes.state) | (
-            x >= high[places[k]] - AT_BOUND * along.sizes.state
-        )
-        fixed[k] = fixed[k] | rests
+        fixed[k] = fixed[k] | (x <= low[places[k]] + slack) | (x >= high[places[k]] - slack)
 
     # rows and columns of (x, T, x0) that z has; at the start x is the x0 of the conditions
     z = [*range(nx), *([nx] if accessory.free else []), *(range(nx + 1, 2 * nx + 1) if accessory.tied else [])]

@@ -22,7 +22,7 @@ from ocp.audit.principle import DEPENDENT, holders, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
-__all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "between", "end_limits", "ends_of_intervals"]
+__all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "ends_of_intervals"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
@@ -130,7 +130,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
         standing.reshape(n * q, m),
         np.abs(first - start) @ size,
         total,
-        np.maximum(between(along, costate, last) - force.sum(axis=1), 0.0),
+        np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
         stand.sum(axis=(1, 2)) + single[0] + single[1],
         _lumps(along, holding, inside, atoms if taken is None else None),
         _ends(along, costate, holding, inside, atoms, cost, last[-1]),
@@ -218,18 +218,13 @@ class Backwards:
         start = end + np.einsum("k,j,kja->ka", along.width, along.weight, flow) + force.sum(axis=1)
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
-    @property
-    def flow(self) -> tuple[np.ndarray, np.ndarray]:
-        """What costates at the ends of the intervals make at the points, (N, q, nx, nx), and at the starts, alone."""
+    def chained(self, errors: np.ndarray) -> np.ndarray:
+        """What errors (N, nx) at the start of each interval make together at its start, carried on backwards."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         weight = self.along.weight[:, None, None]
-        return points, np.eye(nx) + self.along.width[:, None, None] * (weight * (self.feed @ points)).sum(axis=1)
-
-    def chained(self, errors: np.ndarray) -> np.ndarray:
-        """What errors (N, nx) at the start of each interval make together at its start, carried on backwards."""
-        (n, _), nx = self.along.shape, self.along.form.nx
-        off, found, (_, flow) = np.zeros(nx), np.zeros((n, nx)), self.flow
+        flow = np.eye(nx) + self.along.width[:, None, None] * (weight * (self.feed @ points)).sum(axis=1)
+        off, found = np.zeros(nx), np.zeros((n, nx))
         with np.errstate(over="ignore", invalid="ignore"):
             for k in reversed(range(n)):
                 off = errors[k] + flow[k] @ off
@@ -291,7 +286,7 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     return inside, atoms
 
 
-def between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
+def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Distance of the costates that a plan reports between the ends of its intervals, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     at = along.solution.t / along.solution.horizon

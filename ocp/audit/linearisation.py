@@ -84,7 +84,8 @@ class Linearisation:
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
         sizes: Of all named things along the plan. state_size: Of the states, by which costates are judged. Shape (nx,).
         end_row, end_y: The end and start rows, in this order, and their derivatives in (x, x0, T), (m,), (m, 2 nx + 1).
-        final_y, final_yy: Derivatives of the terminal cost in these, (2 nx + 1,), and its second ones, squared.
+        final_y, final_yy: First and second derivatives of the terminal cost in these, (2 nx + 1,) and
+            (2 nx + 1, 2 nx + 1).
         hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of states,
             in this order. Shape (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
