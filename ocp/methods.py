@@ -137,7 +137,7 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     Raises:
         SolveError: It can, but from beside it the solver finds no plan: the cost may have no least.
     """
-    form = Formulation(solution.problem)
+    form = Formulation.of(solution.problem)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     for _ in range(MOST_DESCENTS):

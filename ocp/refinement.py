@@ -99,7 +99,7 @@ def refine(
         if name not in LIMITS:
             raise unknown_name("limit of the audit", name, LIMITS)
     max_intervals = checked_count("refine: max_intervals", max_intervals)
-    form = Formulation(problem)
+    form = Formulation.of(problem)
     p = form.parameter_vector(checked_mapping("parameters", parameters))
     method = method.with_nodes_at(_fractions(form, p, breaks))
     if max_intervals < method.intervals:

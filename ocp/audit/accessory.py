@@ -11,12 +11,16 @@ step of the control (Maurer, Osmolovskii 2003).
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
 from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
+from ocp.problem.formulation import Formulation
 
 __all__ = ["AccessoryProblem", "end_conditions"]
 
@@ -57,12 +61,7 @@ class AccessoryProblem:
         self._switch()
 
     def _obstacle(self) -> str:
-        form = self.along.form
-        if ca.depends_on(ca.vertcat(form.end.expression, form.terminal), form.u0):
-            return "the control at the start enters the conditions at the end"
-        if ca.depends_on(ca.vertcat(form.end.expression, form.terminal, form.start.expression), form.u):
-            return "a control enters the conditions at an end"
-        return ""
+        return str(self.along.form.kept("obstacle", lambda: obstacle(self.along.form)))
 
     def _units(self) -> None:
         """Units in which a sweep is well conditioned: they judge nothing.
@@ -92,11 +91,14 @@ class AccessoryProblem:
         multipliers = np.zeros((m, len(form.path)))
         multipliers[:, along.mixed] = self.adjoint.holding[:, self.nu : self.nu + along.mixed.size]
         multipliers[:, along.still] = self.adjoint.standing[:, self.nx :]
-        cost, rate, path = along.scaled
-        total = cost + ca.dot(lam, rate) + ca.dot(mu, path)
+
+        def outputs() -> list[Any]:
+            cost, rate, path = along.scaled
+            total = cost + ca.dot(lam, rate) + ca.dot(mu, path)
+            return [ca.hessian(total, along.y)[0], ca.diag(ca.hessian(cost, form.x)[0])]
+
         more = (lam, self.adjoint.costate), (mu, multipliers)
-        own = ca.diag(ca.hessian(cost, form.x)[0])
-        hessian, self._cost_curves = form.sampled([ca.hessian(total, along.y)[0], own], *along.here, *more)
+        hessian, self._cost_curves = form.sampled(outputs, *along.here, *more, kept="second derivatives")
         ny = self.nx + 1 + self.nu
         hessian = hessian.reshape(m, ny, ny)
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
@@ -110,14 +112,14 @@ class AccessoryProblem:
         self.rate *= self.unit / z_unit[:, None]
         self.hessian *= self.unit * self.unit[:, None]
 
-    @property
+    @cached_property
     def flat(self) -> np.ndarray:
         """Controls along which the Hamiltonian does not curve. Shape (nu,), bool."""
         bends = np.abs(self.curved * self.range * self.range[:, None]).max(axis=(0, 2), initial=0.0)
         pull = np.abs(slope(self.along, self.adjoint.costate) * self.range).max(initial=0.0)
         return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
 
-    @property
+    @cached_property
     def left(self) -> np.ndarray:
         """Slope of T H along the controls that curve it, which nothing holds, in scaled controls. Shape (M, nu)."""
         along = self.along
@@ -204,11 +206,37 @@ class AccessoryProblem:
             whole = fixed[:, :, i].all(axis=1)
             for k in np.flatnonzero(~whole):
                 before, after = max(int(k) - 1, 0), min(int(k) + 1, n - 1)
+                rise = u[after, -1, i] - u[before, 0, i]
+                if not (np.isfinite(step) and abs(rise) > 0.5 * step):
+                    continue
                 near = slice(before, after + 1)
                 steep = np.polynomial.polynomial.polyfit(at[near].ravel(), pull[near, :, i].ravel(), 1)[1]
-                rise = u[after, -1, i] - u[before, 0, i]
-                if np.isfinite(step) and steep * rise < 0 and abs(rise) > 0.5 * step:
+                if steep * rise < 0:
                     self.moved[k, i], self.switching[k, i] = True, abs(steep) / abs(rise)
+
+
+def obstacle(form: Formulation) -> str:
+    """Why the second variation of the plans of a problem is not known, or ""."""
+    last = ca.vertcat(form.end.expression, form.terminal)
+    if ca.depends_on(last, form.u0):
+        return "the control at the start enters the conditions at the end"
+    if ca.depends_on(ca.vertcat(last, form.start.expression), form.u):
+        return "a control enters the conditions at an end"
+    return ""
+
+
+def curved_ends(form: Formulation) -> Any:
+    """Second derivatives of the end and of the start rows, each times its multiplier, in (x, T, x0).
+
+    A Function (x, x0, T, p, multipliers of the end rows, of the start rows).
+    """
+    nu_end, nu_start = (form.sym(name, len(r)) for name, r in (("nu", form.end), ("nu0", form.start)))
+    last = ca.substitute([form.end.expression], [form.t], [form.T])[0]
+    begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
+    both = ca.vertcat(form.x, form.T, form.x0)
+    outputs = [ca.hessian(ca.dot(nu, rows), both)[0] for nu, rows in ((nu_end, last), (nu_start, begin))]
+    symbols = [form.x, form.x0, form.T, form.p, nu_end, nu_start]
+    return ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -220,16 +248,12 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     form, solution, (low, high) = along.form, along.solution, along.bounds
     places, nx = form.bounds.places, accessory.nx
     x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
-    nu_end, nu_start = (form.sym(name, len(r)) for name, r in (("nu", form.end), ("nu0", form.start)))
-    last = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
-    begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
-    both = ca.vertcat(form.x, form.T, form.x0)
-    total = [last[1] + ca.dot(nu_end, last[0]), ca.dot(nu_start, begin)]
-    outputs = [ca.jacobian(last[0], both), ca.jacobian(begin, both), *(ca.hessian(part, both)[0] for part in total)]
-    symbols = [form.x, form.x0, form.T, form.p, nu_end, nu_start]
-    values = ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
-    found = values(x1, x0, solution.horizon, along.p, ends.end, ends.start)
-    psi_y, psi0_y, end_curved, start_curved = (np.asarray(v.full()) for v in found)
+    second = form.kept("curvature of the ends", lambda: curved_ends(form))
+    found = second(x1, x0, solution.horizon, along.p, ends.end, ends.start)
+    end_curved, start_curved = (np.asarray(v.full()) for v in found)
+    order = [*range(nx), 2 * nx, *range(nx, 2 * nx)]  # of (x, T, x0) in (x, x0, T)
+    end_curved = end_curved + along.final_yy[np.ix_(order, order)]
+    psi_y, psi0_y = np.split(along.end_y[:, order], [len(form.end)])
     force = max(np.abs(ends.end).max(initial=0.0), np.abs(ends.start).max(initial=0.0)) or 1.0
     at_end = (np.abs(ends.end) > FLAT * force) | form.end.equality
     at_start = (np.abs(ends.start) > FLAT * force) | form.start.equality

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
 from ocp.audit.principle import FLAT
 from ocp.audit.reintegration import Reintegration, reintegrate
@@ -206,7 +207,7 @@ def audit(
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
             raise ProblemError(words, name=name, value=limit)
-    form = Formulation(problem)
+    form = Formulation.of(problem)
     check_structure(solution)
     check_belongs(form, solution)
     solution = in_order_of(form, solution)
@@ -214,15 +215,16 @@ def audit(
     bounds = form.bound_values(p)
     grid = fine_grid(solution)
     size = sizes_along(form, grid, solution.horizon, p, bounds)
-    again = reintegrate(form, solution, p, grid, size)
+    along = Linearisation(form, solution, p, bounds, size)
+    again = reintegrate(along, grid)
     check_time()
 
     findings = []
     off = again.carried_off(integration)
     findings.append(integration_finding(again, integration, off))
     findings.append(worst("integration error of one interval", again.local_errors, again.t, integration))
-    along, running = (again.local, again.local_cost) if off else (again.states, again.cost)
-    final = form.terminal_cost(along[-1], along[0], again.controls[0], solution.horizon, p)
+    motion, running = (again.local, again.local_cost) if off else (again.states, again.cost)
+    final = form.terminal_cost(motion[-1], motion[0], again.controls[0], solution.horizon, p)
     cost = cost_finding(solution, running, final, size, integration)
     findings.append(cost)
     findings.append(reported_finding(solution, size, integration))
@@ -234,7 +236,7 @@ def audit(
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
     total: dict[str, float] = {}
-    for check in violations(form, again, along, size, bounds, p, solution.horizon):
+    for check in violations(form, again, motion, size, bounds, p, solution.horizon):
         finding = violation_finding(check, constraints, limits.get(check.name))
         findings.append(replace(finding, unit=form.units.get(check.name, "")))
         total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))
@@ -243,7 +245,7 @@ def audit(
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     sound = all(finding.passed for finding in findings)
     # the best multipliers of a plan that must not be run anyway are nobody's concern
-    found = optimality(form, solution, p, bounds, size, lost if sound else np.inf)
+    found = optimality(form, solution, p, bounds, along, lost if sound else np.inf)
     over = cost.value if cost.passed and solution.cost > running + final else 0.0
     findings += optimality_findings(form, found, over, lost, costates, stationarity, drift)
     undecided = found.curvature.flat
@@ -352,14 +354,15 @@ def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
     """The reported arrays against the interpolants, relative; at a break the value of either side will do."""
     off = np.zeros(len(solution.t))
     costates = float(np.max(np.abs(solution.costate_interpolant.values), initial=0.0)) or 1.0
+    at = np.add.outer([-1e-12, 1e-12], solution.t / solution.horizon).ravel()
     for pool, curve, size in (
         (solution.states, solution.state_interpolant, sizes.state),
         (solution.controls, solution.control_interpolant, sizes.control),
         (solution.costates, solution.costate_interpolant, costates),
     ):
         values = stack(pool, len(off))
-        sides = [np.abs(curve(solution.t / solution.horizon + shift) - values) / size for shift in (-1e-12, 1e-12)]
-        off = np.maximum(off, np.min([side.max(axis=1, initial=0.0) for side in sides], axis=0))
+        sides = np.abs(curve(at).reshape(2, len(off), -1 if values.size else 0) - values) / size
+        off = np.maximum(off, sides.max(axis=2, initial=0.0).min(axis=0))
     return worst("reported values, relative", off, solution.t, limit)
 
 

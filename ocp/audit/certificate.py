@@ -118,7 +118,7 @@ def certificate(
     if len(named) < 2:
         words = f"a certificate compares at least two solutions, not {len(named)}"
         raise ProblemError(words, name="solutions", value=len(named), limit=2)
-    form = Formulation(problem)
+    form = Formulation.of(problem)
     for solution in named.values():
         check_belongs(form, solution)
     order = sorted(named, key=lambda name: named[name].method["type"] != "Indirect")  # stable: indirect first

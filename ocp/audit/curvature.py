@@ -82,21 +82,22 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
     along = accessory.along
     if along.form.indifferent:
         return Curvature(np.inf, None, "", None, along.t)
-    if not (np.isfinite(accessory.rate).all() and np.isfinite(accessory.hessian).all()):
+    if not all(np.isfinite(part).all() for part in (accessory.rate, accessory.hessian, accessory.left)):
         return Curvature(np.nan, None, "the Hamiltonian is not finite along the plan", None, along.t)
     if accessory.obstacle:
         return Curvature(np.nan, None, accessory.obstacle, None, along.t)
-    found = _sweep(accessory, weak=False)
+    stages = _Linearised.of(accessory)
+    found = _sweep(accessory, stages, weak=False)
     if found.least <= FLAT and accessory.weak.any():
         # a limit that is touched without a push takes away one side of a direction only
-        inside = _sweep(accessory, weak=True)
+        inside = _sweep(accessory, stages, weak=True)
         if inside.least > FLAT:
             why = "the cost curves upwards only because of limits that are touched without a push"
             return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:])
         found = inside
     if found.flat.startswith(NEARLY):
         # without what is left of conditions that others imply there is more to vary: upwards all the more
-        wider = _sweep(accessory, weak=False, tied=TIED)
+        wider = _sweep(accessory, stages, weak=False, tied=TIED)
         if wider.least > FLAT and not wider.flat:
             found = wider
     return Curvature(*found[:4], along.t, *found[4:])
@@ -114,93 +115,88 @@ class _Swept(NamedTuple):
     pull: np.ndarray | None = None
 
 
-def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swept:
-    """The backward sweep over all stages.
+def _sweep(accessory: AccessoryProblem, along: _Linearised, weak: bool, tied: float = RANK) -> _Swept:
+    """The backward sweep over all stages, by solves where every stage curves upwards, else by eigenvectors.
 
     Args:
         weak: Whether what is touched without a push is held too.
         tied: Size of a singular value below which constraints count as dependent, and the rest of them is dropped.
     """
-    along = accessory.along
-    n, q = along.shape
-    nz, nu = accessory.nz, accessory.nu
-    form, mesh = along.form, along.mesh
-    a, b = along.matrix, along.weight
-    h = along.width
-    # variations at the Gauss points from those at the start of the interval and those of the controls
-    rate = accessory.rate.reshape(n, q, nz, nz + nu)
-    rate_z, rate_u = rate[..., :nz], rate[..., nz:]
-    system = np.eye(q * nz) - np.einsum("k,ij,kjab->kiajb", h, a, rate_z).reshape(n, q * nz, q * nz)
-    driven = np.zeros((n, q, nz, nz + q * nu))
-    driven[..., :nz] = np.eye(nz)
-    driven[..., nz:] = np.einsum("k,ij,kjau->kiaju", h, a, rate_u).reshape(n, q, nz, q * nu)
-    inside = np.linalg.solve(system, driven.reshape(n, q * nz, -1)).reshape(n, q, nz, -1)
-    # controls in the metric of the quadrature: the length of their variation is that of a function of time
-    metric = np.sqrt(np.outer(h, along.weight))
-    whole = np.zeros((n, q, nz + nu, nz + q * nu))
-    whole[..., :nz, :] = inside
-    for j in range(q):
-        whole[:, j, nz:, nz + j * nu : nz + (j + 1) * nu] = np.eye(nu)
-    whole[..., nz:] /= np.repeat(metric, nu, axis=1)[:, None, None, :]
-    step = np.einsum("k,j,kjab,kjbc->kac", h, b, rate, whole)
-    step[:, :, :nz] += np.eye(nz)
-    weighted = (h[:, None] * b)[:, :, None, None] * accessory.hessian.reshape(n, q, nz + nu, nz + nu)
-    stage = (np.swapaxes(whole, 2, 3) @ weighted @ whole).sum(axis=1)
+    stages = _freed(accessory, along, weak, tied)
+    if not accessory.flat.any():
+        found = _swept(accessory, along, stages, tied, upwards=True)
+        if found is not None:
+            return found
+    found = _swept(accessory, along, stages, tied, upwards=False)
+    assert found is not None
+    return found
 
-    for k, i in zip(*np.nonzero(accessory.moved), strict=True):
-        area = np.zeros(nz + q * nu)
-        area[nz + i :: nu] = h[k] * b / metric[k] * accessory.range[i]
-        stage[k] += accessory.switching[k, i] * np.outer(area, area)
 
-    cost, rows, start_cost, start_rows = end_conditions(accessory)
-    sweep = _Linearised(whole, step, stage, metric, cost, rows, start_cost)
-    bends = np.abs(np.linalg.eigvalsh(stage[:, nz:, nz:])).max(axis=1) if nu else np.zeros(n)
-    scale = float(max(bends.max(initial=0.0), np.abs(cost).max(initial=0.0) * FLAT)) or 1.0
+def _swept(
+    accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tied: float, upwards: bool
+) -> _Swept | None:
+    """The sweep. With ``upwards`` None where some stage does not curve upwards.
+
+    Cost, step and curvature of a stage are those of (z, 1, controls), so that they hold the slope of the cost too.
+    """
+    mesh, horizon = accessory.along.mesh, accessory.along.solution.horizon
+    n, nz, nu = accessory.along.shape[0], accessory.nz, accessory.nu
+    m, rows, scale = nz + 1, sweep.end_rows, sweep.scale
+    cost = np.zeros((m, m))
+    cost[:nz, :nz] = sweep.end_cost
     least, at, flat = np.inf, None, ""
-    gains: list[np.ndarray] = []
-    share = (metric**2).reshape(n, q, 1)
-    slopes = np.einsum("kju,kjuc->kc", share * accessory.left.reshape(n, q, nu), whole[:, :, nz:])
-    pull, won = np.zeros(nz), np.zeros(n)
-    for k, (lift, move, bend, above) in reversed(list(enumerate(_freed(accessory, sweep, weak, tied)))):
-        joined = bend + move.T @ cost @ move
+    gains: list[_Gain] = []
+    won = np.zeros(n)
+    solid: dict[int, list[tuple[int, np.ndarray]]] = {}  # stages and their curvatures, by size
+    for k in reversed(range(n)):
+        lift, move, bend, above = stages[k]
+        joined = bend + move.T @ (cost @ move)
         if len(rows):
-            carried = rows_of_length_one(rows @ move, tied)
-            (inner,), (unheld,) = _eliminated(carried[None], nz, tied)
-            joined, lift, move = inner.T @ joined @ inner, lift @ inner, move @ inner
+            carried = rows_of_length_one(rows @ move[:nz], tied)
+            ((_, (inner,), (unheld,)),) = _eliminated(carried[None], m, tied)
+            joined, lift = inner.T @ joined @ inner, lift @ inner
             above = np.vstack([above, unheld])
-        rows = rows_of_length_one(above, tied) if len(above) else above
-        mixed, gain, cost = joined[nz:, :nz], lift[nz:, :nz], joined[:nz, :nz]
-        slope = lift.T @ slopes[k] + move.T @ pull
-        pull = slope[:nz]
-        if lift.shape[1] > nz:
-            values, vectors = np.linalg.eigh(joined[nz:, nz:])
-            if values[0] / scale < least:
-                least, at = float(values[0] / scale), float(mesh[k] * along.solution.horizon)
-            if values[0] < -FLAT * scale:
-                worst = lift[nz:, nz:] @ vectors[:, 0]
-                why = _singular(accessory, k, worst)
-                if why:
-                    return _Swept(least, at, why, None)
-                return _confirmed(least, at, _variation(accessory, sweep, k, worst, gains), scale)
-            curved = values > FLAT * scale
-            if not curved.all():
-                label = _label(form, lift[nz:, nz:] @ vectors[:, 0], nu)
-                flat = (
-                    flat
-                    or f"the cost does not curve along control {label!r} at {mesh[k] * along.solution.horizon:.4g} s"
-                )
-            answer = (vectors[:, curved] / values[curved]) @ (vectors[:, curved].T @ mixed)
-            gain = gain - lift[nz:, nz:] @ answer
-            pull = pull - answer.T @ slope[nz:]
-            won[k] = ((vectors[:, curved].T @ slope[nz:]) ** 2 / values[curved]).sum() / 2
+        rows = rows_of_length_one(above, tied)[:, :nz] if len(above) else above[:, :nz]
+        curve, mixed, cost = joined[m:, m:], joined[m:, :m], joined[:m, :m]
+        answer = mixed
+        if len(curve):
+            if upwards:
+                solid.setdefault(len(curve), []).append((k, curve))
+                try:
+                    answer = np.linalg.solve(curve, mixed)
+                except np.linalg.LinAlgError:
+                    return None
+            else:
+                values, vectors = np.linalg.eigh(curve)
+                if values[0] / scale < least:
+                    least, at = float(values[0] / scale), float(mesh[k] * horizon)
+                if values[0] < -FLAT * scale:
+                    worst = lift[m:, m:] @ vectors[:, 0]
+                    why = _singular(accessory, k, worst)
+                    if why:
+                        return _Swept(least, at, why, None)
+                    return _confirmed(least, at, _variation(accessory, sweep, k, worst, gains), scale)
+                curved = values > FLAT * scale
+                if not curved.all() and not flat:
+                    label = _label(accessory.along.form, lift[m:, m:] @ vectors[:, 0], nu)
+                    flat = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
+                answer = (vectors[:, curved] / values[curved]) @ (vectors[:, curved].T @ mixed)
+            won[k] = mixed[:, nz] @ answer[:, nz] / 2
             cost = cost - mixed.T @ answer
         cost = (cost + cost.T) / 2
-        gains.append(gain)
-    _, sizes, right = np.linalg.svd(rows_of_length_one(np.vstack([rows, start_rows]), tied))
+        gains.append(_Gain(lift[m:], answer))
+    for curves in solid.values():
+        smallest = np.linalg.eigvalsh(np.array([curve for _, curve in curves]))[:, 0] / scale
+        i = int(np.argmin(smallest))
+        if not smallest[i] > FLAT:
+            return None
+        if smallest[i] < least:
+            least, at = float(smallest[i]), float(mesh[curves[i][0]] * horizon)
+    _, sizes, right = np.linalg.svd(rows_of_length_one(np.vstack([rows, sweep.start_rows]), tied))
     basis = right[int(np.sum(sizes > tied)) :].T
     starts = basis, np.zeros(0)
     if basis.shape[1]:
-        values, vectors = np.linalg.eigh(basis.T @ (cost + start_cost) @ basis)
+        values, vectors = np.linalg.eigh(basis.T @ (cost[:nz, :nz] + sweep.start_cost) @ basis)
         if values[0] / scale < least:
             least, at = float(values[0] / scale), 0.0
         if values[0] < -FLAT * scale:
@@ -208,66 +204,19 @@ def _sweep(accessory: AccessoryProblem, weak: bool, tied: float = RANK) -> _Swep
         if values[0] <= FLAT * scale:
             flat = flat or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT * scale, values, 0.0)
-    return _Swept(least, at, flat, None, starts, won, pull)
-
-
-def _freed(
-    accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: float
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """What its own constraints leave free of each stage: those with the same constraints all at once.
-
-    Returns:
-        For each stage the variations at its start and of its controls from the former and from what is free,
-        (nz + q nu, nz + f); the step and the cost in these; and rows (r, nz) that are left for the stages before.
-    """
-    n, q = accessory.along.shape
-    nz, nu = accessory.nz, accessory.nu
-    normals = accessory.normals.reshape(n, q, -1, nz + nu)
-    held = (accessory.strong | accessory.weak if weak else accessory.strong).reshape(n, -1)
-    parts = [held, accessory.node_strong[:-1], accessory.node_strong[1:], accessory.moved]
-    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
-    found: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
-    for pattern, members in groups(np.hstack(parts)):
-        inside, first, last, moved = np.split(pattern, ends)
-        whole, step = sweep.whole[members], sweep.step[members]
-        own = [normals[members, j][:, at] @ whole[:, j] for j, at in enumerate(inside.reshape(q, -1))]
-        own.append(accessory.node_normals[members][:, first] @ np.eye(nz, step.shape[2]))
-        own.append(accessory.node_normals[members + 1][:, last] @ step)
-        for i in np.flatnonzero(moved):  # a switch moves: one variation, of the mean
-            own.append(whole[:, 1:, nz + i] - whole[:, :1, nz + i])
-        lifts, above = _eliminated(np.concatenate(own, axis=1), nz, tied)
-        for k, lift, rows in zip(members.tolist(), lifts, above, strict=True):
-            found[k] = lift, sweep.step[k] @ lift, lift.T @ sweep.stage[k] @ lift, rows
-    return [found[k] for k in range(n)]
-
-
-def _eliminated(rows: np.ndarray, nz: int, tied: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """What rows (K, r, nz + m) of states and controls leave free at K stages.
-
-    Returns:
-        Of each stage states and controls from the states and from what is free of the controls, (nz + m, nz + f), and
-        the rows (r', nz) of the states that no control sees. What controls see by less than counts is dropped.
-    """
-    count, _, both = rows.shape
-    lengths = np.linalg.norm(rows, axis=2, keepdims=True)
-    keep = lengths > tied * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
-    rows = np.where(keep, rows / np.where(keep, lengths, 1.0), 0.0)
-    left, sizes, right = np.linalg.svd(rows[:, :, nz:])
-    ranks, seen = (sizes > tied).sum(axis=1), (sizes > RANK).sum(axis=1)
-    lifts, above = [], []
-    for k in range(count):
-        rank = ranks[k]
-        lift = np.zeros((both, both - rank))
-        lift[:nz, :nz] = np.eye(nz)
-        lift[nz:, :nz] = -(right[k, :rank].T / sizes[k, :rank]) @ (left[k, :, :rank].T @ rows[k, :, :nz])
-        lift[nz:, nz:] = right[k, rank:].T
-        lifts.append(lift)
-        above.append(left[k, :, max(rank, seen[k]) :].T @ rows[k, :, :nz])
-    return lifts, above
+    return _Swept(least, at, flat, None, starts, won, cost[:nz, nz])
 
 
 class _Linearised(NamedTuple):
-    """The accessory problem of all stages: variations at the points, the step, the cost; metric; the ends."""
+    """The accessory problem of all stages: variations at the points from those at the start and of the controls.
+
+    Attributes:
+        whole: Variations of (z, u) at the points, (N, q, nz + nu, nz + q nu). step, stage: Those at the end, and the
+            cost, from (z, 1, controls): (N, nz + 1, nz + 1 + q nu), (N, nz + 1 + q nu, nz + 1 + q nu).
+        metric: Square root of the width that each point stands for. Shape (N, q).
+        end_cost, end_rows, start_cost, start_rows: See :func:`ocp.audit.accessory.end_conditions`.
+        scale: Largest curvature along the controls of a stage.
+    """
 
     whole: np.ndarray
     step: np.ndarray
@@ -276,6 +225,130 @@ class _Linearised(NamedTuple):
     end_cost: np.ndarray
     end_rows: np.ndarray
     start_cost: np.ndarray
+    start_rows: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, accessory: AccessoryProblem) -> _Linearised:
+        along, nz, nu = accessory.along, accessory.nz, accessory.nu
+        (n, q), h = along.shape, along.width
+        # variations at the Gauss points from those at the start of the interval and those of the controls
+        rate = accessory.rate.reshape(n, q, nz, nz + nu)
+        fed = h[:, None, None, None, None] * along.matrix[:, None, :, None] * rate[:, None].transpose(0, 1, 3, 2, 4)
+        system = np.eye(q * nz) - fed[..., :nz].reshape(n, q * nz, q * nz)
+        driven = np.zeros((n, q * nz, nz + q * nu))
+        driven[:, :, :nz] = np.tile(np.eye(nz), (q, 1))
+        driven[:, :, nz:] = fed[..., nz:].reshape(n, q * nz, q * nu)
+        # controls in the metric of the quadrature: the length of their variation is that of a function of time
+        metric = np.sqrt(np.outer(h, along.weight))
+        whole = np.zeros((n, q, nz + nu, nz + q * nu))
+        whole[:, :, :nz] = np.linalg.solve(system, driven).reshape(n, q, nz, -1)
+        for j in range(q):
+            whole[:, j, nz:, nz + j * nu : nz + (j + 1) * nu] = np.eye(nu)
+        whole[..., nz:] /= np.repeat(metric, nu, axis=1)[:, None, None, :]
+        share, together = (metric**2)[:, :, None, None], whole.reshape(n, q * (nz + nu), -1)
+        m = nz + 1
+        own = np.delete(np.arange(m + q * nu), nz)
+        step, stage = np.zeros((n, m, m + q * nu)), np.zeros((n, m + q * nu, m + q * nu))
+        step[:, :nz, own] = (share * rate).transpose(0, 2, 1, 3).reshape(n, nz, -1) @ together
+        step[:, :m, :m] += np.eye(m)
+        weighted = share * (accessory.hessian.reshape(n, q, nz + nu, nz + nu) @ whole)
+        curved = np.swapaxes(together, 1, 2) @ weighted.reshape(together.shape)
+        for k, i in zip(*np.nonzero(accessory.moved), strict=True):
+            area = np.zeros(nz + q * nu)
+            area[nz + i :: nu] = h[k] * along.weight / metric[k] * accessory.range[i]
+            curved[k] += accessory.switching[k, i] * np.outer(area, area)
+        slope = np.zeros((n, q, nz + nu))
+        slope[:, :, nz:] = share[..., 0] * accessory.left.reshape(n, q, nu)
+        stage[:, own[:, None], own] = curved
+        stage[:, nz, own] = stage[:, own, nz] = (slope.reshape(n, 1, -1) @ together)[:, 0]
+        ends = end_conditions(accessory)
+        bends = np.abs(np.linalg.eigvalsh(stage[:, m:, m:])).max(initial=0.0) if nu else 0.0
+        scale = float(max(bends, np.abs(ends[0]).max(initial=0.0) * FLAT)) or 1.0
+        return cls(whole, step, stage, metric, *ends, scale)
+
+
+class _Stage(NamedTuple):
+    """What its own constraints leave free of a stage: f variations of its controls, beside (z, 1).
+
+    Attributes:
+        lift: (z, 1, controls) from (z, 1) and from what is free. Shape (nz + 1 + q nu, nz + 1 + f).
+        move, bend: Step and cost in these. rows: Of (z, 1), what is left for the stages before. Shape (r, nz + 1).
+    """
+
+    lift: np.ndarray
+    move: np.ndarray
+    bend: np.ndarray
+    rows: np.ndarray
+
+
+def _freed(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: float) -> list[_Stage]:
+    """What its own constraints leave free of each stage: those with the same constraints all at once."""
+    n, q = accessory.along.shape
+    nz, nu = accessory.nz, accessory.nu
+    normals = accessory.normals.reshape(n, q, -1, nz + nu)
+    held = (accessory.strong | accessory.weak if weak else accessory.strong).reshape(n, -1)
+    parts = [held, accessory.node_strong[:-1], accessory.node_strong[1:], accessory.moved]
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    found: dict[int, _Stage] = {}
+    for pattern, members in groups(np.hstack(parts)):
+        if not pattern.any():
+            lift, above = np.eye(nz + 1 + q * nu), np.zeros((0, nz + 1))
+            found |= {k: _Stage(lift, sweep.step[k], sweep.stage[k], above) for k in members.tolist()}
+            continue
+        inside, first, last, moved = np.split(pattern, ends)
+        whole = np.insert(sweep.whole[members], nz, 0.0, axis=3)
+        own = [normals[members, j][:, at] @ whole[:, j] for j, at in enumerate(inside.reshape(q, -1))]
+        own.append(accessory.node_normals[members][:, first] @ np.eye(nz, whole.shape[3]))
+        own.append(accessory.node_normals[members + 1][:, last] @ sweep.step[members, :nz])
+        for i in np.flatnonzero(moved):  # a switch moves: one variation, of the mean
+            own.append(whole[:, 1:, nz + i] - whole[:, :1, nz + i])
+        for part, lifts, above in _eliminated(np.concatenate(own, axis=1), nz + 1, tied):
+            k = members[part]
+            bend = np.swapaxes(lifts, 1, 2) @ sweep.stage[k] @ lifts
+            found |= zip(k.tolist(), map(_Stage, lifts, sweep.step[k] @ lifts, bend, above), strict=True)
+    return [found[k] for k in range(n)]
+
+
+def _eliminated(rows: np.ndarray, nz: int, tied: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """What rows (K, r, nz + m) of nz states and m controls leave free at K stages.
+
+    Returns:
+        Of the stages that are alike, L of them: which they are, (L,); states and controls from the states and from what
+        is free of the controls, (L, nz + m, nz + f); and the rows (L, r', nz) of the states that no control sees. What
+        controls see by less than counts is dropped.
+    """
+    both = rows.shape[2]
+    lengths = np.linalg.norm(rows, axis=2, keepdims=True)
+    keep = lengths > tied * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
+    rows = np.where(keep, rows / np.where(keep, lengths, 1.0), 0.0)
+    left, sizes, right = np.linalg.svd(rows[:, :, nz:])
+    ranks, seen = (sizes > tied).sum(axis=1), (sizes > RANK).sum(axis=1)
+    alike: dict[tuple[int, int], list[int]] = {}
+    for k, kind in enumerate(zip(ranks.tolist(), seen.tolist(), strict=True)):
+        alike.setdefault(kind, []).append(k)
+    found = []
+    for (rank, visible), members in alike.items():
+        at = np.array(members)
+        own, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
+        lift = np.zeros((len(at), both, both - rank))
+        lift[:, :nz, :nz] = np.eye(nz)
+        lift[:, nz:, :nz] = -np.swapaxes(right[at, :rank], 1, 2) @ (own[:, :rank] @ of_states / sizes[at, :rank, None])
+        lift[:, nz:, nz:] = np.swapaxes(right[at, rank:], 1, 2)
+        found.append((at, lift, own[:, max(rank, visible) :] @ of_states))
+    return found
+
+
+class _Gain(NamedTuple):
+    """How a stage's controls follow (z, 1): from these and what is free of them, and minus how that does."""
+
+    lift: np.ndarray
+    answer: np.ndarray
+
+    def of(self, z: np.ndarray) -> np.ndarray:
+        """The controls for a variation of the state."""
+        both = np.append(z, 0.0)
+        return np.asarray(self.lift @ np.concatenate([both, -self.answer @ both]))
 
 
 def rows_of_length_one(rows: np.ndarray, rank: float) -> np.ndarray:
@@ -299,24 +372,26 @@ def _variation(
     sweep: _Linearised,
     first: int,
     controls: np.ndarray | None,
-    gains: list[np.ndarray],
+    gains: list[_Gain],
     start: np.ndarray | None = None,
 ) -> _Variation:
     """A variation that begins at an interval with these controls, or at the start, then follows the best feedback."""
     along, nz, nu = accessory.along, accessory.nz, accessory.nu
     n, q = along.shape
+    own = np.delete(np.arange(nz + 1 + q * nu), nz)
+    step, stage = sweep.step[:, :nz, own], sweep.stage[:, own][:, :, own]
     z = np.zeros(nz) if start is None else start
     states, values = np.zeros((n + 1, nz)), np.zeros((n, q * nu))
     cost, slips = float(z @ sweep.start_cost @ z), [0.0]
     for k in range(first, n):
         states[k] = z
-        values[k] = controls if controls is not None and k == first else gains[n - 1 - k] @ z
+        values[k] = controls if controls is not None and k == first else gains[n - 1 - k].of(z)
         both = np.concatenate([z, values[k]])
-        cost += float(both @ sweep.stage[k] @ both)
+        cost += float(both @ stage[k] @ both)
         for j in range(k * q, (k + 1) * q):
             held = accessory.normals[j][accessory.strong[j]] @ sweep.whole[k, j - k * q] @ both
             slips.append(np.abs(held).max(initial=0.0))
-        z = sweep.step[k] @ both
+        z = step[k] @ both
     states[n] = z
     cost += float(z @ sweep.end_cost @ z)
     slips.append(np.abs(sweep.end_rows @ z).max(initial=0.0))

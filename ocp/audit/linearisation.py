@@ -14,11 +14,10 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.sizes import FLOOR, Sizes
-from ocp.curves import lagrange, quadrature_weights
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.formulation import Bounds, Formulation, Sampler
 from ocp.solution import Solution, stack
 
-__all__ = ["NEAR", "Limits", "Linearisation", "gauss"]
+__all__ = ["NEAR", "Limits", "Linearisation", "gauss", "integrals"]
 
 POINTS = (3, 5)
 """Least and largest number of Gauss points of an interval."""
@@ -118,13 +117,13 @@ class Linearisation:
 
     def _differentiate(self) -> None:
         form, m = self.form, len(self.s)
-        self.fraction = form.sym("s")
         self.y = ca.vertcat(form.x, form.T, form.u)
-        self.scaled = ca.substitute(
-            [form.T * form.running, form.T * form.f, form.path.expression], [form.t], [self.fraction * form.T]
-        )
-        outputs = [self.scaled[2], *(ca.jacobian(part, self.y) for part in self.scaled)]
-        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.here)
+        self.fraction, *self.scaled = form.kept("over the fraction of the horizon", lambda: over_fraction(form))
+
+        def outputs() -> list[Any]:
+            return [self.scaled[2], *(ca.jacobian(part, self.y) for part in self.scaled)]
+
+        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.here, kept="first derivatives")
         ny = form.nx + 1 + form.nu
         self.rate_y = rate_y.reshape(m, ny, form.nx).transpose(0, 2, 1)
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
@@ -162,12 +161,7 @@ class Linearisation:
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
-        begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
-        end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
-        rows, y = ca.vertcat(end, begin), ca.vertcat(form.x, form.x0, form.T)
-        symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
-        outputs = [rows, ca.jacobian(rows, y), ca.gradient(final, y), ca.hessian(final, y)[0]]
-        function = ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
+        function = form.kept("ends", lambda: ends_of(form))
         found = [np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, self.p)]
         self.end_row, self.end_y, self.final_y, self.final_yy = found[0][:, 0], found[1], found[2][:, 0], found[3]
 
@@ -227,10 +221,14 @@ class Linearisation:
         self.stand_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
 
         at = self.mesh
-        rows = self.scaled[2][self.still.tolist()] if self.still.size else self.scaled[2][:0, :]
-        outputs = [rows, ca.jacobian(rows, ca.vertcat(form.x, form.T))]
+
+        def still() -> list[Any]:
+            rows = self.scaled[2][self.still.tolist()] if self.still.size else self.scaled[2][:0, :]
+            return [rows, ca.jacobian(rows, ca.vertcat(form.x, form.T))]
+
         x, u, horizon = self.solution.state_interpolant(at), np.zeros((n + 1, nu)), self.solution.horizon
-        row, row_y = form.sampled(outputs, x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None]))
+        here = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
+        row, row_y = form.sampled(still, *here, kept="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
         ends = np.maximum(low[before], low[after])[:, stand], np.minimum(high[before], high[after])[:, stand]
         self.node_stand = Limits(np.hstack([x, row]), *ends, equal[stand], size[stand])
@@ -245,29 +243,61 @@ class Linearisation:
         of its derivatives (Hartl, Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of
         the last derivative.
         """
-        form, nu = self.form, self.form.nu
-        equal = np.flatnonzero(form.path.equality[self.still])
-        rows = ca.vertcat(*[form.path.expression[int(i)] for i in self.still[equal]])
-        m, count = len(self.s), len(equal)
-        arcs = np.zeros((m, count, nu))
-        left = np.arange(count)
-        for _ in range(MOST_DERIVATIVES):
-            if not left.size or not nu:
-                break
-            rows = ca.mtimes(ca.jacobian(rows, form.x), form.f) + ca.jacobian(rows, form.t)
-            in_control = ca.jacobian(rows, form.u)
-            found = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
-            if found.any():
-                which = np.flatnonzero(found)
-                (slopes,) = form.sampled([in_control[which.tolist(), :]], *self.here[:5])
-                arcs[:, left[which]] = slopes.reshape(m, nu, len(which)).transpose(0, 2, 1)
-                rows, left = rows[np.flatnonzero(~found).tolist()], left[~found]
+        form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
+        arcs = np.zeros((len(self.s), len(equal), form.nu))
+        for which, slopes in form.kept("arcs", lambda: arcs_of(form, self.still[equal])):
+            found = slopes(*self.here[:2], self.t[:, None], *self.here[3:5])[0]
+            arcs[:, which] = found.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
         self.hold_u = np.concatenate([self.hold_u, arcs], axis=1)
-        self.hold.extend(count)
+        self.hold.extend(len(equal))
+
+
+def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
+    """Which of some path rows contain the controls first in one same derivative in time, and its slopes in these."""
+    at, left, found = form.path.expression[rows.tolist()], np.arange(len(rows)), []
+    for _ in range(MOST_DERIVATIVES):
+        if not left.size or not form.nu:
+            break
+        at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t)
+        in_control = ca.jacobian(at, form.u)
+        seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
+        if seen.any():
+            found.append((left[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]])))
+            at, left = at[np.flatnonzero(~seen).tolist()], left[~seen]
+    return found
+
+
+def over_fraction(form: Formulation) -> list[Any]:
+    """The fraction of the horizon, a symbol, and T L, T f and the path rows as expressions of it."""
+    fraction = form.sym("s")
+    parts = [form.T * form.running, form.T * form.f, form.path.expression]
+    return [fraction, *ca.substitute(parts, [form.t], [fraction * form.T])]
+
+
+def ends_of(form: Formulation) -> Any:
+    """A Function (x, x0, u, u0, T, p) of the ends: rows, their derivatives, both of the terminal cost."""
+    begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
+    end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
+    rows, y = ca.vertcat(end, begin), ca.vertcat(form.x, form.x0, form.T)
+    curved, slope = ca.hessian(final, y)
+    outputs = [rows, ca.jacobian(rows, y), slope, curved]
+    symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
+    return ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
 
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
-    at, weight = np.polynomial.legendre.leggauss(len(places))
-    matrix = [c / 2 * weight @ lagrange(places, c * (at + 1) / 2) for c in places]
-    return np.array(matrix), quadrature_weights(places)
+    found = integrals(places, np.append(places, 1.0))
+    return found[:-1], found[-1]
+
+
+def integrals(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
+    """What integrates values at ``places`` (q,) from 0 to each of ``ends`` (m,). Shape (m, q).
+
+    By the polynomial of a degree that fits them best; by default of the one that takes them.
+    """
+    degree = len(places) - 1 if degree is None else degree
+    legendre = np.polynomial.legendre.legvander
+    values = legendre(2 * ends - 1, degree + 1)
+    rising = (values[:, 2:] - values[:, :-2]) / (2 * np.arange(1, degree + 1) + 1)  # integrals of P_k
+    return np.asarray(np.column_stack([2 * ends, rising]) @ np.linalg.pinv(legendre(2 * places - 1, degree)) / 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,7 +14,7 @@ from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.duality import best_multipliers
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope, turning
-from ocp.audit.sizes import Sizes, sizes
+from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 
@@ -66,18 +67,18 @@ def optimality(
     solution: Solution,
     p: np.ndarray,
     bounds: Bounds,
-    size: Sizes | None = None,
+    along: Linearisation | None = None,
     allowed: float = DEGENERATE,
 ) -> Optimality:
     """Look for the multipliers of a plan, for what it loses and for how the cost curves.
 
     Args:
         form, p, bounds: The problem, its parameters and its bounds at these.
-        solution: The plan. size: Sizes along it, where they are known already.
+        solution: The plan. along: Its first derivatives, where they are known already.
         allowed: Share of the cost from which on it is worth looking for multipliers that fit the plan better than the
             costates reported.
     """
-    along = Linearisation(form, solution, p, bounds, size or sizes(form, solution, p, bounds))
+    along = along or Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
     if not along.finite:
         return undefined(along, hamiltonian(form, solution, p))
     cost = abs(solution.cost) or along.slope_size or 1.0
@@ -149,8 +150,11 @@ def _curved(along: Linearisation) -> np.ndarray | None:
     if form.path.equality[along.mixed].all() and not single:
         return None
     lam = form.sym("lam", form.nx)
-    total = along.scaled[0] + ca.dot(lam, along.scaled[1])
-    (curved,) = form.sampled([ca.hessian(total, form.u)[0]], *along.here, (lam, along.costate))
+
+    def outputs() -> list[Any]:
+        return [ca.hessian(along.scaled[0] + ca.dot(lam, along.scaled[1]), form.u)[0]]
+
+    (curved,) = form.sampled(outputs, *along.here, (lam, along.costate), kept="curvature in the controls")
     return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 

@@ -12,21 +12,21 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import FineGrid, Sizes
+from ocp.audit.correction import ROUNDING, TOLERANCE, Corrected, corrected
+from ocp.audit.linearisation import Linearisation
+from ocp.audit.sizes import FineGrid
 from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
-from ocp.problem.formulation import Formulation
-from ocp.solution import Solution
+from ocp.problem.formulation import Formulation, in_blocks
 
-__all__ = ["Reintegration", "reintegrate"]
+__all__ = ["Reintegration", "integrated", "reintegrate"]
 
-TOLERANCE = 1e-11  # of the error of one step, relative to the size of each state
-ROUNDING = 1e-15  # of a state: its last digit
 ORDER = 5  # of the error of a step in its width
 MOST_PIECES = 4  # that a step is split into at once: an unstable step tells no width
 MOST_ROUNDS = 40  # of splitting
 MOST_STEPS = 300_000  # at once: what is stiffer than that, or chatters, breaks down within seconds
 BLOCK = 512  # steps in one call
+BLOCKS = 8  # calls between two looks at the time
 INLINE = 1000  # instructions of the dynamics up to which a step is one flat SX function
 GROWN = 10.0  # times what every interval adds: a plan that is so far off has been carried off by its dynamics
 
@@ -77,25 +77,13 @@ class Reintegration:
         return bool(self.added[k] + here <= limit / GROWN)
 
 
-def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, grid: FineGrid, sizes: Sizes) -> Reintegration:
-    """Integrate the controls of ``solution``, over every interval and over the whole horizon."""
-    n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
-    flow = Flow(form, solution, p, sizes)
-    by_interval = grid.states.reshape(n, cells + 1, form.nx)
-    starts = by_interval[:, 0]
-
-    def on_grid(start: np.ndarray, after: np.ndarray) -> np.ndarray:
-        return np.concatenate([start[:, None], after], axis=1).reshape(-1, form.nx)
-
-    after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
-    found = after.reshape(n, cells, -1)
-    local = on_grid(starts, found[:, :, :-1])
-    local_cost = float(found[:, -1, -1].sum())
-    found = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1], steps)[0].reshape(n, cells, -1)
-    states = on_grid(np.vstack([starts[:1], found[:-1, -1, :-1]]), found[:, :, :-1])
-    cost = float(found[-1, -1, -1])
+def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
+    """What the controls of a plan do over every interval and over the whole horizon."""
+    sizes, starts = along.sizes, grid.states.reshape(-1, grid.samples, along.form.nx)[:, 0]
+    local, states, local_cost, cost = corrected(along, grid) or integrated(along, grid)
+    left = np.abs(local[:-1, -1] - starts[1:]) / sizes.state
+    local, states = (part.reshape(grid.states.shape) for part in (local, states))
     lost = ~np.isfinite(states).all(axis=1)
-    left = np.abs(local.reshape(by_interval.shape)[:-1, -1] - starts[1:]) / sizes.state
     return Reintegration(
         grid.t,
         grid.interval,
@@ -110,6 +98,20 @@ def reintegrate(form: Formulation, solution: Solution, p: np.ndarray, grid: Fine
         np.concatenate([[0.0], np.cumsum(_worst(left))]),
         float(grid.t[np.argmax(lost)]) if lost.any() else None,
     )
+
+
+def integrated(along: Linearisation, grid: FineGrid) -> Corrected:
+    """The same as :func:`ocp.audit.correction.corrected`, step by step, whatever the plan says between its starts."""
+    n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
+    flow = Flow(along)
+    starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
+    after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
+    each = after.reshape(n, cells, -1)
+    whole = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1], steps)[0].reshape(n, cells, -1)
+    chained = np.vstack([starts[:1], whole[:-1, -1, :-1]])
+    both = (starts, each), (chained, whole)
+    local, states = (np.concatenate([start[:, None], found[:, :, :-1]], axis=1) for start, found in both)
+    return Corrected(local, states, float(each[:, -1, -1].sum()), float(whole[-1, -1, -1]))
 
 
 def _relative(difference: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -145,12 +147,14 @@ class Steps(NamedTuple):
 class Flow:
     """The dynamics and the running cost under the controls of a plan, to be integrated from any states."""
 
-    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, sizes: Sizes) -> None:
-        curve = solution.control_interpolant
+    def __init__(self, along: Linearisation) -> None:
+        form, solution, sizes = along.form, along.solution, along.sizes
+        curve, self._given = solution.control_interpolant, np.append(along.p, solution.horizon)
         differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
         self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
         self._tolerance = TOLERANCE * np.append(sizes.state, sizes.cost)
-        self._step = step_function(form, curve.nodes, solution.horizon, p).mapaccum("steps", BLOCK)
+        name = "steps", curve.nodes.tobytes()
+        self._step = form.kept(name, lambda: step_function(form, curve.nodes).mapaccum("steps", BLOCK))
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
@@ -201,36 +205,30 @@ class Flow:
         count, size = len(first), starts.shape[1]
         whole = -(-count // BLOCK) * BLOCK
         data = np.zeros((whole, self._step.size1_in(1)))  # what is left of the last block are steps of no width
-        data[:count] = np.column_stack([first, starts, place, width, self._columns[interval]])
+        data[:, -len(self._given) :] = self._given
+        data[:count, : -len(self._given)] = np.column_stack([first, starts, place, width, self._columns[interval]])
         now, after, errors = starts[0].copy(), np.empty((whole, size)), np.empty((whole, size))
-        memory, evaluate = self._step.buffer()
-        memory.set_arg(0, now.data)
-        for at in range(0, whole, BLOCK):
+        for at in range(0, whole, BLOCKS * BLOCK):
             check_time()
-            part = slice(at, at + BLOCK)
-            memory.set_arg(1, data[part].data)
-            memory.set_res(0, after[part].data)
-            memory.set_res(1, errors[part].data)
-            evaluate()
-            if memory.ret():
-                raise RuntimeError(f"the dynamics failed at steps {at} to {at + BLOCK - 1}")
-            now[:] = after[part][-1]
+            part = slice(at, at + BLOCKS * BLOCK)
+            in_blocks(self._step, BLOCK, data[part], [after[part], errors[part]], now)
         return after[:count], np.abs(errors[:count])
 
 
-def step_function(form: Formulation, nodes: np.ndarray, horizon: float, p: np.ndarray) -> Any:
+def step_function(form: Formulation, nodes: np.ndarray) -> Any:
     """One step (x, data) -> (x behind it, its error); x with the cost below it.
 
     Data are: whether to start anew, from where, place and width of the step in its interval, the divided differences
-    of the control at ``nodes`` of the interval, and start and width of the interval in fractions of the horizon.
+    of the control at ``nodes`` of the interval, start and width of the interval in fractions of the horizon, the
+    parameters and the horizon.
     """
     function = form.function("f", [form.f, form.running], ["f", "running"])
     flat = function.is_a("SXFunction") and function.n_instructions() <= INLINE
     sym, size, nw = (ca.SX if flat else ca.MX).sym, form.nx + 1, form.nu * len(nodes)
-    x, data = sym("x", size), sym("data", 1 + size + 2 + nw + 2)
+    x, data = sym("x", size), sym("data", 1 + size + 2 + nw + 2 + form.np + 1)
     new, start, place, width = data[0], data[1 : 1 + size], data[1 + size], data[2 + size]
     differences = ca.reshape(data[3 + size : 3 + size + nw], form.nu, len(nodes))
-    s, h = data[3 + size + nw], data[4 + size + nw]
+    s, h, p, horizon = data[3 + size + nw], data[4 + size + nw], data[5 + size + nw : -1], data[-1]
 
     def slope(within: float, state: Any) -> Any:
         at = place + within * width

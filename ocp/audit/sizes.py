@@ -13,16 +13,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ocp.curves import lagrange
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 
-__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "integral", "sizes", "sizes_along"]
+__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "integral", "plan_at", "sizes", "sizes_along"]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which a plan is looked at
 FLOOR = 1e-6  # of the largest value: what is smaller cannot be told from the solver's own tolerance
 ROUNDING = 1e-9  # of the largest of its kind: what moves less stands still
 HELD = 1e-2  # of what it is made of: a task that asks for less of a way is judged by this share of it
 STILL = 1e-12  # SI units: what moves less, and is not told to move, stands still
+SAME = 1e-14  # of the horizon, between breaks that are one
+COSTS = ("running", "terminal")
 PLACES = 32  # of the horizon, at which a constraint is looked at for what it is made of
 
 
@@ -47,20 +50,40 @@ class FineGrid:
 def fine_grid(solution: Solution) -> FineGrid:
     """The plan at ten times its own points."""
     curve = solution.state_interpolant
-    mesh = solution.control_interpolant.breaks
-    n = len(mesh) - 1
+    n = len(solution.control_interpolant.breaks) - 1
     points, pieces = max(len(curve.nodes) - 1, 1), max((len(curve.breaks) - 1) // n, 1)
     steps = GRID_FACTOR * points * pieces
     places = np.linspace(0.0, 1.0, steps + 1)
-    interval, place = np.repeat(np.arange(n), steps + 1), np.tile(places, n)
-    width = np.diff(mesh)[interval]
-    fractions = mesh[interval] + width * place
-    inside = fractions + np.where(place > 0, -0.5, 0.5) / steps * width  # a time on a break belongs to this side
-    piece = np.clip(np.searchsorted(curve.breaks, inside, side="right") - 1, 0, len(curve.breaks) - 2)
+    states, controls, t = plan_at(solution, places)
+    return FineGrid(t, np.repeat(np.arange(n), steps + 1), np.tile(places, n), states, controls, steps + 1)
+
+
+@np.errstate(invalid="ignore")  # what is not a number is found by name
+def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States, controls and times at the same places (m,), 0..1, of all intervals, each from its side of a break.
+
+    Shapes (N m, nx), (N m, nu), (N m,).
+    """
+    curve, control = solution.state_interpolant, solution.control_interpolant
+    mesh, width, m = control.breaks, np.diff(control.breaks), len(places)
+    n = len(width)
+    fractions = mesh[:-1, None] + width[:, None] * places
+    controls = (lagrange(control.nodes, places) @ control.values).reshape(n * m, control.values.shape[2])
+    pieces, d = max((len(curve.breaks) - 1) // n, 1), len(curve.nodes)
+    inside = places + np.where(places > 0, -0.1, 0.1) / (GRID_FACTOR * pieces * d)
+    even = (mesh[:-1, None] + width[:, None] * (np.arange(pieces) / pieces)).ravel()
+    same = len(even) == len(curve.breaks) - 1 and np.abs(even - curve.breaks[:-1]).max() < SAME
+    if same and np.isfinite(curve.values).all():
+        piece = np.clip((inside * pieces).astype(int), 0, pieces - 1)
+        basis = np.zeros((m, pieces, d))
+        basis[np.arange(m), piece] = lagrange(curve.nodes, np.clip(places * pieces - piece, 0.0, 1.0))
+        states = basis.reshape(m, -1) @ curve.values.reshape(n, pieces * d, -1)
+        return states.reshape(n * m, curve.values.shape[2]), controls, fractions.ravel() * solution.horizon
+    inner = mesh[:-1, None] + width[:, None] * inside
+    piece = np.clip(np.searchsorted(curve.breaks, inner.ravel(), side="right") - 1, 0, len(curve.breaks) - 2)
     start, end = curve.breaks[piece], curve.breaks[piece + 1]
-    states = curve.within(piece, np.clip((fractions - start) / (end - start), 0.0, 1.0))
-    controls = solution.control_interpolant.within(interval, place)
-    return FineGrid(fractions * solution.horizon, interval, place, states, controls, steps + 1)
+    states = curve.within(piece, np.clip((fractions.ravel() - start) / (end - start), 0.0, 1.0))
+    return states, controls, fractions.ravel() * solution.horizon
 
 
 @dataclass(frozen=True)
@@ -103,15 +126,17 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
     declared = _of(bounds, places["control"])
     control, acts = _sizes_of(grid.controls, declared, [])
     entries = np.concatenate([state, control]), np.concatenate([moves, acts])
-    path, start, end = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("path", "start", "end"))
-    running = form.sampled([form.running], grid.states, grid.controls, grid.t, horizon, p)[0][:, 0]
-    parts = np.where(np.isfinite(running), np.abs(running), 0.0)
+    here = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
+    running, rows, way = form.sampled([form.running, form.path.expression, form.watch_way], *here, kept="along a plan")
+    path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
+    start, end, watch = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("start", "end", "watch"))
+    parts = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
     spent = float(np.sum(np.diff(grid.t) * (parts[:-1] + parts[1:]) / 2))
     made_of = [
         _made_of(form, what, grid, at, horizon, p, entries)[0][0]
-        for what, at in ((form.running, spaced(grid)), (form.terminal, spaced(grid)[-1:]))
+        for what, at in zip(COSTS, (spaced(grid), spaced(grid)[-1:]), strict=True)
     ]
-    watch = _watched(form, grid, horizon, p, bounds, entries)
+    watch = _watched(form, watch, horizon, integral(way, grid.t))
     return Sizes(state, control, path, start, end, watch, max(spent, FLOOR * (horizon * made_of[0] + made_of[1])))
 
 
@@ -167,16 +192,17 @@ def _rows_of(
     p: np.ndarray,
     bounds: Bounds,
     entries: tuple[np.ndarray, np.ndarray],
+    values: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Sizes of the rows of one kind. Shape (rows,)."""
+    """Sizes of the rows of one kind, whose ``values`` (M, rows) along the grid may be known. Shape (rows,)."""
     rows: Rows = getattr(form, kind)
     if len(rows) == 0:
         return np.zeros(0)
     some = spaced(grid)
     picked = some[:1] if kind == "start" else some[-1:] if kind == "end" else some
-    made_of, moved, own, largest = _made_of(form, rows.expression, grid, picked, horizon, p, entries)
-    if kind == "path":
-        own, largest = _spread(form.sampled([rows.expression], grid.states, grid.controls, grid.t, horizon, p)[0])
+    made_of, moved, own, largest = _made_of(form, kind, grid, picked, horizon, p, entries)
+    if values is not None:
+        own, largest = _spread(values)
     made_of = np.where(moved | (largest <= STILL), made_of, 0.0)  # what is there though nothing moves has a size
     size = np.maximum(np.maximum(own, made_of), FLOOR * largest)
     least = np.minimum(1.0, _least(_of(bounds, rows.bounds)))
@@ -187,26 +213,16 @@ def _rows_of(
     return np.asarray(size)
 
 
-def _watched(
-    form: Formulation,
-    grid: FineGrid,
-    horizon: float,
-    p: np.ndarray,
-    bounds: Bounds,
-    entries: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:
-    """Sizes of the watched rows: the longest way of those of one name, or what they are made of. Shape (rows,)."""
-    rows = form.watch
-    if len(rows) == 0:
-        return np.zeros(0)
-    made_of = _rows_of(form, "watch", grid, horizon, p, bounds, entries)
+def _watched(form: Formulation, made_of: np.ndarray, horizon: float, ways: np.ndarray) -> np.ndarray:
+    """Sizes of the watched rows: the longest way of those of one name, or what they are made of. Shape (rows,).
+
+    Args:
+        made_of: Shape (rows,). ways: Along the grid. Shape (M, rows).
+    """
     made_of = np.where(form.watch_integral, horizon, 1.0) * made_of
-    starts = (form.x0, grid.states[0]), (form.u0, grid.controls[0])
-    rate = form.sampled([form.watch_way], grid.states, grid.controls, grid.t, horizon, p, *starts)[0]
-    way = _spread(integral(rate, grid.t))[0]
-    size = made_of.copy()
-    for name in rows.names:
-        mine = rows.of(name)
+    way, size = _spread(ways)[0], made_of.copy()
+    for name in form.watch.names:
+        mine = form.watch.of(name)
         if form.problem.declared.watch[name].way is not None:
             size[mine] = max(way[mine].max(), HELD * made_of[mine].max())
     return np.asarray(size)
@@ -220,20 +236,20 @@ def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 def _made_of(
     form: Formulation,
-    expression: Any,
+    kind: str,
     grid: FineGrid,
     picked: np.ndarray,
     horizon: float,
     p: np.ndarray,
     entries: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of each row of an expression at some samples: the sum of its changes where one entry alone moves by its size.
+    """Of each row of one kind at some samples: the sum of its changes where one entry alone moves by its size.
 
     And whether anything that moves is in it, its spread, and its largest absolute value. Shape (rows,) each.
     """
     x, u = grid.states[picked], grid.controls[picked]
     begin = grid.states[0], grid.controls[0]
-    here, change = changes(form, expression, (x, u, grid.t[picked]), begin, horizon, p, entries[0])
+    here, change = changes(form, kind, (x, u, grid.t[picked]), begin, horizon, p, entries[0])
     change = change.max(axis=1)
     moves = np.resize(entries[1], len(change))
     told, every = change[moves].sum(axis=0), change.sum(axis=0)
@@ -243,16 +259,17 @@ def _made_of(
 
 def changes(
     form: Formulation,
-    expression: Any,
+    kind: str,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
     begin: tuple[np.ndarray, np.ndarray],
     horizon: float,
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of an expression at K samples, and by how much each changes where one entry alone moves.
+    """The rows of one kind at K samples, and by how much each changes where one entry alone moves.
 
     Args:
+        kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.
         samples: States (K, nx), controls (K, nu) and times (K,), s. begin: States and controls at the start.
         moves: Of each state and control, there or at the start, one way and the other. Shape (nx + nu,).
 
@@ -261,13 +278,16 @@ def changes(
     """
     x, u, t = samples
     both, count = form.nx + form.nu, len(t)
-    used = 2 * both if ca.depends_on(expression, ca.vertcat(form.x0, form.u0)) else both
+    expression = getattr(form, kind) if kind in COSTS else getattr(form, kind).expression
+    tied = form.kept((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
+    used = 2 * both if tied else both
     steps = np.vstack([np.zeros(2 * both), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
     at = np.tile(np.arange(count), len(steps))
     first = np.broadcast_to(np.concatenate(begin), (len(at), both))
     columns = np.hstack([x[at], u[at], first]) + np.repeat(steps, count, axis=0)
     x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
-    found = form.sampled([expression], x, u, t[at], horizon, p, (form.x0, x0), (form.u0, u0))[0]
+    starts = (form.x0, x0), (form.u0, u0)
+    found = form.sampled([expression], x, u, t[at], horizon, p, *starts, kept=(kind, "from the start"))[0]
     g = found.reshape(len(steps), count, -1)
     change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
     return g[0], change.reshape(2, used, count, -1).max(axis=0)

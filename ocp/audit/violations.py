@@ -69,13 +69,20 @@ def violations(
                 found.append(judged(f"{what} {name}", name, again.t[at], over, size[place][given]))
     begin = states[0], again.controls[0]
     entries = SHIFT * np.concatenate([sizes.state, sizes.control])
-    for kind, at in (("path", slice(None)), ("start", first), ("end", last), ("watch", slice(None))):
+    whole = slice(None)
+    here = states, again.controls, again.t, horizon, p, (form.x0, begin[0]), (form.u0, begin[1])
+    outputs = [form.path.expression, form.watch.expression]
+    along = dict(zip(("path", "watch"), form.sampled(outputs, *here, kept="rows along a plan"), strict=True))
+    for kind, at in (("path", whole), ("start", first), ("end", last), ("watch", whole)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
             continue
         x, u, t = states[at], again.controls[at], again.t[at]
-        starts = (form.x0, begin[0]), (form.u0, begin[1])
-        g = form.sampled([rows.expression], x, u, t, horizon, p, *starts)[0]
+        if kind in along:
+            g = along[kind]
+        else:
+            starts = (form.x0, begin[0]), (form.u0, begin[1])
+            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, kept=(kind, "from the start"))[0]
         if kind == "watch":
             g = np.where(form.watch_integral, integral(g, t), g)
         over = beyond(g, lower[rows.bounds], upper[rows.bounds])
@@ -84,11 +91,9 @@ def violations(
         if kind != "watch" and np.any(
             over[worst] > FLOOR * size[worst]
         ):  # by how much it changes where it is missed most
-            change = changes(
-                form, rows.expression, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries
-            )[1]
-            here = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
-            size[worst] = np.clip(here, FLOOR * size[worst], size[worst])
+            change = changes(form, kind, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries)[1]
+            by = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
+            size[worst] = np.clip(by, FLOOR * size[worst], size[worst])
         for name in rows.names:
             mine = rows.of(name)
             found.append(judged(name, name, t, over[:, mine], size[:, mine]))

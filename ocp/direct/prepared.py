@@ -169,7 +169,7 @@ class Prepared:
     ) -> None:
         began = time.monotonic()
         self.problem, self.method, self.solver_name = problem, method, solver
-        self.formulation = Formulation(problem)
+        self.formulation = Formulation.of(problem)
         checked_choice("solver", solver, SOLVERS)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
         self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)

@@ -111,7 +111,7 @@ class PreparedIndirect:
     def __init__(self, problem: Problem, method: Indirect, seeding: dict[str, Any]) -> None:
         began = time.monotonic()
         self.problem, self.method, self._seeding = problem, method, seeding
-        self.formulation = Formulation(problem)
+        self.formulation = Formulation.of(problem)
         self.hamiltonian = Hamiltonian.of(self.formulation)
         backward = method.shooting == "backward"
         self.boundary = BoundaryProblem(self.hamiltonian, backward=backward, tolerance=method.tolerance)

@@ -5,7 +5,9 @@ Time runs as the fraction ``s`` of the horizon, ``t = s * T``, so that a free fi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -15,9 +17,9 @@ from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.problem import Constraint, Declarations, Problem, Variable, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
-__all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "at_samples"]
+__all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "Sampler", "at_samples", "in_blocks"]
 
-BLOCK = 512  # samples in one call of a function: a map of them all takes longer to make than to evaluate
+BLOCKS = (512, 32)  # samples in one call of a function: a map of them all takes longer to make than to evaluate
 
 Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
@@ -130,7 +132,8 @@ class Formulation:
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
         self.x0, self.u0 = sym("x0", self.nx), sym("u0", self.nu)
         self.t, self.T = sym("t"), sym("T")
-        self._declared = declared
+        self._declared, self._made_of = declared, entries_of(declared)
+        self._kept: dict[Any, Any] = {}
         self.horizon_is_free = not horizon.fixed
         self.horizon_guess = horizon.guess
 
@@ -155,31 +158,64 @@ class Formulation:
         self.ties_ends = bool(ca.depends_on(both, ca.vertcat(self.x0, self.u0)))
         self.guesses = {v.name: v.guess for v in (*declared.states.values(), *declared.controls.values())}
 
+    @classmethod
+    def of(cls, problem: Problem) -> Formulation:
+        """The formulation that is kept with a problem, a new one where more has been declared since."""
+        kept: Formulation | None = checked_problem(problem).formulated
+        entries = entries_of(problem.declared)
+        if kept is None or len(kept._made_of) != len(entries) or not all(map(operator.is_, kept._made_of, entries)):
+            kept = problem.formulated = cls(problem)
+        return kept
+
+    def kept(self, name: Any, make: Callable[[], Any]) -> Any:
+        """What is made once of the problem, by a name."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        return self._kept[name]
+
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
         """A casadi Function of (x, u, t, T, p)."""
         return ca.Function(name, [self.x, self.u, self.t, self.T, self.p], outputs, ["x", "u", "t", "T", "p"], names)
 
     def sampled(
-        self, outputs: list[Any], x: Any, u: Any, t: Any, horizon: Any, p: Any, *more: tuple[Any, Any]
+        self,
+        outputs: list[Any] | Callable[[], list[Any]],
+        x: Any,
+        u: Any,
+        t: Any,
+        horizon: Any,
+        p: Any,
+        *more: tuple[Any, Any],
+        kept: Any = None,
     ) -> list[np.ndarray]:
         """Expressions of (x, u, t, T, p) and of ``more`` symbols at M samples; each output (M, its number of entries).
 
         An output that is a matrix is read column by column.
 
         Args:
-            outputs: Expressions of the symbols of the formulation and of those in ``more``.
+            outputs: Expressions of the symbols of the formulation and of those in ``more``, or what makes them.
             x, u: States (M, nx), controls (M, nu). t: Times, s. Shape (M,).
             horizon: s. p: Parameters. Shape (np,).
             more: Pairs of another symbol and its values, (M, n), or (n,) where they are the same at all samples.
+            kept: A name under which the function of these outputs is kept, which are the same whenever it is told.
         """
-        symbols = [self.x, self.u, self.t, self.T, self.p, *(symbol for symbol, _ in more)]
-        function = ca.Function("sampled", symbols, [ca.densify(ca.vec(output)) for output in outputs], {"cse": True})
-        return at_samples(function, x, u, np.reshape(t, (-1, 1)), horizon, p, *(values for _, values in more))
+
+        def make() -> Sampler:
+            return self.sampler(outputs() if callable(outputs) else outputs, *(symbol for symbol, _ in more))
+
+        function = make() if kept is None else self.kept(kept, make)
+        return list(function(x, u, np.reshape(t, (-1, 1)), horizon, p, *(values for _, values in more)))
+
+    def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
+        """The function (x, u, t, T, p, *more) -> outputs, to be called at many samples."""
+        symbols = self.problem.symbols
+        return Sampler([self.x, self.u, self.t, self.T, self.p, *more], [symbols(output) for output in outputs])
 
     def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
         """The terminal cost of a final state, and of the state and controls at the start."""
         symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
-        return float(ca.Function("terminal", symbols, [self.terminal])(x, x0, u0, horizon, horizon, p))
+        function = self.kept("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
+        return float(function(x, x0, u0, horizon, horizon, p))
 
     def horizon_at(self, p: Any) -> Any:
         """The fixed horizon at parameters, numbers or symbols."""
@@ -325,32 +361,80 @@ class Formulation:
         return BoundTable(ca.Function("bounds", [self.p], table), places)
 
 
-def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """A casadi function of dense columns at M samples; each output (M, n).
+class Sampler:
+    """A function of columns, called at many samples at once."""
+
+    def __init__(self, symbols: list[Any], outputs: list[Any]) -> None:
+        """Of expressions of symbols; an output that is a matrix is read column by column."""
+        self._inputs, self._outputs = ([part.numel() for part in parts] for parts in (symbols, outputs))
+        packed, found = ca.vertcat(*symbols), ca.vertcat(*[ca.densify(ca.vec(output)) for output in outputs])
+        if isinstance(packed, ca.MX):  # of which only symbols can be inputs
+            inner = ca.Function("inner", symbols, [found], {"cse": True})
+            packed = ca.MX.sym("packed", sum(self._inputs))
+            found = inner(*ca.vertsplit(packed, np.cumsum([0, *self._inputs]).tolist()))
+        self._function = ca.Function("sampled", [packed], [found], {"cse": True})
+        self._maps: dict[int, Any] = {}
+
+    def __call__(self, *columns: Any) -> list[np.ndarray]:
+        """Its outputs at M samples, each (M, n).
+
+        Args:
+            columns: Its arguments: an array (M, n) of what differs from sample to sample, or (n,) or a number of what
+                does not.
+        """
+        values = [np.asarray(column, dtype=float) for column in columns]
+        m = next(len(value) for value in values if value.ndim == 2)
+        whole = -(-m // BLOCKS[-1]) * BLOCKS[-1]
+        given, found = np.empty((whole, sum(self._inputs))), np.empty((whole, sum(self._outputs)))
+        first = 0
+        for size, value in zip(self._inputs, values, strict=True):
+            given[:m, first : first + size] = value
+            first += size
+        given[m:] = given[m - 1 : m]  # what is left of the last block says the last sample again
+        at = 0
+        for size in BLOCKS:
+            end = whole - (whole - at) % size
+            if end > at:
+                block = self._maps.get(size) or self._maps.setdefault(size, self._function.map(size))
+                in_blocks(block, size, given[at:end], [found[at:end]])
+            at = end
+        return np.split(found[:m], np.cumsum(self._outputs[:-1]), axis=1)
+
+
+def in_blocks(
+    function: Any, size: int, given: np.ndarray, outputs: list[np.ndarray], state: np.ndarray | None = None
+) -> None:
+    """Call a casadi function of ``size`` columns side by side block by block.
 
     Args:
-        function: Its inputs and outputs are dense columns. columns: Its arguments: an array (M, n) of what differs
-            from sample to sample, or (n,) or a number of what does not.
+        given, outputs: Its input and outputs, the columns as rows, in whole blocks: (K size, n) each.
+        state: An input (n,) before that: the last column of the first output of the block before.
     """
-    values = [np.asarray(column, dtype=float) for column in columns]
-    m = next(len(value) for value in values if value.ndim == 2)
-    outputs = [np.empty((m, function.numel_out(i))) for i in range(function.n_out())]
-    inputs = [np.empty((m, function.numel_in(i))) for i in range(function.n_in())]
-    for into, value in zip(inputs, values, strict=True):
-        into[:] = value
-    for first in range(0, m, BLOCK):
-        if first + BLOCK > m or first == 0:
-            count = min(BLOCK, m - first)
-            memory, evaluate = (function.map(count) if count > 1 else function).buffer()
-        part = slice(first, first + BLOCK)
-        for i, value in enumerate(inputs):
-            memory.set_arg(i, value[part].data)
+    memory, evaluate = function.buffer()
+    if state is not None:
+        memory.set_arg(0, state.data)
+    for at in range(0, len(given), size):
+        part = slice(at, at + size)
+        memory.set_arg(0 if state is None else 1, given[part].data)
         for i, value in enumerate(outputs):
             memory.set_res(i, value[part].data)
         evaluate()
         if memory.ret():
-            raise RuntimeError(f"{function.name()} failed at samples {first} to {first + count - 1}")
-    return outputs
+            raise RuntimeError(f"{function.name()} failed at samples {at} to {at + size - 1}")
+        if state is not None:
+            state[:] = outputs[0][at + size - 1]
+
+
+def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
+    """A casadi function of dense columns at M samples, see :class:`Sampler`."""
+    symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
+    return Sampler(symbols, list(function.call(symbols)))(*columns)
+
+
+def entries_of(declared: Declarations) -> list[Any]:
+    """All that is declared, one thing an entry."""
+    pools = [getattr(declared, kind.name) for kind in fields(declared)]
+    return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 
 
 def slices(pool: dict[str, Variable]) -> dict[str, slice]:

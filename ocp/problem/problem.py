@@ -170,6 +170,7 @@ class Problem:
         self.symbols = symbols
         self.time = symbols.sym("time")
         self.declared = Declarations()
+        self.formulated: Any = None  # see ocp.problem.formulation.Formulation.of
 
     # ---- copies and files ------------------------------------------------------------------------------------
 
@@ -189,6 +190,7 @@ class Problem:
         """
         kinds = (Variable, Constraint, Horizon, Declarations)
         self.name, self.symbols, self.time, self.declared = restored(state, kinds)
+        self.formulated = None
 
     @classmethod
     def restored(cls, state: dict[str, Any]) -> Problem:

@@ -1,7 +1,7 @@
 """How long an audit takes beside the solve that it checks, and how both grow with the number of intervals.
 
-What a user waits for is the whole solve: the program is built, then solved. The solve alone is what remains where one
-program is solved many times.
+What a user waits for is the whole solve, the program built and solved, and the first audit, which derives what it needs
+of the problem. Where one program is solved many times, the solve alone and an audit that has all of this remain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scripts import drawing
 from scripts.papers.free_floating.results import problem as free_floating
 from scripts.papers.run import progress, text_table
 from scripts.timing.build_and_solve import growth
-from scripts.timing.measure import median
+from scripts.timing.measure import median, timed
 
 INTERVALS = (50, 100, 200, 400, 800)
 GOAL_RATIO = 1.0  # an audit takes at most the time of the solve
@@ -58,18 +58,18 @@ def run(repeats: int = 5) -> dict[str, Any]:
         "rows": rows,
         "growth_over_linear": [{"case": case, "audit": value} for case, value in by_case.items()],
         "worst_ratio": max(row["audit_over_solve"] for row in rows),
-        "worst_ratio_to_whole": max(row["audit_over_whole"] for row in rows),
+        "worst_ratio_to_whole": max(row["first_audit_over_whole"] for row in rows),
         "worst_growth_over_linear": max(by_case.values()),
         "goals": {"worst_ratio": GOAL_RATIO, "worst_growth_over_linear": GOAL_GROWTH},
     }
 
 
 def audit_times(case: str, intervals: int, repeats: int) -> dict[str, Any]:
-    """One row: median times of a solve, built before, and of the audit of its plan."""
+    """One row: median times of a solve, built before, and of the audit of its plan; and of its first audit."""
     declare, method = CASES[case]
     prepared = prepare(declare(), method(intervals))
     plan = prepared.solve()
-    audit = plan.audit()
+    audit, first = timed(plan.audit)
     solve, judge = median(prepared.solve, repeats), median(plan.audit, repeats)
     return {
         "case": case,
@@ -78,8 +78,9 @@ def audit_times(case: str, intervals: int, repeats: int) -> dict[str, Any]:
         "build_s": plan.seconds["build"],
         "solve_s": solve,
         "audit_s": judge,
+        "first_audit_s": first,
         "audit_over_solve": judge / solve,
-        "audit_over_whole": judge / (solve + plan.seconds["build"]),
+        "first_audit_over_whole": first / (solve + plan.seconds["build"]),
         "audit_ms_an_interval": 1e3 * judge / intervals,
         "passed": audit.passed,
     }
@@ -91,7 +92,7 @@ def report(summary: dict[str, Any]) -> str:
     return (
         f"{text_table(summary['rows'], 4)}\n"
         f"audit over solve, worst: {summary['worst_ratio']:.2f}, goal {goals['worst_ratio']:g}; "
-        f"over the solve with its build: {summary['worst_ratio_to_whole']:.2f}\n"
+        f"the first over the solve with its build: {summary['worst_ratio_to_whole']:.2f}\n"
         f"growth of the audit from 100 to {max(INTERVALS)} intervals over linear, worst: "
         f"{summary['worst_growth_over_linear']:.2f}, goal {goals['worst_growth_over_linear']:g}"
     )

@@ -116,8 +116,8 @@ print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success
 CHECKS = """
 long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
 plan = solve(long, Collocation(4000))
-interrupted("audit", lambda: plan.audit())
-interrupted("audit again", lambda: plan.audit(), 0.6)
+interrupted("audit", lambda: plan.audit(), 0.1)
+interrupted("audit again", lambda: plan.audit(), 0.3)
 interrupted("certificate", lambda: certificate(long, [plan, plan]))
 indirect = prepare(van_der_pol(horizon=6.0), Indirect(segments=800))
 seed = solve(van_der_pol(horizon=6.0), Collocation(20))

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.audit.reintegration import Reintegration, reintegrate
-from ocp.audit.sizes import fine_grid, sizes
+from ocp.audit.correction import corrected
+from ocp.audit.linearisation import Linearisation
+from ocp.audit.reintegration import Reintegration, integrated, reintegrate
+from ocp.audit.sizes import FineGrid, fine_grid, sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import drawn, of
 from tests.ocp.problems import Array, van_der_pol
@@ -27,11 +29,16 @@ METHODS = {
 every_method = pytest.mark.parametrize("method", METHODS)
 
 
-def again(problem: Problem, solution: Solution) -> Reintegration:
+def linearised(problem: Problem, solution: Solution) -> tuple[Linearisation, FineGrid]:
     form = Formulation(problem)
     p = form.parameter_vector(solution.parameters)
-    found = sizes(form, solution, p, form.bound_values(p))
-    return reintegrate(form, solution, p, fine_grid(solution), found)
+    bounds = form.bound_values(p)
+    found = sizes(form, solution, p, bounds)
+    return Linearisation(form, solution, p, bounds, found), fine_grid(solution)
+
+
+def again(problem: Problem, solution: Solution) -> Reintegration:
+    return reintegrate(*linearised(problem, solution))
 
 
 def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: Any = 0.0) -> tuple[Problem, Solution]:
@@ -94,6 +101,50 @@ def test_the_running_cost_is_integrated_along(method: str) -> None:
     found = again(van_der_pol(), plan)
     assert found.cost == pytest.approx(plan.cost, rel=1e-3)
     assert found.local_cost == pytest.approx(found.cost, rel=1e-3)
+
+
+@every_method
+def test_corrections_of_a_plan_lead_where_its_integration_does(method: str) -> None:
+    along, grid = linearised(van_der_pol(), solve(van_der_pol(), METHODS[method]))
+    near, exact = corrected(along, grid), integrated(along, grid)
+    assert near is not None
+    for name in ("local", "states"):
+        np.testing.assert_allclose(getattr(near, name), getattr(exact, name), rtol=0, atol=2e-10)
+    assert near.cost == pytest.approx(exact.cost, rel=1e-9)
+    assert near.local_cost == pytest.approx(exact.local_cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-8, 1e-5, 1e-3, 0.1])
+def test_a_wrong_plan_is_corrected_or_left_to_the_integration(share: float) -> None:
+    plan = solve(van_der_pol(), METHODS["radau"])
+    curve = plan.control_interpolant
+    wrong = replace(plan, control_interpolant=replace(curve, values=(1 + share) * curve.values))
+    along, grid = linearised(van_der_pol(), wrong)
+    exact, found = integrated(along, grid), again(van_der_pol(), wrong)
+    np.testing.assert_allclose(found.states, exact.states.reshape(found.states.shape), rtol=0, atol=2e-10)
+    np.testing.assert_allclose(found.local, exact.local.reshape(found.local.shape), rtol=0, atol=2e-10)
+    assert found.cost == pytest.approx(exact.cost, rel=1e-9)
+
+
+def test_jumps_of_the_plan_are_carried_on_by_its_dynamics() -> None:
+    plan = solve(van_der_pol(), METHODS["legendre"])
+    curve = plan.state_interpolant
+    values = curve.values + 1e-4 * np.sin(np.arange(20))[:, None, None]
+    along, grid = linearised(van_der_pol(), replace(plan, state_interpolant=replace(curve, values=values)))
+    near, exact = corrected(along, grid), integrated(along, grid)
+    assert near is not None
+    np.testing.assert_allclose(near.states, exact.states, rtol=0, atol=2e-10)
+    np.testing.assert_allclose(near.local, exact.local, rtol=0, atol=2e-10)
+
+
+@pytest.mark.parametrize("half_cells", [1, 2, 3])
+def test_what_swings_in_time_with_the_grid_is_seen(half_cells: int) -> None:
+    """20 intervals of 30 cells: at their ends and middles the push is nothing."""
+    problem, plan = driven(lambda x, u, t: 1 - ca.cos(2 * np.pi * 1200 / half_cells * t))
+    rest = replace(plan, state_interpolant=replace(plan.state_interpolant, values=0 * plan.state_interpolant.values))
+    found = again(problem, rest)
+    swing = 2 * np.pi * 1200 / half_cells
+    np.testing.assert_allclose(found.states[:, 0], found.t - np.sin(swing * found.t) / swing, atol=1e-8)
 
 
 # ---- between the points ----------------------------------------------------------------------------------------------

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import casadi as ca
@@ -100,6 +102,58 @@ def test_later_declarations_do_not_reach_a_formulation() -> None:
     problem.path("late", problem.declared.states["q"].symbol, upper=0.5)
     assert len(form.path) == 0
     assert len(Formulation(problem).path) == 1
+
+
+def test_a_formulation_is_kept_with_its_problem_until_more_is_declared() -> None:
+    problem = energy()
+    form = Formulation.of(problem)
+    assert Formulation.of(problem) is form
+    q = problem.declared.states["q"].symbol
+    late: list[Any] = [
+        lambda: problem.at_start("q"),
+        lambda: problem.path("late", q, upper=0.5),
+        lambda: problem.watch("seen", q, upper=0.5),
+        lambda: problem.parameter("p"),
+    ]
+    for declare in late:
+        declare()
+        later = Formulation.of(problem)
+        assert later is not form
+        assert Formulation.of(problem) is later
+        form = later
+    assert form.path.names == ("late",)
+    assert Formulation.of(copy(problem)) is not form
+    assert Formulation.of(pickle.loads(pickle.dumps(problem))) is not form
+
+
+def test_a_plan_is_audited_for_its_problem_as_it_stands() -> None:
+    problem = energy()
+    plan = solve(problem, Collocation(6))
+    assert plan.audit().feasible
+    problem.path("late", problem.declared.states["q"].symbol, upper=0.5)
+    assert not plan.audit()["late"].passed
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+def test_what_is_kept_by_a_name_is_made_once(symbols: Any) -> None:
+    form = Formulation(swing(symbols))
+    made = []
+
+    def outputs() -> list[Any]:
+        made.append(1)
+        return [form.f, form.x[0] * lam]
+
+    lam = form.sym("lam")
+    rng = np.random.default_rng(3)
+    for count in (1, 31, 700):
+        x, u, t = rng.normal(size=(count, form.nx)), rng.normal(size=(count, form.nu)), rng.normal(size=count)
+        costate, p = rng.normal(size=count), rng.normal(size=form.np)
+        own = form.sampled(outputs, x, u, t, 2.0, p, (lam, costate[:, None]), kept="both")
+        anew = form.sampled([form.f, form.x[0] * lam], x, u, t, 2.0, p, (lam, costate[:, None]))
+        for one, other in zip(own, anew, strict=True):
+            np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(own[1][:, 0], x[:, 0] * costate, rtol=1e-15)
+    assert made == [1]
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
