@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import DEPENDENT, holders, nonnegative
+from ocp.audit.principle import holders, inverse_of, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
 
@@ -182,7 +182,7 @@ class Backwards:
         held = np.flatnonzero(pushing.any(axis=1))
         if held.size:
             rows = np.where(pushing[held, :, None], along.hold_u[held] * unit, 0.0)
-            inverse = np.linalg.pinv(rows.transpose(0, 2, 1), rcond=DEPENDENT)
+            inverse = inverse_of(along, pushing)[held].transpose(0, 2, 1)
             self.projector[held] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
                 given += np.einsum("km,kmi->ki", holding[:, mixed] * across[:, None], along.row_y[:, along.mixed, :nx])

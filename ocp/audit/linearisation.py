@@ -90,6 +90,7 @@ class Linearisation:
         stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
             derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
         low, high: Limits of the controls at the points. Shape (M, nu).
+        inverses: What :func:`ocp.audit.principle.inverse_of` found.
     """
 
     def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, sizes: Sizes) -> None:
@@ -109,6 +110,7 @@ class Linearisation:
         self.x = solution.state_interpolant(self.s)
         self.u = solution.control_interpolant.within(np.repeat(np.arange(n), q), np.tile(self.places, n))
         self.costate = solution.costate_interpolant(self.s)
+        self.inverses: dict[bytes, np.ndarray] = {}
         self._differentiate()
         self._at_ends()
         self.state_size = self._state_sizes()

@@ -24,6 +24,8 @@ __all__ = [
     "groups",
     "hamiltonian",
     "holders",
+    "inverse_of",
+    "inverses",
     "lost",
     "nonnegative",
     "reduced_slope",
@@ -90,7 +92,8 @@ def holders(
     """
     unit, hold, mixed = along.sizes.control, along.hold, along.mixed.size
     gradient, directions = slope(along, costate) * unit, along.hold_u * unit
-    found = balance(gradient, directions, hold.lower, hold.upper)
+    inverse = inverse_of(along, hold.near)
+    found = balance(gradient, directions, hold.lower, hold.upper, inverse)
     across = np.zeros(len(found), bool)
     if curved is None or along.form.path.equality[along.mixed].all():
         return found, across
@@ -124,25 +127,44 @@ def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
     return np.asarray(along.cost_y[:, of:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, of:], costate))
 
 
-def balance(gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def inverse_of(along: Linearisation, held: np.ndarray) -> np.ndarray:
+    """Pseudo-inverse of the derivatives of the limits that hold, (M, m) bool, in controls in units of their sizes.
+
+    Shape (M, nu, m). It is kept with the plan, for the same limits hold it whatever its costates.
+    """
+    key = np.packbits(held).tobytes()
+    if key not in along.inverses:
+        along.inverses[key] = inverses(along.hold_u * along.sizes.control, held)
+    return along.inverses[key]
+
+
+def inverses(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Pseudo-inverses (M, n, m) of those of the rows (M, m, n) that are ``held`` (M, m), bool; zero for the others."""
+    m, count, n = rows.shape
+    found = np.zeros((m, n, count))
+    for pattern, members in groups(held):
+        if pattern.any():
+            inverse = np.linalg.pinv(rows[members][:, pattern], rcond=DEPENDENT)
+            found[members[:, None], :, np.flatnonzero(pattern)] = inverse.transpose(0, 2, 1)
+    return found
+
+
+def balance(
+    gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, inverse: np.ndarray
+) -> np.ndarray:
     """Multipliers (M, m) of limits that make gradient (M, n) + directions (M, m, n)' multipliers least at each point.
 
     At least zero where only ``upper`` (M, m) may push, at most zero where only ``lower`` may, free where both may.
+    ``inverse`` is that of the directions which may push, (M, n, m).
     """
-    found = np.zeros(lower.shape)
-    active, both = lower | upper, lower & upper
-    for pattern, members in groups(active):
-        if not pattern.any():
-            continue
-        columns = directions[members][:, pattern].transpose(0, 2, 1)
-        multipliers = -np.einsum("kmn,kn->km", np.linalg.pinv(columns, rcond=DEPENDENT), gradient[members])
-        free, sign = both[members][:, pattern], np.where(upper[members][:, pattern], 1.0, -1.0)
-        wrong = (sign * multipliers < 0) & ~free
-        for k in np.flatnonzero(wrong.any(axis=1)):  # the signs hold some of them back
-            nothing = np.zeros(len(sign[k]))
-            multipliers[k] = sign[k] * nonnegative(columns[k] * sign[k], -gradient[members[k]], nothing, free[k])
-        found[np.ix_(members, np.flatnonzero(pattern))] = multipliers
-    return found
+    multipliers = -np.einsum("knm,kn->km", inverse, gradient)
+    sign, free, active = np.where(upper, 1.0, -1.0), lower & upper, lower | upper
+    wrong = (sign * multipliers < 0) & active & ~free
+    for k in np.flatnonzero(wrong.any(axis=1)):  # the signs hold some of them back
+        own = np.flatnonzero(active[k])
+        columns = (directions[k, own] * sign[k, own, None]).T
+        multipliers[k, own] = sign[k, own] * nonnegative(columns, -gradient[k], np.zeros(len(own)), free[k, own])
+    return np.asarray(multipliers)
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
@@ -235,9 +257,11 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
     best = np.zeros(len(won))
     while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
-        blocked = fixed.copy()
+        blocked, inverse = fixed.copy(), inverse_of(along, fixed)
         for pattern, members in groups(fixed):
-            step = _step(gradient[members], curved[members], along.hold_u[members][:, pattern] * unit, scale)
+            rows = along.hold_u[members][:, pattern] * unit
+            projector = np.eye(nu) - inverse[members][:, :, pattern] @ rows
+            step = _step(gradient[members], curved[members], projector, scale)
             with np.errstate(divide="ignore", invalid="ignore"):
                 room = np.where(step > 0, high[members] / step, np.where(step < 0, low[members] / step, np.inf))
             step = np.clip(room.min(axis=1, initial=1.0), 0.0, 1.0)[:, None] * step
@@ -283,13 +307,12 @@ def turning(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np
     return np.asarray(along.width * missed.sum(axis=1))
 
 
-def _step(gradient: np.ndarray, curved: np.ndarray, rows: np.ndarray, scale: float) -> np.ndarray:
-    """The least of gradient . d + d curved d / 2 over rows d = 0 at each point, |d| about 1 where it does not curve."""
-    k, nu = gradient.shape
-    if rows.shape[1]:
-        projector = np.eye(nu) - np.einsum("kun,knv->kuv", np.linalg.pinv(rows, rcond=DEPENDENT), rows)
-    else:
-        projector = np.broadcast_to(np.eye(nu), (k, nu, nu))
+def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
+    """The least of gradient . d + d curved d / 2 over projected d at each point; |d| about 1 where it does not curve.
+
+    Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale``: the largest curvature.
+    """
+    nu = gradient.shape[1]
     pull = np.einsum("kuv,kv->ku", projector, gradient)
     # held directions are as stiff as the stiffest, so that rounding does not move along them
     inside = projector @ curved @ projector + scale * (np.eye(nu) - projector)

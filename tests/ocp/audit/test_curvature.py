@@ -15,7 +15,7 @@ from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import adjoint
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import balance
+from ocp.audit.principle import balance, inverses
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import drawn
@@ -244,7 +244,7 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     lower = np.array([[False, False], [True, True], [True, True]])
     upper = np.array([[True, True], [False, False], [True, True]])
     expected = [[2.0, 0.0], [0.0, -3.0], [2.0, -3.0]]  # an upper bound pushes back only
-    np.testing.assert_allclose(balance(gradient, eye, lower, upper), expected)
+    np.testing.assert_allclose(balance(gradient, eye, lower, upper, inverses(eye, lower | upper)), expected)
 
 
 def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
@@ -252,7 +252,7 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
     rng = np.random.default_rng(5)
     gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
     upper = rng.random((200, 2)) < 0.7
-    found = balance(gradient, rows, np.zeros_like(upper), upper)
+    found = balance(gradient, rows, np.zeros_like(upper), upper, inverses(rows, upper))
     assert (found >= 0).all()
     assert (found[~upper] == 0).all()
     for k in range(200):
