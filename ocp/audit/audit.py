@@ -176,8 +176,10 @@ def audit(
     no verdict.
 
     The plan is looked at on a grid ten times as fine as its own points. What is narrower than a step of it and is no
-    part of the dynamics, a wall thinner than the way between two samples say, is not seen; what pushes is met by the
-    steps of the integration, some four to a step of the grid.
+    part of the dynamics, a wall thinner than the way between two samples say, is not seen. The dynamics are looked at
+    twice as often, and where they push there the plan is integrated step by step.
+
+    What the audit derives of a problem is kept with it until more is declared, so that further audits take less time.
 
     Where unstable dynamics carry the re-integrated states away from a plan that every interval keeps, the row of the
     whole horizon is only told, and bounds, constraints and cost are judged interval by interval.

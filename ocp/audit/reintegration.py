@@ -1,7 +1,8 @@
 """What the controls of a plan really do: integrated anew, knowing nothing of the transcription.
 
-Every interval is integrated in the steps of the fine grid, which are halved where the error of a step says so: what
-happens between the points of a plan, a push of a millisecond say, is met by a stage of some step.
+A plan that is nearly right is corrected (:mod:`ocp.audit.correction`). Where that leads nowhere, every interval is
+integrated in the steps of the fine grid, which are halved where the error of a step says so: what happens between the
+points of a plan, a push of a millisecond say, is met by a stage of some step.
 """
 
 from __future__ import annotations
