@@ -12,7 +12,7 @@ from models.machines.scara_path import scara_along
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
-from models.paths import Arc, Line, Path, SmoothPath, smooth
+from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
 from models.robot.kinematics import (
     center_of_mass,
@@ -54,6 +54,7 @@ __all__ = [
     "Footprint",
     "Frame",
     "FreeFloating",
+    "Helix",
     "Joint",
     "Line",
     "Link",

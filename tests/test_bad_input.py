@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import models
 import ocp
+import ocp.files
 import ocp.schedule
 from tests.bad_values import panel
 from tests.models.cts.test_bad_rigs import CASES as RIGS
@@ -12,13 +13,15 @@ from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
 from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
 from tests.ocp.builders.test_bad_tasks import CASES as TASKS
+from tests.ocp.files.test_bad_files import CASES as FILES
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
 
-CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS]
+CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS, *FILES]
 MADE_BY_THE_PACKAGE = {
     "Audit",
     "Certificate",
+    "Cut",
     "Dip",
     "Finding",
     "Footprint",
@@ -27,11 +30,19 @@ MADE_BY_THE_PACKAGE = {
     "JointRates",
     "LineMotion",
     "Machine",
+    "Note",
     "PathLike",
+    "Pause",
+    "Program",
+    "ProgramMotion",
+    "Rapid",
     "STANDING_STARTS",
     "Schedule",
     "SmoothPath",
     "Solution",
+    "Stretch",
+    "TimedProgram",
+    "Waypoints",
 }
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "paper_example", "reference_tunnel", "standing_example"}
@@ -41,7 +52,7 @@ LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
 
 def test_everything_a_user_types_is_in_a_panel() -> None:
     asked = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
-    faces = {*models.__all__, *ocp.__all__, *ocp.schedule.__all__}
+    faces = {*models.__all__, *ocp.__all__, *ocp.files.__all__, *ocp.schedule.__all__}
     errors = {name for name in faces if name.endswith(("Error", "Warning")) or name == "Unreachable"}
     assert faces - asked - errors - MADE_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - LOOKED_AT_IN_A_PROBLEM == set()
 

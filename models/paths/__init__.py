@@ -1,21 +1,24 @@
-"""Task paths: lines and arcs with tool orientation, rounded at their corners, as functions of the distance."""
+"""Task paths: lines, arcs and helices with tool orientation, rounded at their corners, as functions of the distance."""
 
 from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
 from models.paths.path import Path
+from models.paths.reversals import chains
 from models.paths.rounding import smooth
-from models.paths.segments import Arc, Line, Segment
+from models.paths.segments import Arc, Helix, Line, Segment
 from models.paths.smooth_path import Blend, Place, SmoothPath, Turn
 
 __all__ = [
     "Arc",
     "Blend",
+    "Helix",
     "Line",
     "Path",
     "Place",
     "Segment",
     "SmoothPath",
     "Turn",
+    "chains",
     "end_curvature",
     "gamma",
     "gauss_newton",

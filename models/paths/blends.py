@@ -20,7 +20,7 @@ from models.errors import ModelError
 from models.spatial import Expression
 
 __all__ = [
-    "DEFAULT_SHAPE",
+    "PAPER_SHAPE",
     "BlendKind",
     "by_arc_length",
     "checked_shape",
@@ -35,7 +35,8 @@ __all__ = [
 ]
 
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
-DEFAULT_SHAPE: dict[str, float] = {"cubic": 3.0, "quintic": 1.5}
+PAPER_SHAPE = 3.0
+"""Of the cubic, whose curvature is then continuous between lines."""
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
 """At these the curve between two lines stops in its middle: a cusp."""
 # value and derivative at the middle of the corner: F = Lr (n2 - n1) (1/2 - a shape), F' = Lr (n1 + n2) (b - c shape),
@@ -46,8 +47,8 @@ MIDDLE: dict[str, tuple[float, float, float, float]] = {
 }
 
 
-def checked_shape(shape: ArrayInput | None, kind: str, count: int = 1) -> Array:
-    """Shape factors of some vertices, one or one for each given; None takes that of the kind (cubic 3, quintic 1.5).
+def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
+    """Shape factors of some vertices, one or one for each given.
 
     Shape (count,).
 
@@ -55,11 +56,8 @@ def checked_shape(shape: ArrayInput | None, kind: str, count: int = 1) -> Array:
         ModelError: A factor that is not above zero and below that of the cusp (cubic 6, quintic 30/7), an unknown kind.
     """
     checked_choice(kind, get_args(BlendKind), "blend", "kind")
-    given = DEFAULT_SHAPE[kind] if shape is None else shape
-    factors, cusp = (
-        one_for_each(given, count, f"{kind} blend", "shape factor", "vertices", positive=True),
-        LARGEST_SHAPE[kind],
-    )
+    cusp = LARGEST_SHAPE[kind]
+    factors = one_for_each(shape, count, f"{kind} blend", "shape factor", "vertices", positive=True)
     if (factors >= cusp).any():
         worst = float(factors.max())
         message = f"shape factor {worst:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"

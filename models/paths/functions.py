@@ -26,6 +26,7 @@ from models.arrays import (
 from models.errors import ModelError
 from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, NEWTON_STEPS, speed
 from models.paths.orientation import orientation_function
+from models.paths.segments import screw_axes
 from models.paths.smooth_path import SmoothPath
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
@@ -35,10 +36,10 @@ MOST_CORRECTIONS, MOST_NODES = 100, 100  # of a mapping, whose expression grows 
 QUADRATURE_NODES = (2, 3, 4, 8)
 """Twice the time of the paper's 3 corrections; on a 90 deg corner of 5 mm, at 1 m/s and 2 ms, a drift of 2e-9 mm."""
 # rows of the table of cells
-SEGMENT = slice(0, 10)  # start, tangent, normal, curvature
-CURVE = slice(10, 28)  # coefficients, three a power
-CELL = slice(28, 35)  # distance, length, whether on a blend; u at the start, width in u, speed at both ends
-ROWS = 35
+SEGMENT = slice(0, 13)  # start; parts along, round and towards the axis of the screw, rate of turning
+CURVE = slice(13, 31)  # coefficients, three a power
+CELL = slice(31, 38)  # distance, length, whether on a blend; u at the start, width in u, speed at both ends
+ROWS = 38
 
 
 def path_function(path: SmoothPath) -> Any:
@@ -74,21 +75,22 @@ def turn_function(path: SmoothPath) -> Any:
 @lru_cache(maxsize=1)
 def _in_cell() -> Any:
     row, s = ca.SX.sym("row", ROWS), ca.SX.sym("s")
-    start, tangent, normal, k = row[0:3], row[3:6], row[6:9], row[9]
+    start, climb, ahead, inward, rate = row[0:3], row[3:6], row[6:9], row[9:12], row[12]
     coefficients = ca.reshape(row[CURVE], 3, 6)
     first_s, length, curved, first_u, width, speed0, speed1 = (row[i] for i in range(CELL.start, CELL.stop))
     distance = s - first_s
 
-    # segment; a line has k = 0: then sin(k s)/k is s
-    safe = k + (k == 0)
-    along = ca.if_else(k == 0, distance, ca.sin(k * distance) / safe)
-    across = ca.if_else(k == 0, 0, 2 * ca.sin(k * distance / 2) ** 2 / safe)
-    cosine, sine = ca.cos(k * distance), ca.sin(k * distance)
+    # segment; a line has the rate 0: then sin(rate s)/rate is s
+    safe = rate + (rate == 0)
+    along = ca.if_else(rate == 0, distance, ca.sin(rate * distance) / safe)
+    across = ca.if_else(rate == 0, 0, 2 * ca.sin(rate * distance / 2) ** 2 / safe)
+    cosine, sine = ca.cos(rate * distance), ca.sin(rate * distance)
+    turning = cosine * ahead + sine * inward
     on_segment = [
-        start + along * tangent + across * normal,
-        cosine * tangent + sine * normal,
-        k * (cosine * normal - sine * tangent),
-        -(k**2) * (cosine * tangent + sine * normal),
+        start + distance * climb + along * ahead + across * inward,
+        climb + turning,
+        rate * (cosine * inward - sine * ahead),
+        -(rate**2) * turning,
     ]
 
     u = ca.SX.sym("u")
@@ -137,9 +139,10 @@ def _table(path: SmoothPath) -> tuple[Array, Array]:
     task = path.path
     skipped = np.concatenate([[0.0], path.remaining])[segment]
     position, tangent, bend, _ = task.at(segment, skipped)
-    k = task.curvature[segment][:, None]
-    normal = bend / np.where(k == 0, 1.0, k)
-    rows[parts, SEGMENT] = np.concatenate([position, tangent, normal, k], axis=1)
+    k = task.curvature[segment]
+    normal = bend / np.where(k == 0, 1.0, k)[:, None]
+    climb, ahead, inward, rate = screw_axes(tangent, normal, k, task.torsion[segment])
+    rows[parts, SEGMENT] = np.column_stack([position, climb, ahead, inward, rate])
     # any regular curve will do where none is used: its speed must not be zero
     rows[parts, CURVE] = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (len(on_segment), 1))
     ones = np.ones(len(on_segment))
@@ -149,7 +152,6 @@ def _table(path: SmoothPath) -> tuple[Array, Array]:
     curves = slice(len(on_segment), count)
     cells = path.cells
     coefficients = path.coefficients[cells.curve]
-    rows[curves, 3:6] = [1.0, 0.0, 0.0]
     rows[curves, CURVE] = coefficients.reshape(-1, 18)
     speeds = speed(coefficients, cells.start), speed(coefficients, cells.start + cells.width)
     flag = np.ones(len(cells.curve))

@@ -8,7 +8,7 @@ leads to; so a quintic in the chart of the vertex joins two segments with contin
 from __future__ import annotations
 
 from functools import lru_cache
-from math import factorial
+from math import atan2, factorial, hypot
 from typing import Any
 
 import casadi as ca
@@ -19,7 +19,15 @@ from models.errors import ModelError
 from models.paths.blends import polynomial
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
-__all__ = ["along_piece", "exponential", "orientation_function", "rotation_vector", "unit_quaternion"]
+__all__ = [
+    "along_piece",
+    "exponential",
+    "orientation_function",
+    "product",
+    "rotation_matrix",
+    "rotation_vector",
+    "unit_quaternion",
+]
 
 LARGEST_TURN = np.pi - 1e-3
 """Two orientations further apart (rad) have no shorter way between them that one would guess."""
@@ -42,20 +50,45 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
     Raises:
         ModelError: The two are (nearly) half a turn apart, where the way is ambiguous.
     """
-    p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    scalar = p @ q
-    vector = p[0] * q[1:] - q[0] * p[1:] - np.cross(p[1:], q[1:])
+    # in plain numbers: a path has many, and numpy is slow on three entries
+    p0, p1, p2, p3 = np.asarray(first, dtype=float).tolist()
+    q0, q1, q2, q3 = np.asarray(second, dtype=float).tolist()
+    scalar = p0 * q0 + p1 * q1 + p2 * q2 + p3 * q3
+    x = p0 * q1 - q0 * p1 - (p2 * q3 - p3 * q2)
+    y = p0 * q2 - q0 * p2 - (p3 * q1 - p1 * q3)
+    z = p0 * q3 - q0 * p3 - (p1 * q2 - p2 * q1)
     if scalar < 0:
-        scalar, vector = -scalar, -vector
-    norm = float(np.linalg.norm(vector))
-    angle = 2 * float(np.arctan2(norm, scalar))
+        scalar, x, y, z = -scalar, -x, -y, -z
+    norm = hypot(x, y, z)
+    angle = 2 * atan2(norm, scalar)
     if angle > LARGEST_TURN:
         message = (
             f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, whose sense is ambiguous; "
             "split the segment"
         )
         raise ModelError(message, name=owner, value=angle, limit=LARGEST_TURN)
-    return np.asarray(vector * (angle / norm if norm > 0 else 2.0))
+    over = angle / norm if norm > 0 else 2.0
+    return np.array([x * over, y * over, z * over])
+
+
+def product(first: ArrayInput, second: ArrayInput) -> Array:
+    """Quaternion product of rows or of one each: `second` in the axes of `first`. Shape (..., 4)."""
+    p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def rotation_matrix(quaternion: ArrayInput) -> Array:
+    """Rotation matrix of a unit quaternion; its columns are the axes. Shape (3, 3)."""
+    w, x, y, z = np.asarray(quaternion, dtype=float)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def exponential(vector: Any) -> Any:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from models.arrays import NOT_NUMBERS, Array, ArrayInput, check_entries, checked_array, checked_indices, checked_numbers
 from models.errors import ModelError
-from models.paths.orientation import rotation_vector
-from models.paths.segments import Arc, Line, Segment, constant_curvature
+from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
+from models.paths.segments import Arc, Helix, Line, Segment, screw
 
 __all__ = ["Path"]
 
@@ -20,18 +20,19 @@ LARGEST_GAP = 1e-9
 """m; and rad between orientations."""
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner counts as a reversal: its blend would bend with 4e12 / remaining."""
+FRAME = ("start", "tangent", "normal", "curvature", "torsion")
 NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A chain of lines and arcs, each starting where the one before ends.
+    """A chain of lines, arcs and helices, each starting where the one before ends.
 
     Attributes:
         segments: At least one.
         lengths: Of the segments. Shape (n,), m.
         start, tangent, normal: Of each segment, at its start, in world. Shape (n, 3), m and unit vectors.
-        curvature: Of each segment; zero for a line. Shape (n,), 1/m.
+        curvature, torsion: Of each segment; zero for a line, the torsion for an arc too. Shape (n,), 1/m.
         orientation: Tool orientation at the start of each segment, unit quaternion. Shape (n, 4).
         turn: Rotation vector of each segment in the axes of its start orientation. Shape (n, 3), rad.
 
@@ -46,25 +47,15 @@ class Path:
     tangent: Array = field(init=False, repr=False)
     normal: Array = field(init=False, repr=False)
     curvature: Array = field(init=False, repr=False)
+    torsion: Array = field(init=False, repr=False)
     orientation: Array = field(init=False, repr=False)
     turn: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        try:
-            check_entries(self.segments)
-            segments = tuple(self.segments)
-        except NOT_NUMBERS as error:
-            message = f"the path {self.segments!r} is no sequence of segments"
-            raise ModelError(message, name="segments", value=self.segments) from error
-        if not segments:
-            raise ModelError("the path has no segment; give at least one Line or Arc", name="segments", value=())
-        for i, segment in enumerate(segments):
-            if not isinstance(segment, Line | Arc):
-                message = f"segment {i} is {segment!r}; a path is made of Line and Arc"
-                raise ModelError(message, name=f"segment {i}", value=segment)
+        segments = checked_segments(self.segments)
         object.__setattr__(self, "segments", segments)
         object.__setattr__(self, "lengths", np.array([segment.length for segment in segments]))
-        for name in ("start", "tangent", "normal", "curvature"):
+        for name in FRAME:
             object.__setattr__(self, name, np.array([getattr(segment, name) for segment in segments]))
         self._check_gaps()
         self._set_orientations()
@@ -102,21 +93,38 @@ class Path:
         """
         index = checked_indices(index, len(self.segments), "path", "index")
         along = checked_numbers(distance, "path", "distance")
-        return constant_curvature(
-            self.start[index], self.tangent[index], self.normal[index], self.curvature[index], along
-        )
+        frame = self.start[index], self.tangent[index], self.normal[index]
+        return screw(*frame, self.curvature[index], self.torsion[index], along)
 
     def corner_angles(self) -> Array:
         """Interior angle at each vertex, pi where the tangent goes on. Shape (n - 1,), rad."""
-        before, after = self._tangents()
-        # exact near 0 and pi, where the arc cosine is not
-        return np.asarray(
-            2 * np.arctan2(np.linalg.norm(before + after, axis=1), np.linalg.norm(before - after, axis=1))
-        )
-
-    def _tangents(self) -> tuple[Array, Array]:
         index = np.arange(len(self.segments) - 1)
-        return self.at(index, self.lengths[:-1])[1], self.tangent[1:]
+        return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
+
+    def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
+        """The path seen from a world in which its own axes have a pose; the tool is turned with it.
+
+        Args:
+            position: Of the path's origin in that world. Shape (3,), m.
+            orientation: Of the path's axes in that world, unit quaternion. Shape (4,).
+        """
+        origin = checked_array(position, (3,), "path", "position")
+        turned = unit_quaternion(orientation, "path: orientation")
+        matrix = rotation_matrix(turned)
+        made: list[Segment] = []
+        for i, segment in enumerate(self.segments):
+            changed: dict[str, Any] = {"start": origin + matrix @ segment.start}
+            for what in ("end",) if isinstance(segment, Line) else ("center",):
+                changed[what] = origin + matrix @ getattr(segment, what)
+            if not isinstance(segment, Line):
+                changed["axis"] = matrix @ segment.axis
+            for what in ("start_orientation", "end_orientation"):
+                given = getattr(segment, what)
+                if given is None and i == 0 and what == "start_orientation":
+                    given = NO_ROTATION
+                changed[what] = None if given is None else product(turned, given)
+            made.append(replace(segment, **changed))
+        return Path(tuple(made))
 
     def _check_gaps(self) -> None:
         ends = self.at(np.arange(len(self.segments)), self.lengths)[0]
@@ -164,3 +172,33 @@ class Path:
                 current = current if begin @ current >= 0 else -current
         object.__setattr__(self, "orientation", np.array(starts))
         object.__setattr__(self, "turn", np.array(turns))
+
+
+def checked_segments(segments: Any) -> tuple[Segment, ...]:
+    """`segments` as a tuple; ModelError unless they are Lines, Arcs and Helices, one at least."""
+    try:
+        check_entries(segments)
+        each = tuple(segments)
+    except NOT_NUMBERS as error:
+        message = f"the path {segments!r} is no sequence of segments"
+        raise ModelError(message, name="segments", value=segments) from error
+    if not each:
+        raise ModelError("the path has no segment; give at least one Line, Arc or Helix", name="segments", value=())
+    for i, segment in enumerate(each):
+        if not isinstance(segment, Line | Arc | Helix):
+            message = f"segment {i} is {segment!r}; a path is made of Line, Arc and Helix"
+            raise ModelError(message, name=f"segment {i}", value=segment)
+    return each
+
+
+def interior_angles(segments: Sequence[Segment]) -> Array:
+    """Interior angle between each segment and the next, as of `Path.corner_angles`. Shape (n - 1,), rad."""
+    start, tangent, normal, k, w, length = (
+        np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
+    )
+    return _angles(screw(start, tangent, normal, k, w, length)[1][:-1], tangent[1:])
+
+
+def _angles(before: Array, after: Array) -> Array:
+    # exact near 0 and pi, where the arc cosine is not
+    return np.asarray(2 * np.arctan2(np.linalg.norm(before + after, axis=1), np.linalg.norm(before - after, axis=1)))

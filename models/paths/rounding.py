@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array, ArrayInput, checked_choice, checked_instance, one_for_each
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
 from models.paths.arc_length import cells
-from models.paths.blends import BlendKind, checked_shape, cubic, polynomial, quintic
+from models.paths.blends import PAPER_SHAPE, BlendKind, checked_shape, cubic, polynomial, quintic
 from models.paths.path import Path
+from models.paths.segments import screw
+from models.paths.shape_factor import best_shape, corner_shape
 from models.paths.smooth_path import SmoothPath
 from models.spatial import FULL_TURN
 
@@ -26,6 +29,10 @@ KEPT_BACK = 1e-3
 """Share of the tolerance kept back for what lies between the samples of a deviation."""
 MOST_TRIALS, MOST_SHRINKS = 60, 30
 CORNERS_AT_ONCE = 500  # so that memory does not grow with them
+HELIX_SAMPLES, HELIX_STEPS = 33, 4  # of a stretch, and a turn, that a nearest place is looked for on
+GENTLEST = 0.1
+"""Slope of the condition for a nearest place below which a Newton step is not trusted: near the axis of a helix."""
+LONGEST_SHOWN = 12  # vertices in a warning
 SHORTEST_PIECE = 1e-12
 """Rests of a segment between two blends shorter than this, over the segment, are dropped."""
 
@@ -47,21 +54,39 @@ class _Corners(NamedTuple):
         """Those of some indices."""
         return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
 
-    def blends(self, remaining: Array) -> Array:
-        """Polynomials of the blends with some remaining distances, (V,). Shape (V, 6, 3)."""
+    @property
+    def bent(self) -> NDArray[np.intp]:
+        """Indices of those with an arc or a helix on either side."""
+        curved = self.path.curvature > 0
+        return np.flatnonzero(curved[self.vertices] | curved[self.vertices + 1])
+
+    def ends(self, remaining: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Position, tangent and curvature vector at the start and at the end of the blends. Shape (V, 3) each."""
         before = self.vertices
         p0, n0, k0, _ = self.path.at(before, self.path.lengths[before] - remaining)
         p1, n1, k1, _ = self.path.at(before + 1, remaining)
+        return p0, n0, k0, p1, n1, k1
+
+    def blends(self, remaining: Array) -> Array:
+        """Polynomials of the blends with some remaining distances, (V,). Shape (V, 6, 3)."""
+        p0, n0, k0, p1, n1, k1 = self.ends(remaining)
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
             return cubic(p0, rate * n0, p1, rate * n1)
         return quintic(p0, rate * n0, rate**2 * k0, p1, rate * n1, rate**2 * k1)
 
+    def shaped(self, remaining: Array) -> _Corners:
+        """The same with the shape that suits each best."""
+        shape, bent = corner_shape(self.path.corner_angles()[self.vertices]), self.bent
+        some = self.some(bent)
+        shape[bent] = best_shape(*some.ends(remaining[bent]), remaining[bent])
+        return self._replace(shape=shape)
 
-def _remaining_distances(
-    corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap
-) -> Array:
-    """Remaining distance of each vertex, checked. Shape (n - 1,), m. Arguments as of `smooth`."""
+
+def _sized(
+    corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
+) -> tuple[_Corners, Array]:
+    """The corners, shaped if that is free, and their remaining distances, (n - 1,), m. Arguments as of `smooth`."""
     checked_choice(overlap, get_args(Overlap), "path", "overlap")
     if (remaining is None) == (deviation is None):
         message = "give either the remaining distance or the deviation, not both and not neither"
@@ -69,13 +94,25 @@ def _remaining_distances(
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
         wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
-        return _without_overlap(path, wanted, overlap)
+        found = _without_overlap(path, wanted, overlap)
+        _warn_of_smaller(path, wanted, found)
+        return corners.shaped(found) if free else corners, found
     tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
+    found = _within(corners, tolerance, overlap)
+    if free and corners.bent.size:
+        corners = corners.shaped(found)
+        found = _within(corners, tolerance, overlap)
+    return corners, found
+
+
+def _within(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
+    """Remaining distances whose blends stay within the tolerance. Shape (V,), m."""
+    path = corners.path
     # never longer than a segment, so that every trial is a curve that exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
     found = _without_overlap(path, _from_deviation(corners, tolerance, longest), overlap)
     # next to an arc the vertex need not be the farthest point, nor a smaller blend the nearer one
-    bent = np.flatnonzero((path.curvature[:-1] > 0) | (path.curvature[1:] > 0))
+    bent = corners.bent
     aim = tolerance * (1 - KEPT_BACK)
     for _ in range(MOST_SHRINKS):
         some = corners.some(bent)
@@ -86,6 +123,21 @@ def _remaining_distances(
         aim[bent] *= (1 - KEPT_BACK) / over
         found[bent] = _fitted(corners.some(bent), aim[bent], found[bent])
     return found
+
+
+def _warn_of_smaller(path: Path, wanted: Array, found: Array) -> None:
+    smaller = np.flatnonzero(found < wanted * (1 - 1e-12))
+    if smaller.size:
+        worst = int((found / wanted).argmin())
+        vertices = tuple((smaller + 1).tolist())
+        shown = ", ".join(str(vertex) for vertex in vertices[:LONGEST_SHOWN])
+        shown += f" and {len(vertices) - LONGEST_SHOWN} more" if len(vertices) > LONGEST_SHOWN else ""
+        message = (
+            f"overlap='shrink': blends are smaller than asked at vertices {shown}; at vertex {worst + 1} "
+            f"{found[worst]:g} of {wanted[worst]:g} m, between segments {path.lengths[worst]:g} and "
+            f"{path.lengths[worst + 1]:g} m long"
+        )
+        warn(ModelWarning(message, name=f"vertex {worst + 1}", value=vertices, limit=float(found[worst])), stacklevel=4)
 
 
 def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
@@ -108,17 +160,15 @@ def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
 
 
 def _from_deviation(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    found, path = longest.copy(), corners.path
-    straight = (path.curvature[:-1] == 0) & (path.curvature[1:] == 0)
+    found, arcs = longest.copy(), corners.bent
     # between two lines the deviation is proportional to the remaining distance: one trial tells the ratio
-    lines = np.flatnonzero(straight)
+    lines = np.setdiff1d(np.arange(len(longest)), arcs, assume_unique=True)
     if lines.size:
         some = corners.some(lines)
         corner, legs = _deviations(some, longest[lines])
         largest = np.maximum(corner, legs * (1 + KEPT_BACK))
         with np.errstate(divide="ignore"):
             found[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
-    arcs = np.flatnonzero(~straight)
     if arcs.size:
         found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - KEPT_BACK), longest[arcs])
     return found
@@ -212,6 +262,13 @@ def _from_segments(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 def _distance(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
     # of points (V, S, 3) from the stretch first..last of a segment each
+    screwed = np.flatnonzero(path.torsion[index] != 0)
+    if screwed.size:
+        result, others = np.empty(points.shape[:2]), np.flatnonzero(path.torsion[index] == 0)
+        if others.size:
+            result[others] = _distance(path, index[others], points[others], first[others], last[others])
+        result[screwed] = _from_helix(path, index[screwed], points[screwed], first[screwed], last[screwed])
+        return result
     offset = points - path.start[index][:, None]
     along = np.einsum("vsi,vi->vs", offset, path.tangent[index])
     across = np.einsum("vsi,vi->vs", offset, path.normal[index])
@@ -223,11 +280,32 @@ def _distance(path: Path, index: NDArray[np.intp], points: Array, first: Array, 
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(k > 0, angle / k, along)
     s = np.clip(distance, first[:, None], last[:, None])
-    # what constant_curvature says of the position, without its derivatives
+    # what screw says of the position, without its derivatives
     turned = k * s / np.pi
     offset -= (s * np.sinc(turned))[..., None] * path.tangent[index][:, None]
     offset -= (k * s**2 / 2 * np.sinc(turned / 2) ** 2)[..., None] * path.normal[index][:, None]
     return np.asarray(np.sqrt(np.einsum("vsi,vsi->vs", offset, offset)))
+
+
+def _from_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
+    # as _distance: the nearest of some places, and Newton steps from there to where the offset is square to the tangent
+    if len(index) > CORNERS_AT_ONCE:
+        parts = [slice(k, k + CORNERS_AT_ONCE) for k in range(0, len(index), CORNERS_AT_ONCE)]
+        return np.concatenate([_from_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
+    frame = path.start[index][:, None], path.tangent[index][:, None], path.normal[index][:, None]
+    bends = path.curvature[index][:, None], path.torsion[index][:, None]
+    turns = float((np.hypot(*bends)[:, 0] * (last - first)).max()) / FULL_TURN
+    share = np.linspace(0, 1, int(HELIX_SAMPLES * (1 + turns)))
+    places = first[:, None] + (last - first)[:, None] * share
+    there = screw(*frame, *bends, places)[0] - frame[0]
+    square = (there**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ there.transpose(0, 2, 1)
+    s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
+    for _ in range(HELIX_STEPS):
+        at, tangent, bend, _ = screw(*frame, *bends, s)
+        slope = 1 + ((at - points) * bend).sum(axis=-1)
+        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, GENTLEST)
+        s = np.clip(s, first[:, None], last[:, None])
+    return np.asarray(np.linalg.norm(screw(*frame, *bends, s)[0] - points, axis=-1))
 
 
 def smooth(
@@ -249,16 +327,26 @@ def smooth(
             smooth path; the blends are as large as that and the segments allow.
         kind: "quintic", whose curvature is continuous everywhere, or the paper's "cubic", whose curvature is continuous
             between lines only, and only at shape 3.
-        shape: End tangents over the remaining distance, lambda of eq. (9), one for all or one for each vertex; 3
-            (cubic) or 1.5 (quintic) if None.
+        shape: End tangents over the remaining distance, lambda of eq. (9), one for all or one for each vertex. If
+            None, the paper's 3 for a cubic, and for a quintic that of least peak curvature at each vertex, which is
+            run fastest: see models.paths.shape_factor.
         overlap: What happens to blends that would overlap on a segment: "shrink" makes both smaller, "refuse" raises.
 
     Raises:
         ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
+
+    Warns:
+        ModelWarning: Blends that were made smaller than `remaining` asks, their vertices being its `value`. A
+            `deviation` is kept by smaller ones too, and nothing is said.
     """
     count = len(checked_instance(path, Path, "smooth", "path").segments)
-    corners = _Corners(path, kind, checked_shape(shape, kind, count - 1), np.arange(count - 1))
-    distances = _remaining_distances(corners, remaining, deviation, overlap)
+    checked_choice(kind, get_args(BlendKind), "blend", "kind")
+    free = shape is None and kind == "quintic"
+    angles = path.corner_angles()
+    factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)
+    corners, distances = _sized(
+        _Corners(path, kind, factors, np.arange(count - 1)), remaining, deviation, overlap, free
+    )
     coefficients = corners.blends(distances)
     curve_cells = cells(coefficients)
     blend_lengths = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(distances))

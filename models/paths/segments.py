@@ -1,15 +1,18 @@
-"""Segments of a task path: straight lines and circular arcs in space, tool orientation carried along.
+"""Segments of a task path: straight lines, circular arcs and helices in space, tool orientation carried along.
 
-Both are curves of constant curvature k, and one formula, with the arc length s from the start, serves both:
+All are curves of constant curvature k and torsion w, and one formula, with the arc length s from the start and
+T, N, B = T x N there, serves them all. With o = sqrt(k^2 + w^2), d = (w T + k B)/o and e = (k T - w B)/o
 
-    r(s) = start + tangent sin(k s)/k + normal (1 - cos(k s))/k.
+    r(s) = start + w/o d s + k/o [e sin(o s) + N (1 - cos(o s))]/o:
+
+the way along the axis d of the screw, and the way round it. An arc has w = 0, a line k = 0 as well.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -18,10 +21,12 @@ from models.errors import ModelError
 from models.paths.orientation import rotation_vector, unit_quaternion
 from models.spatial import FULL_TURN
 
-__all__ = ["Arc", "Line", "Segment", "constant_curvature"]
+__all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
 
 SHORTEST_SEGMENT = 1e-9
 """Segments below this length (m) count as points."""
+STEEPEST = 1e-6
+"""Cosine between the axis and a radius above which they do not count as perpendicular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +79,11 @@ class Line:
         """1/m."""
         return 0.0
 
+    @property
+    def torsion(self) -> float:
+        """1/m."""
+        return 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class Arc:
@@ -98,29 +108,12 @@ class Arc:
     end_orientation: ArrayInput | None = None
 
     def __post_init__(self) -> None:
-        for what in ("start", "center", "axis"):
-            object.__setattr__(self, what, checked_array(getattr(self, what), (3,), "arc", what))
+        radius = _set_circle(self, "arc")
         sweep = checked_number(self.sweep, "arc", "sweep")
-        norm = float(np.linalg.norm(self.axis))
-        if norm == 0:
-            message = "arc: axis [0, 0, 0] has no direction; give the normal of the arc's plane"
-            raise ModelError(message, name="axis", value=self.axis)
-        object.__setattr__(self, "axis", self.axis / norm)
-        radius = float(np.linalg.norm(self.start - self.center))
-        if radius <= SHORTEST_SEGMENT:
-            message = f"arc: start {self.start.tolist()} is its center; its radius {radius:g} m is no circle"
-            raise ModelError(message, name="radius", value=radius, limit=SHORTEST_SEGMENT)
-        slope = abs(float(self.axis @ (self.start - self.center))) / radius
-        if slope > 1e-6:
-            message = (
-                f"arc: axis {self.axis.tolist()} is not perpendicular to the radius from {self.center.tolist()} to "
-                f"{self.start.tolist()} (cosine {slope:.3g}); move the center along the axis into the arc's plane"
-            )
-            raise ModelError(message, name="axis", value=slope, limit=1e-6)
         if not 0 < sweep <= FULL_TURN * (1 + 1e-12) or radius * sweep <= SHORTEST_SEGMENT:
             message = (
                 f"arc: sweep {sweep:g} rad is outside (0, 2 pi] or its length {radius * sweep:g} m is zero; "
-                "turn the axis round for the other sense, chain arcs for several turns"
+                "turn the axis round for the other sense, take a Helix for several turns"
             )
             raise ModelError(message, name="sweep", value=sweep, limit=(0.0, FULL_TURN))
         object.__setattr__(self, "sweep", sweep)
@@ -198,37 +191,159 @@ class Arc:
         return 1 / self.radius
 
     @property
+    def torsion(self) -> float:
+        """1/m."""
+        return 0.0
+
+    @property
     def end(self) -> Array:
         """End point in world. Shape (3,), m."""
-        place = constant_curvature(self.start, self.tangent, self.normal, self.curvature, self.length)[0]
-        return np.asarray(place)
+        return np.asarray(screw(self.start, self.tangent, self.normal, self.curvature, 0.0, self.length)[0])
 
 
-Segment: TypeAlias = Line | Arc
+@dataclass(frozen=True, eq=False)
+class Helix:
+    """A circular helix, or a circle of several turns: of constant curvature and torsion.
+
+    Attributes:
+        start: In world. Shape (3,), m.
+        center: Of the circle that the helix starts on, in world. Shape (3,), m.
+        axis: Unit vector about which the helix turns, right-handed. Shape (3,).
+        sweep: Angle turned, rad: any number of turns, above zero.
+        rise: Way along the axis meanwhile, m; below zero it screws left-handed, at zero it stays in its plane.
+        start_orientation, end_orientation: As of a Line.
+
+    Raises:
+        ModelError: nan, no radius, an axis that is zero or not perpendicular to the radius, a sweep that is not above
+            zero.
+    """
+
+    start: ArrayInput
+    center: ArrayInput
+    axis: ArrayInput
+    sweep: float
+    rise: float
+    start_orientation: ArrayInput | None = None
+    end_orientation: ArrayInput | None = None
+
+    def __post_init__(self) -> None:
+        radius = _set_circle(self, "helix")
+        sweep = checked_number(self.sweep, "helix", "sweep", positive=True, unit="rad")
+        object.__setattr__(self, "sweep", sweep)
+        object.__setattr__(self, "rise", checked_number(self.rise, "helix", "rise"))
+        if self.length <= SHORTEST_SEGMENT:
+            message = f"helix: sweep {sweep:g} rad at the radius {radius:g} m has the length {self.length:g} m; drop it"
+            raise ModelError(message, name="sweep", value=sweep, limit=SHORTEST_SEGMENT)
+        _set_orientations(self, "helix")
+
+    @property
+    def radius(self) -> float:
+        """Of the cylinder that it lies on, m."""
+        return float(np.linalg.norm(self.start - self.center))
+
+    @property
+    def length(self) -> float:
+        """m."""
+        return float(np.hypot(self.radius * self.sweep, self.rise))
+
+    @property
+    def normal(self) -> Array:
+        """Unit vector at the start towards the axis. Shape (3,)."""
+        return np.asarray((self.center - self.start) / self.radius)
+
+    @property
+    def tangent(self) -> Array:
+        """Unit tangent at the start. Shape (3,)."""
+        round_the_axis = self.radius * self.sweep * np.cross(self.normal, self.axis)
+        return np.asarray((round_the_axis + self.rise * self.axis) / self.length)
+
+    @property
+    def curvature(self) -> float:
+        """1/m."""
+        return self.radius * (self.sweep / self.length) ** 2
+
+    @property
+    def torsion(self) -> float:
+        """1/m; above zero where it screws right-handed."""
+        return self.rise * self.sweep / self.length**2
+
+    @property
+    def end(self) -> Array:
+        """End point in world. Shape (3,), m."""
+        return np.asarray(screw(self.start, self.tangent, self.normal, self.curvature, self.torsion, self.length)[0])
 
 
-def constant_curvature(
-    start: Array, tangent: Array, normal: Array, curvature: float | Array, distance: float | Array
+Segment: TypeAlias = Line | Arc | Helix
+
+
+def screw(
+    start: Array,
+    tangent: Array,
+    normal: Array,
+    curvature: float | Array,
+    torsion: float | Array,
+    distance: float | Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Point at `distance` along a line or an arc, and its first three derivatives by the distance.
+    """Point at `distance` along a line, an arc or a helix, and its first three derivatives by the distance.
 
     Args:
         start, tangent, normal: At distance 0. Shape (..., 3), m and unit vectors.
-        curvature: Shape (...), 1/m; zero for a line.
+        curvature, torsion: Shape (...), 1/m; both zero for a line, the torsion for an arc.
         distance: Shape (...), m.
 
     Returns:
         Position (m), unit tangent, curvature vector (1/m), its derivative (1/m^2). Shape (..., 3) each.
     """
-    k, s = np.asarray(curvature, dtype=float)[..., None], np.asarray(distance, dtype=float)[..., None]
-    angle = k * s
+    climb, ahead, inward, rate = screw_axes(tangent, normal, curvature, torsion)
+    rate, s = rate[..., None], np.asarray(distance, dtype=float)[..., None]
+    angle = rate * s
     sine, cosine = np.sin(angle), np.cos(angle)
     along = s * np.sinc(angle / np.pi)
-    across = k * s**2 / 2 * np.sinc(angle / (2 * np.pi)) ** 2
-    position = start + along * tangent + across * normal
-    first = cosine * tangent + sine * normal
-    second = k * (cosine * normal - sine * tangent)
-    return position, first, second, -(k**2) * first
+    across = rate * s**2 / 2 * np.sinc(angle / (2 * np.pi)) ** 2
+    position = start + s * climb + along * ahead + across * inward
+    turning = cosine * ahead + sine * inward
+    return position, climb + turning, rate * (cosine * inward - sine * ahead), -(rate**2) * turning
+
+
+def screw_axes(
+    tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
+) -> tuple[Array, Array, Array, Array]:
+    """The tangent's part along the axis of the screw and that round it, the part towards it, and the rate of turning.
+
+    Shape (..., 3) three times; (...), rad/m. Arguments as of `screw`.
+    """
+    k, w = np.asarray(curvature, dtype=float), np.asarray(torsion, dtype=float)
+    if not np.any(w):
+        return np.zeros_like(tangent), tangent, normal, k
+    rate = np.hypot(k, w)
+    safe = np.where(rate == 0, 1.0, rate)
+    level, steep = np.where(rate == 0, 1.0, k / safe)[..., None], (w / safe)[..., None]
+    binormal = np.cross(tangent, normal)
+    climb = steep * (steep * tangent + level * binormal)
+    return climb, level * (level * tangent - steep * binormal), level * normal, rate
+
+
+def _set_circle(segment: Any, owner: str) -> float:
+    """Check start, center and axis, and set them. Returns the radius, m."""
+    for what in ("start", "center", "axis"):
+        object.__setattr__(segment, what, checked_array(getattr(segment, what), (3,), owner, what))
+    norm = float(np.linalg.norm(segment.axis))
+    if norm == 0:
+        message = f"{owner}: axis [0, 0, 0] has no direction; give the one that it turns about"
+        raise ModelError(message, name="axis", value=segment.axis)
+    object.__setattr__(segment, "axis", segment.axis / norm)
+    radius = float(np.linalg.norm(segment.start - segment.center))
+    if radius <= SHORTEST_SEGMENT:
+        message = f"{owner}: start {segment.start.tolist()} is its center; its radius {radius:g} m is no circle"
+        raise ModelError(message, name="radius", value=radius, limit=SHORTEST_SEGMENT)
+    slope = abs(float(segment.axis @ (segment.start - segment.center))) / radius
+    if slope > STEEPEST:
+        message = (
+            f"{owner}: axis {segment.axis.tolist()} is not perpendicular to the radius from {segment.center.tolist()} "
+            f"to {segment.start.tolist()} (cosine {slope:.3g}); move the center along the axis to the start's height"
+        )
+        raise ModelError(message, name="axis", value=slope, limit=STEEPEST)
+    return radius
 
 
 def _set_orientations(segment: Segment, owner: str) -> None:

@@ -13,7 +13,9 @@ MM = 1e-3
 
 # printed
 POINTS = MM * np.array([(700, 0, 50), (300, 0, 50), (300, 650, 0), (0, 650, 50), (-372, 650, 50)])
-REMAINING, SHAPE = 150 * MM, 3.0
+REMAINING = 150 * MM
+SHAPE: dict[BlendKind, float] = {"cubic": 3.0, "quintic": 1.5}
+"""The paper's cubic, and ours that stands beside it in every figure and table."""
 SPEED, MEAN_ACCELERATION, JERK = 1.0, 5.0, 200.0  # m/s, m/s^2, m/s^3
 REACH = 0.8  # m
 PAPER_TIMES = (0.356, 0.628, 0.982, 1.254)  # s, Figure 14

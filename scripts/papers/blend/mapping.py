@@ -10,9 +10,9 @@ from models import SmoothPath
 from models.arrays import Array
 from models.paths import Blend, gauss_newton, march, predictor_corrector
 from models.paths.arc_length import arc_length
-from models.paths.blends import DEFAULT_SHAPE, BlendKind, polynomial
+from models.paths.blends import BlendKind, polynomial
 from ocp.schedule import Schedule, SpeedProfile
-from scripts.papers.blend.example import MM, PERIOD, SPEED, corner
+from scripts.papers.blend.example import MM, PERIOD, SHAPE, SPEED, corner
 from scripts.papers.run import Row
 
 PERIODS = (1e-3, 2e-3, 4e-3)  # s
@@ -69,12 +69,12 @@ def mapping_table(path: SmoothPath, profile: SpeedProfile) -> list[Row]:
 def small_blend_table() -> list[Row]:
     """Both mappings on 90 deg corners of many sizes at 1000 mm/s, the first sample one period past the blend's start.
 
-    On cubic and quintic blends of the default shape.
+    On cubic and quintic blends of the example's shapes.
     """
     rows: list[Row] = []
     for kind in DEGREE:
         for remaining in DISTANCES:
-            blend = corner(90, remaining, DEFAULT_SHAPE[kind], kind).blend(0)
+            blend = corner(90, remaining, SHAPE[kind], kind).blend(0)
             for period in PERIODS:
                 count = int(blend.length / (SPEED * period))
                 if count < 2:

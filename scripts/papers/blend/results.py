@@ -12,7 +12,7 @@ from models import SmoothPath, scara_along, smooth
 from models.arrays import Array
 from models.machines.scara_path import ScaraPath
 from models.paths import gamma
-from models.paths.blends import polynomial
+from models.paths.blends import BlendKind, polynomial
 from ocp import plan_minimum_time
 from ocp.builders.timing import Fastest
 from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
@@ -26,6 +26,7 @@ from scripts.papers.blend.example import (
     MM,
     PAPER_GAMMA,
     REMAINING,
+    SHAPE,
     SPEED,
     corner,
     example,
@@ -79,7 +80,8 @@ class Results:
 
 def compute() -> Results:
     """All of it, in under ten seconds."""
-    cubic, quintic = smooth(example(), REMAINING, kind="cubic"), smooth(example(), REMAINING, kind="quintic")
+    kinds: tuple[BlendKind, ...] = ("cubic", "quintic")
+    cubic, quintic = (smooth(example(), REMAINING, kind=kind, shape=SHAPE[kind]) for kind in kinds)
     acceleration = peak_acceleration(MEAN_ACCELERATION, SPEED, JERK)
     mean = schedule(cubic, LineLimits(SPEED, acceleration, JERK))
     peak = schedule(cubic, LineLimits(SPEED, MEAN_ACCELERATION, JERK))

@@ -18,6 +18,7 @@ from ocp import ProblemError
 from ocp.schedule import JointLimits, LineLimits, schedule
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 EVEN = Scara(0.4, 0.4)
 NAN = float("nan")
 

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import Arc, Line, ModelError, Path, Scara, scara_along, smooth
+from models import Arc, Helix, Line, ModelError, Path, Scara, scara_along, smooth
 from models.machines.scara_path import ScaraPath
 from models.paths import Segment
 
@@ -29,8 +29,13 @@ def product(p: Array, q: Array) -> Array:
     return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], vector])
 
 
-def random_path(rng: np.random.Generator, count: int, *, turns: bool = False, arcs: float = 0.5) -> Path:
-    """Segments of 30 to 300 mm, a share of them arcs in any plane up to a full circle; the tool turns if asked."""
+def random_path(
+    rng: np.random.Generator, count: int, *, turns: bool = False, arcs: float = 0.5, helices: float = 0.0
+) -> Path:
+    """Segments of 30 to 300 mm, a share of them arcs in any plane up to a full circle; the tool turns if asked.
+
+    Another share are helices of up to three turns, rising or falling by up to half their radius a turn.
+    """
     segments: list[Segment] = []
     end, orientation = rng.normal(size=3), turned(rng.normal(size=3))
     while len(segments) < count:
@@ -41,7 +46,11 @@ def random_path(rng: np.random.Generator, count: int, *, turns: bool = False, ar
         choice = rng.random()
         try:
             segment: Segment
-            if choice > arcs:
+            if choice > 1 - helices:
+                center = end + size * across / np.linalg.norm(across)
+                sweep, pitch = rng.uniform(0.1, 3) * 2 * np.pi, rng.uniform(-0.5, 0.5) * size
+                segment = Helix(end, center, axis, sweep, pitch * sweep / (2 * np.pi), **ends)
+            elif choice > arcs:
                 segment = Line(end, end + size * rng.normal(size=3), **ends)
             elif choice > arcs / 2:
                 segment = Arc.through(end, *(end + size * rng.normal(size=(2, 3))), **ends)

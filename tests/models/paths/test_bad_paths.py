@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from models import Arc, Line, Path, SmoothPath, smooth
+from models import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.paths import (
     end_curvature,
     gamma,
@@ -92,6 +92,19 @@ CASES = [
         Arc.through,
         {"start": (1, 0, 0), "via": (0, 1, 0), "end": (-1, 0, 0)},
         {"start": POINT, "via": POINT | {"in line": (0, 0, 0)}, "end": POINT | {"the start": (1, 0, 0)}},
+    ),
+    Case(
+        "Helix",
+        Helix,
+        {"start": (1, 0, 0), "center": (0, 0, 0), "axis": (0, 0, 1), "sweep": 9.0, "rise": -0.1},
+        {
+            "start": POINT,
+            "center": POINT | {"the start": (1, 0, 0)},
+            "axis": POINT | {"zero": (0, 0, 0), "along the radius": (1, 0, 0)},
+            "sweep": POSITIVE | NOTHING,
+            "rise": FINITE | NOTHING,
+            "start_orientation": QUATERNION,
+        },
     ),
     Case(
         "Path",

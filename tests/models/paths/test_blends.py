@@ -14,11 +14,13 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
-from models import Arc, Line, ModelError, Path, SmoothPath, smooth
-from models.paths import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
+from models import Arc, Line, ModelError, ModelWarning, Path, SmoothPath, smooth
+from models.paths import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest, rounding, shape_factor
 from models.paths.arc_length import arc_length
 from models.paths.blends import LARGEST_SHAPE, polynomial
 from tests.models.paths.task_paths import random_path, seeds
+
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 
 ANGLES = (5.0, 11.0, 30.0, 45.0, 77.0, 90.0, 120.0, 150.0, 175.0, 179.0)
 
@@ -103,7 +105,7 @@ few = settings(max_examples=40)
 @given(seeds, st.integers(2, 8), st.sampled_from(["cubic", "quintic"]), st.floats(-3.5, -1))
 def test_random_paths_stay_within_the_deviation(seed: int, count: int, kind: Any, exponent: float) -> None:
     deviation = 10**exponent
-    path = random_path(np.random.default_rng(seed), count)
+    path = random_path(np.random.default_rng(seed), count, helices=0.3)
     smoothed = smooth(path, deviation=deviation, kind=kind)
     for vertex in range(count - 1):
         blend = smoothed.blend(vertex)
@@ -136,7 +138,7 @@ def test_a_blend_between_long_lines_takes_all_of_the_deviation(
 @few
 @given(seeds, st.integers(2, 8), st.sampled_from(["cubic", "quintic"]), st.floats(-3, 0))
 def test_random_paths_are_continuous_as_promised(seed: int, count: int, kind: Any, exponent: float) -> None:
-    smoothed = smooth(random_path(np.random.default_rng(seed), count), 10**exponent, kind=kind)
+    smoothed = smooth(random_path(np.random.default_rng(seed), count, helices=0.3), 10**exponent, kind=kind)
     at = smoothed.bounds[1:-1]
     step = 1e-12 * smoothed.length
     before, after = smoothed.at(at - step), smoothed.at(at + step)
@@ -151,7 +153,7 @@ def test_random_paths_are_continuous_as_promised(seed: int, count: int, kind: An
 @given(seeds, st.integers(1, 8))
 def test_derivatives_by_the_distance_are_those_of_the_position(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    smoothed = smooth(random_path(rng, count), 0.1)
+    smoothed = smooth(random_path(rng, count, helices=0.3), 0.1)
     share = rng.uniform(0.05, 0.95, len(smoothed.piece_lengths))
     s, h = smoothed.bounds[:-1] + share * smoothed.piece_lengths, 1e-5 * smoothed.piece_lengths.min()
     before, here, after = (smoothed.at(s + k * h) for k in (-1, 0, 1))
@@ -164,7 +166,7 @@ def test_derivatives_by_the_distance_are_those_of_the_position(seed: int, count:
 @few
 @given(seeds)
 def test_every_bound_of_a_long_path_belongs_to_the_piece_that_begins_there(seed: int) -> None:
-    smoothed = smooth(random_path(np.random.default_rng(seed), 25, arcs=0.2), 0.01)
+    smoothed = smooth(random_path(np.random.default_rng(seed), 25, arcs=0.2, helices=0.2), 0.01)
     at_bounds = smoothed.at(smoothed.bounds).position
     gaps = np.linalg.norm(np.diff(at_bounds, axis=0), axis=1)
     assert (gaps <= smoothed.piece_lengths * (1 + 1e-9)).all()
@@ -176,6 +178,12 @@ def test_blends_that_overlap_are_shrunk_to_meet_or_refused() -> None:
     points = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (2, 0.3, 0)]
     smoothed = smooth(Path.through(points), 0.2)
     assert smoothed.remaining == pytest.approx([0.15, 0.15], rel=1e-15)
+    with pytest.warns(ModelWarning, match=r"smaller than asked at vertices 1, 2; at vertex 1 0\.15 of 0\.2 m") as said:
+        smooth(Path.through(points), 0.2)
+    assert [(each.message.name, each.message.value) for each in said] == [("vertex 1", (1, 2))]  # type: ignore[union-attr]
+    with pytest.warns(ModelWarning, match=r"at vertices 3, 4; at vertex 3 0.025 of 0.03 m") as said:
+        smooth(Path.through([*points, (2, 0.35, 0), (3, 0.35, 0)]), [0.05, 0.1, 0.03, 0.03])
+    assert said[0].message.value == (3, 4)  # type: ignore[union-attr]
     assert len(smoothed.piece_lengths) == 4  # nothing is left of the middle segment
     assert smooth(Path.through(points), [0.2, 0.1]).remaining == pytest.approx([0.2, 0.1], rel=1e-15)
     with pytest.raises(ModelError, match=r"segment 1, 0\.3 m long"):
@@ -184,9 +192,19 @@ def test_blends_that_overlap_are_shrunk_to_meet_or_refused() -> None:
 
 @given(seeds, st.floats(-3, 1))
 def test_no_blends_cross(seed: int, exponent: float) -> None:
-    path = random_path(np.random.default_rng(seed), 6)
+    path = random_path(np.random.default_rng(seed), 6, helices=0.2)
     remaining = np.concatenate([[0.0], smooth(path, 10**exponent).remaining, [0.0]])
     assert (remaining[:-1] + remaining[1:] <= path.lengths * (1 + 1e-12)).all()
+
+
+def test_corners_in_parts_are_rounded_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = random_path(np.random.default_rng(11), 12, arcs=0.3, helices=0.4)
+    whole = smooth(path, deviation=1e-3)
+    monkeypatch.setattr(rounding, "CORNERS_AT_ONCE", 2)
+    monkeypatch.setattr(shape_factor, "AT_ONCE", 2)
+    parts = smooth(path, deviation=1e-3)
+    assert parts.remaining == pytest.approx(whole.remaining, rel=1e-9)
+    assert parts.shape == pytest.approx(whole.shape, rel=1e-9)
 
 
 def test_a_vertex_without_a_corner_stays_straight() -> None:

@@ -14,6 +14,8 @@ from tests.models.paths.task_paths import product, random_path, seeds, turned
 
 few = settings(max_examples=40)
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
+
 
 def between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation vector in world that leads from one quaternion to the other, rows."""
@@ -27,7 +29,7 @@ def between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
 @given(seeds, st.integers(1, 6))
 def test_rates_are_those_of_the_quaternion(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    path = smooth(random_path(rng, count, turns=True), 0.08)
+    path = smooth(random_path(rng, count, turns=True, helices=0.2), 0.08)
     s = path.bounds[:-1] + rng.uniform(0.05, 0.95, len(path.piece_lengths)) * path.piece_lengths
     h = 1e-5 * path.piece_lengths
     before, here, after = (path.turn(s + k * h) for k in (-1, 0, 1))
@@ -44,7 +46,7 @@ def test_rates_are_those_of_the_quaternion(seed: int, count: int) -> None:
 @few
 @given(seeds, st.integers(2, 6))
 def test_orientation_rate_and_acceleration_are_continuous_through_blends(seed: int, count: int) -> None:
-    path = smooth(random_path(np.random.default_rng(seed), count, turns=True), 0.08)
+    path = smooth(random_path(np.random.default_rng(seed), count, turns=True, helices=0.2), 0.08)
     at, step = path.bounds[1:-1], 1e-10 * path.length
     before, after = path.turn(at - step), path.turn(at + step)
     for order in range(3):

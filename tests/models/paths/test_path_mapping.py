@@ -20,6 +20,7 @@ from ocp.schedule import LineLimits, SpeedProfile, peak_acceleration, schedule
 from tests.models.paths.task_paths import random_path
 from tests.models.paths.test_paths import example
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 MM = 1e-3
 
 
@@ -152,7 +153,9 @@ def test_a_degree_that_no_blend_has_is_a_named_error() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_the_path_as_a_function_is_the_path(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    path = smooth(random_path(rng, 1 + 2 * seed, turns=True), 0.05, kind="cubic" if seed % 2 else "quintic")
+    path = smooth(
+        random_path(rng, 1 + 2 * seed, turns=True, helices=0.3), 0.05, kind="cubic" if seed % 2 else "quintic"
+    )
     s = np.concatenate([path.bounds, rng.uniform(0, path.length, 100)])
     for function, expected in ((path_function(path), path.at(s)), (turn_function(path), path.turn(s))):
         for value, known in zip(function.map(len(s))(s[None]), expected, strict=True):
@@ -164,7 +167,7 @@ def test_the_path_as_a_function_is_the_path(seed: int) -> None:
 
 
 def test_geometry_mappings_and_time_generate_c_that_agrees(tmp_path: File) -> None:
-    path = smooth(random_path(np.random.default_rng(4), 4, turns=True), 0.05)
+    path = smooth(random_path(np.random.default_rng(4), 4, turns=True, helices=0.3), 0.05)
     plan = schedule(path, LineLimits(0.5, 5.0, 200.0, centripetal=2.0))
     blend = path.blend(0)
     step = [0.01 * blend.length] * 2

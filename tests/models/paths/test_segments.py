@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import Arc, Line, ModelError, Path, smooth
+from models import Arc, Helix, Line, ModelError, Path, smooth
 from tests.models.paths.task_paths import seeds, turned
 
 
@@ -62,6 +62,80 @@ def test_an_arc_about_a_center_turns_by_its_sweep(seed: int, share: float) -> No
     assert arc.length == pytest.approx(abs(sweep) * np.linalg.norm(across), rel=1e-14)
 
 
+def frenet(helix: Helix, angle: Any) -> Any:
+    """Points of a helix from its definition: round the axis by an angle, up by its share of the rise. Shape (M, 3)."""
+    unit = np.asarray(helix.axis)
+    across = np.asarray(helix.start) - np.asarray(helix.center)
+    a = np.asarray(angle)[:, None]
+    round_it = across * np.cos(a) + np.cross(unit, across) * np.sin(a)  # Rodrigues
+    return np.asarray(helix.center) + round_it + unit * helix.rise * a / helix.sweep
+
+
+def random_helix(seed: int, share: float) -> Helix:
+    rng = np.random.default_rng(seed)
+    center, axis = rng.normal(size=3), rng.normal(size=3)
+    across = np.cross(axis, rng.normal(size=3))
+    return Helix(center + across, center, axis, 10 ** rng.uniform(-2, 2), share * 10 ** rng.uniform(-2, 1))
+
+
+@given(seeds, st.floats(-1, 1))
+def test_a_helix_is_the_curve_of_its_definition_by_its_length(seed: int, share: float) -> None:
+    helix = random_helix(seed, share)
+    radius, turned_by = helix.radius, np.linspace(0, 1, 33)
+    assert helix.length == pytest.approx(np.sqrt((radius * helix.sweep) ** 2 + helix.rise**2), rel=1e-14)
+    path = Path((helix,))
+    position, tangent, bend, change = path.at(np.zeros(33, dtype=int), helix.length * turned_by)
+    assert position == pytest.approx(frenet(helix, helix.sweep * turned_by), abs=1e-11 * (1 + helix.length))
+    assert helix.end == pytest.approx(position[-1], abs=1e-12 * (1 + helix.length))
+    # Frenet: |T| = 1, |T'| = k, (T x T') . T'' = k^2 w
+    pitch = helix.rise / helix.sweep
+    curvature, torsion = (each / (radius**2 + pitch**2) for each in (radius, pitch))
+    assert np.linalg.norm(tangent, axis=1) == pytest.approx(1, rel=1e-12)
+    assert np.linalg.norm(bend, axis=1) == pytest.approx(curvature, rel=1e-12)
+    triple = np.einsum("mi,mi->m", np.cross(tangent, bend), change)
+    assert triple == pytest.approx(curvature**2 * torsion, abs=1e-10 * curvature**2 * (curvature + abs(torsion)))
+    assert (helix.curvature, helix.torsion) == pytest.approx((curvature, torsion), rel=1e-12)
+
+
+@given(seeds)
+def test_derivatives_of_a_helix_are_those_of_its_position(seed: int) -> None:
+    helix = random_helix(seed, 0.8)
+    path, index = Path((helix,)), np.zeros(5, dtype=int)
+    h = 1e-4 / np.hypot(helix.curvature, helix.torsion)
+    s = np.linspace(h, max(helix.length - h, h), 5)
+    before, here, after = (path.at(index, s + k * h) for k in (-1, 0, 1))
+    for order in range(3):
+        scale = np.abs(here[order + 1]).max() + np.abs(here[order]).max() * 1e-9 / h
+        assert (after[order] - before[order]) / (2 * h) == pytest.approx(here[order + 1], abs=2e-6 * scale)
+
+
+@given(seeds, st.floats(0.01, 1))
+def test_a_helix_without_a_rise_is_an_arc_and_turns_on(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    center, axis = rng.normal(size=3), rng.normal(size=3)
+    start = center + np.cross(axis, rng.normal(size=3))
+    arc, flat = Arc.about(start, center, axis, share * 2 * np.pi), Helix(start, center, axis, share * 2 * np.pi, 0.0)
+    twice = Helix(start, center, axis, (share + 1) * 2 * np.pi, 0.0)
+    places = np.linspace(0, arc.length, 11)
+    for one, other in zip(*(Path((s,)).at(np.zeros(11, dtype=int), places) for s in (arc, flat)), strict=True):
+        assert other == pytest.approx(one, abs=1e-12 * max(1.0, float(np.abs(one).max())))
+    assert twice.end == pytest.approx(arc.end, abs=1e-12)
+    assert twice.length == pytest.approx(arc.length + 2 * np.pi * arc.radius)
+
+
+def test_a_helix_joins_its_neighbours_and_is_rounded() -> None:
+    """A thread milled: in by a line, down by three turns and a quarter, out by another line."""
+    down = Helix((0.01, 0, 0), (0, 0, 0), (0, 0, 1), 6.5 * np.pi, -0.004)
+    path = Path((Line((0.01, -0.02, 0), (0.01, 0, 0)), down, Line((0, 0.01, -0.004), (-0.02, 0.01, -0.004))))
+    smoothed = smooth(path, deviation=2e-5)
+    first, last = smoothed.bounds[2:4]
+    inside = smoothed.at(np.linspace(first, last, 1001)).position
+    assert np.hypot(inside[:, 0], inside[:, 1]) == pytest.approx(0.01, abs=1e-12)
+    angle = np.unwrap(np.arctan2(inside[:, 1], inside[:, 0]))
+    assert inside[:, 2] == pytest.approx(-0.004 * angle / (6.5 * np.pi), abs=1e-12)
+    assert smoothed.curvature_jumps().max() < 1e-9
+
+
 def test_a_full_circle_closes_and_joins_its_neighbours() -> None:
     circle = Arc.about((1.0, 0.0, 0.0), (1.0, 0.3, 0.0), (0.0, 0.0, 1.0), 2 * np.pi)
     assert circle.end == pytest.approx([1.0, 0.0, 0.0], abs=1e-15)
@@ -104,6 +178,12 @@ TILTED = turned((1.0, 0, 0))
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 0.0), "sweep 0"),
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 7.0), "sweep 7"),
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), NAN), "not finite"),
+        (lambda: Helix((1, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 0.1), "helix: .* radius"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 0), 1.0, 0.1), "helix: .* no direction"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0.1), (0, 0, 1), 1.0, 0.1), "helix: .* perpendicular"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), -1.0, 0.1), "sweep -1.0 rad is not positive"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1e-10, 0.0), "drop it"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1.0, NAN), "rise nan"),
         (lambda: Path(()), "no segment"),
         (lambda: Path(3), "no sequence"),  # type: ignore[arg-type]
         (lambda: Path(("line",)), "segment 0"),  # type: ignore[arg-type]

@@ -30,6 +30,7 @@ from ocp.schedule.grid import make_grid
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 NAN = float("nan")
 LIMITS = LineLimits(1.0, 5.0, 200.0)
 

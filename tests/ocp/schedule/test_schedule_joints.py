@@ -40,6 +40,7 @@ from tests.models.paths.task_paths import random_arm_path, seeds
 from tests.models.paths.test_paths import example
 from tests.ocp.problems import Array
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 ARM = Scara(0.4, 0.4)
 SLOW = JointLimits([3.0, 3.0, 1.0, 6.0], [15.0, 15.0, 5.0, 30.0], [300.0, 300.0, 200.0, 800.0])
 FREE = LineLimits(1.0, 5.0, 200.0)

@@ -1,0 +1,60 @@
+"""Text files line by line, and the error that names a line of one."""
+
+from __future__ import annotations
+
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+from ocp.errors import ProblemError
+
+__all__ = ["LARGEST_FILE", "MOST_LINES", "FileName", "read_lines", "wrong_line"]
+
+FileName = str | PathLike[str]
+LARGEST_FILE = 32 * 2**20
+"""Bytes."""
+MOST_LINES, LONGEST_LINE = 500_000, 10_000
+"""A path takes 1 or 2 kB a line."""
+LONGEST_SHOWN = 120  # characters of a line in a message
+
+
+def read_lines(file: FileName) -> list[str]:
+    """The lines of a text file, of any line ends, without a byte order mark; what is no UTF-8 is read as Latin-1.
+
+    Raises:
+        ProblemError: No file name, a file that cannot be read, an empty one, one or a line that is too long, bytes.
+    """
+    if not isinstance(file, str | PathLike) or not isinstance(fspath(file), str) or not fspath(file):
+        raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
+    path = Path(file)
+    try:
+        with path.open("rb") as stream:
+            raw = stream.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        raise ProblemError(f"{path}: cannot be read: {error}", name="file", value=str(path)) from error
+    if len(raw) > LARGEST_FILE:
+        message = f"{path}: longer than {LARGEST_FILE // 2**20} MB; split it"
+        raise ProblemError(message, name="file", value=str(path), limit=LARGEST_FILE)
+    if b"\0" in raw:
+        raise ProblemError(f"{path}: holds zero bytes, it is no text of UTF-8", name="file", value=str(path))
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("latin-1")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if len(lines) > MOST_LINES:
+        message = f"{path}: {len(lines)} lines, at most {MOST_LINES} are read; split it"
+        raise ProblemError(message, name="file", value=len(lines), limit=MOST_LINES)
+    if (longest := max(len(line) for line in lines)) > LONGEST_LINE:
+        i = next(i for i, line in enumerate(lines) if len(line) == longest)
+        raise wrong_line(path, i + 1, lines[i], f"longer than {LONGEST_LINE} characters; break it", LONGEST_LINE)
+    if not text.strip():
+        raise ProblemError(f"{path}: the file is empty", name="file", value=str(path))
+    return lines
+
+
+def wrong_line(file: Any, number: int, text: str, why: str, limit: Any = None) -> ProblemError:
+    """The error of a line, which is counted from 1: what it says, what is wrong and what to do."""
+    shown = text.strip()
+    shown = shown if len(shown) <= LONGEST_SHOWN else shown[:LONGEST_SHOWN] + " ..."
+    return ProblemError(f"{file}, line {number}, {shown!r}: {why}", name=f"line {number}", value=shown, limit=limit)

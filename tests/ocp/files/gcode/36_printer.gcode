@@ -1,0 +1,13 @@
+; extrusion is not our business
+M104 S200
+G21
+G90
+M82
+G28 ; home
+G1 Z0.2 F1200
+G1 X10 Y0 E0.41 F1800
+G1 X10 Y10 E0.82
+G0 X0 Y0 F6000 ; travel
+G1 X5 Y5 E1.1*57
+M107
+M30

@@ -1,0 +1,5 @@
+(refused: line 4: less than half the way)
+G21
+G1 X1 F100
+G2 X21 Y0 R8
+M2
