@@ -3,6 +3,7 @@
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate
 from ocp.builders.cts import roll_problem, spline_targets
+from ocp.builders.joint_spline import joint_path
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.builders.standing.plan import plan_standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
@@ -52,6 +53,7 @@ __all__ = [
     "Weights",
     "certificate",
     "inverse_kinematics",
+    "joint_path",
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan_minimum_time",

@@ -28,6 +28,7 @@ MADE_BY_THE_PACKAGE = {
     "Frame",
     "JointPath",
     "JointRates",
+    "TorqueRates",
     "LineMotion",
     "Machine",
     "Note",

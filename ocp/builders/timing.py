@@ -35,8 +35,7 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_count, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
-from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line, check_smooth
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, SpeedProfile, advanced
 from ocp.solution import Solution
@@ -204,7 +203,7 @@ def minimum_time_problem(
     path_columns(path, limits, limited, path.dense())  # refuses what is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
-        make_grid(path, limits, limited)  # refuses what no motion keeps, as a schedule does
+        check_smooth(path, limits, limited)  # refuses what no motion keeps, as a schedule does
     whole = reference.duration
     phases = np.diff(reference.t)
     span = (min(phases[0], whole / intervals), whole - min(phases[-1], whole / intervals))

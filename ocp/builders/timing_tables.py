@@ -17,16 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.schedule.grid import make_grid
-from ocp.schedule.limits import (
-    JointPath,
-    LineLimits,
-    PathLike,
-    curvature_along,
-    joint_demands,
-    line_demands,
-    rates_along,
-)
+from ocp.schedule.limits import JointPath, JointRates, LineLimits, PathLike, check_smooth, curvature_along, rates_along
 from ocp.schedule.planner import schedule
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
 
@@ -134,8 +125,38 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
     rows += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
     if rates is not None:
         velocities = steady[1:][power[1:] == 1]
-        rows += [*(velocities * motion.speed), *joint_demands(limits, rates, motion)[0]]
+        rows += [*(velocities * motion.speed), *joint_demands(limits, rates, motion)]
     return np.asarray(np.max(rows, axis=0))
+
+
+def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
+    """Demand over limit at unit, steady line speed, and the power of the speed it grows with.
+
+    Of centripetal acceleration, then of velocity, acceleration and jerk of each joint: v^p demand <= 1. Shape (C, M)
+    and (C,).
+    """
+    count = 0 if rates is None else len(rates.first)
+    rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
+    powers = [2.0]
+    if rates is not None:
+        number = rates.first.shape[1]
+        bounds = limits.of_joints(number)
+        for order, derivative in enumerate((rates.first, rates.second, rates.third)):
+            rows.append(np.abs(derivative.T) / bounds[order][:, None])
+            powers += [order + 1.0] * number
+    return np.concatenate(rows), np.array(powers)
+
+
+def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> Array:
+    """Joint acceleration and jerk over their limits during a motion: q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
+
+    Shape (2 n, M).
+    """
+    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
+    _, most, jerks = limits.of_joints(rates.first.shape[1])
+    accelerations = (rates.second * v**2 + rates.first * a) / most
+    jerk = (rates.third * v**3 + 3 * rates.second * v * a + rates.first * j) / jerks
+    return np.asarray(np.abs(np.concatenate([accelerations.T, jerk.T])))
 
 
 def demand_of_pieces(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
@@ -158,7 +179,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
-        make_grid(path, limits, joints)  # what no motion keeps is refused here
+        check_smooth(path, limits, joints)  # what no motion keeps is refused here
     quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
     # slower by a factor in time: velocities shrink with it, accelerations with its square, jerks with its cube
     fractions = np.linspace(0, 1, 2001)
@@ -167,7 +188,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
     steady, power = line_demands(limits, np.asarray(path.curvature(motion.distance)), rates)
     slower = [(steady[power == 1] * motion.speed).max(initial=1.0), np.sqrt(steady[0] * motion.speed**2).max()]
     if joints is not None and rates is not None:
-        whole = joint_demands(limits, rates, motion)[0]
+        whole = joint_demands(limits, rates, motion)
         count = len(joints.names)
         slower += [np.sqrt(whole[:count]).max(), np.cbrt(whole[count:]).max()]
     c = 1.05 * float(max(slower))

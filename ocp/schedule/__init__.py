@@ -1,6 +1,6 @@
 """Time schedules: jerk-limited line speed along a path, at the asked speed wherever the limits allow it."""
 
-from ocp.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike
+from ocp.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike, ToolLimits, TorqueRates
 from ocp.schedule.planner import Dip, Schedule, schedule
 from ocp.schedule.profile import LineMotion, SpeedProfile
 from ocp.schedule.ramps import peak_acceleration, ramp_distance, ramp_time
@@ -17,6 +17,8 @@ __all__ = [
     "PathLike",
     "Schedule",
     "SpeedProfile",
+    "ToolLimits",
+    "TorqueRates",
     "joint_motion",
     "joint_trajectory",
     "peak_acceleration",

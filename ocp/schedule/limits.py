@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, floats
-from ocp.schedule.profile import Array, LineMotion
+from ocp.schedule.profile import Array
 
 __all__ = [
     "JointLimits",
@@ -18,13 +18,15 @@ __all__ = [
     "JointRates",
     "LineLimits",
     "PathLike",
-    "cause_names",
+    "ToolLimits",
+    "TorqueRates",
     "check_joints",
     "check_line",
+    "check_smooth",
     "curvature_along",
-    "joint_demands",
-    "line_demands",
     "rates_along",
+    "tool_along",
+    "torques_along",
 ]
 
 
@@ -54,8 +56,22 @@ class JointRates(Protocol):
     def third(self) -> Array: ...
 
 
+class TorqueRates(Protocol):
+    """Joint torques along a path as a linear form of the line's motion: inertia a + drag v^2 + rest. Shape (M, n)."""
+
+    @property
+    def inertia(self) -> Array: ...
+    @property
+    def drag(self) -> Array: ...
+    @property
+    def rest(self) -> Array: ...
+
+
 class JointPath(Protocol):
-    """Joints as a function of the distance: models.machines.scara_path.ScaraPath is one."""
+    """Joints as a function of the distance: models.scara_along and ocp.joint_path make one.
+
+    Where torques are limited it has `torques(distance) -> TorqueRates` too.
+    """
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -64,7 +80,9 @@ class JointPath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Greatest joint velocities (rad/s or m/s), accelerations and jerks, symmetric. Shape (n,) or one for all.
+    """Greatest joint velocities (rad/s or m/s), accelerations, jerks and torques (Nm or N), symmetric.
+
+    Each of shape (n,), or one for all.
 
     Raises:
         ProblemError: A limit that is not positive; it may be infinite.
@@ -73,10 +91,37 @@ class JointLimits:
     velocity: ArrayLike = np.inf
     acceleration: ArrayLike = np.inf
     jerk: ArrayLike = np.inf
+    torque: ArrayLike = np.inf
 
     def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration", "jerk"):
+        for name in ("velocity", "acceleration", "jerk", "torque"):
             _check(f"joint {name}", getattr(self, name), False)
+
+
+@dataclass(frozen=True, eq=False)
+class ToolLimits:
+    """Greatest acceleration (m/s^2) and jerk (m/s^3) of the tool along each axis of the world, and its turn rate.
+
+    Attributes:
+        acceleration, jerk: Symmetric. Shape (3,), or one for all axes.
+        turn_rate: Greatest angular speed, rad/s.
+
+    Raises:
+        ProblemError: A limit that is not positive; it may be infinite.
+    """
+
+    acceleration: ArrayLike = np.inf
+    jerk: ArrayLike = np.inf
+    turn_rate: float = np.inf
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "jerk"):
+            value = getattr(self, name)
+            _check(f"tool {name}", value, False)
+            if np.ndim(value) and np.shape(value) != (3,):
+                message = f"tool {name} limit has shape {np.shape(value)}; give one number, or one for each axis"
+                raise ProblemError(message, name=f"tool {name}", value=np.shape(value), limit=(3,))
+        _check("tool turn_rate", self.turn_rate, False, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +131,10 @@ class LineLimits:
     Attributes:
         speed: Asked line speed, m/s: one, or one for each segment of the task.
         acceleration: Of the line speed, peak, m/s^2. See `peak_acceleration` for a mean one.
-        jerk: Of the line speed, m/s^3.
+        jerk: Of the line speed, m/s^3; infinite for none, and the acceleration may then jump.
         centripetal: Greatest speed^2 x curvature, m/s^2.
         joints: Of the joints, or None.
+        tool: Of the tool, or None.
 
     Raises:
         ProblemError: A limit that is not positive, nan, or not finite where it must be.
@@ -99,18 +145,27 @@ class LineLimits:
     jerk: float
     centripetal: float = np.inf
     joints: JointLimits | None = None
+    tool: ToolLimits | None = None
 
     def __post_init__(self) -> None:
-        for name, finite in (("speed", True), ("acceleration", True), ("jerk", True), ("centripetal", False)):
+        for name, finite in (("speed", True), ("acceleration", True), ("jerk", False), ("centripetal", False)):
             _check(name, getattr(self, name), finite, 1 if name == "speed" else 0)
-        if self.joints is not None:
-            checked_instance("joint limits", self.joints, JointLimits)
+        for name, kind in (("joints", JointLimits), ("tool", ToolLimits)):
+            if getattr(self, name) is not None:
+                checked_instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
         """Velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
+        return self._of_joints(count, ("velocity", "acceleration", "jerk"))
+
+    def torques(self, count: int) -> Array:
+        """Torque limits of `count` joints. Shape (count,)."""
+        return np.asarray(self._of_joints(count, ("torque",))[0])
+
+    def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
         given = self.joints or JointLimits()
         rows = []
-        for name in ("velocity", "acceleration", "jerk"):
+        for name in names:
             value = np.asarray(getattr(given, name), dtype=float)
             if value.ndim and value.shape != (count,):
                 message = f"joint {name} limits have shape {value.shape}; the arm has {count} joints"
@@ -203,38 +258,51 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
     return value
 
 
-def cause_names(joint_names: Sequence[str]) -> tuple[str, ...]:
-    """What may bind: the rows of line_demands and joint_demands."""
-    of_joints = [f"joint {name!r} {kind}" for kind in ("velocity", "acceleration", "jerk") for name in joint_names]
-    return ("centripetal acceleration", *of_joints)
+def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
+    """Torques at distances (M,), checked.
 
-
-def line_demands(
-    limits: LineLimits, curvature: Array | None, rates: JointRates | None
-) -> tuple[Array, NDArray[np.float64]]:
-    """Demand over limit at unit, steady line speed, and the power of the speed it grows with.
-
-    Shape (C, M) and (C,), the rows being those of cause_names: v^p demand <= 1 is the limit of a steady line speed v.
+    Raises:
+        ProblemError: Joints that know no torques, shapes that are not (M, n), a value that is not finite.
     """
-    count = 0 if rates is None else len(rates.first)
-    rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
-    powers = [2.0]
-    if rates is not None:
-        number = rates.first.shape[1]
-        bounds = limits.of_joints(number)
-        for order, derivative in enumerate((rates.first, rates.second, rates.third)):
-            rows.append(np.abs(derivative.T) / bounds[order][:, None])
-            powers += [order + 1.0] * number
-    return np.concatenate(rows), np.array(powers)
+    if not callable(getattr(joints, "torques", None)):
+        message = "torque limits need joints with torques: joints=joint_path(machine, plan)"
+        raise ProblemError(message, name="joint torque", value=joints)
+    found: TorqueRates = joints.torques(distance)  # type: ignore[attr-defined]
+    shape = (len(distance), len(joints.names))
+    for kind in ("inertia", "drag", "rest"):
+        value = np.asarray(getattr(found, kind), dtype=float)
+        if value.shape != shape or not np.isfinite(value).all():
+            message = f"torques along the path: {kind} must be finite and of shape {shape}, it has {value.shape}"
+            raise ProblemError(message, name=kind, value=value.shape, limit=shape)
+    return found
 
 
-def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> tuple[Array, Array]:
-    """Joint acceleration and jerk over their limits during a motion, and the part of it that a steady speed has.
+def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
+    """Tangent, curvature vector, its rate, and the turn rate at unit speed, at distances (M,). Shape (M, 3) each."""
+    missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
+    if missing:
+        message = f"tool limits need a path with places and turns, as models.smooth makes it; it has no {missing[0]}"
+        raise ProblemError(message, name="path", value=path)
+    place, turn = path.at(distance), path.turn(distance)  # type: ignore[attr-defined]
+    return place.tangent, place.curvature, place.curvature_rate, turn.rate
 
-    q'' v^2 + q' a, and q''' v^3 + 3 q'' v a + q' j. Shape (2 n, M) each.
+
+def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
+    """Refuse jerk limits of joints or tool on a path whose curvature jumps.
+
+    Raises:
+        ProblemError: Where it jumps most.
     """
-    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
-    _, most, jerks = limits.of_joints(rates.first.shape[1])
-    steady = [rates.second * v**2 / most, rates.third * v**3 / jerks]
-    whole = [steady[0] + rates.first * a / most, steady[1] + (3 * rates.second * v * a + rates.first * j) / jerks]
-    return np.abs(np.concatenate([x.T for x in whole])), np.abs(np.concatenate([x.T for x in steady]))
+    of_joints = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
+    of_tool = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
+    jumps = path.curvature_jumps() if of_joints or of_tool else np.zeros(0)
+    if not jumps.size:
+        return
+    at = int(jumps.argmax())
+    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
+        place, jump, whose = float(path.bounds[at + 1]), float(jumps[at]), "joint" if of_joints else "tool"
+        message = (
+            f"a {whose} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
+            f"{jump:.3g} /m and the {whose} accelerations with it; round the corners with kind='quintic'"
+        )
+        raise ProblemError(message, name="curvature", value=jump, time=place)

@@ -11,12 +11,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_flag, checked_positive
-from ocp.schedule.grid import make_grid
-from ocp.schedule.joints import KEPT, Attempt, search
-from ocp.schedule.limits import JointPath, LineLimits, PathLike, cause_names, check_line
-from ocp.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
+from ocp.schedule.grid import Grid, make_grid, nodes_only
+from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
+from ocp.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
+from ocp.schedule.ramps import Zones, plan, ramp_distance
+from ocp.schedule.rows import causes
+from ocp.schedule.stretch import Stretch, fastest_over
+from ocp.schedule.zones import ramps_below_the_curve
 
 __all__ = ["Dip", "Schedule", "schedule"]
+
+KEPT = 1e-9
+"""Limits count as kept, and speeds as reached, up to this, relative."""
+BINDING = 0.98
+"""A limit binds where more than this share of it is used."""
+REACHED = 1e-4
+"""A speed that lies below the asked one by less than this share is no dip."""
+LONG = 400
+"""Pieces of a path from which on, where centripetal acceleration alone is limited, ramps are taken."""
+LEAVING = 1e-5
+"""Share of the asked speed that a motion may lie below it near the ends of a stretch, when that is long enough."""
 
 
 @dataclass(frozen=True)
@@ -26,23 +40,26 @@ class Dip:
     Attributes:
         start, end: Distances along the path, m.
         cause: The limit that binds, for example "centripetal acceleration" or "joint 'elbow' velocity".
-        asked, speed: Asked line speed and lowest one permitted there, m/s.
-        acceleration, jerk: Of the line speed, permitted there, m/s^2 and m/s^3; below the limits where a ramp would
-            break a joint limit.
+        asked, permitted: Asked line speed and the lowest steady one that the limits permit there, m/s: the same where
+            the limit binds on a ramp alone.
+        speed: Lowest line speed of the schedule there, m/s.
+        acceleration, jerk: Of the line speed, largest there, m/s^2 and m/s^3.
     """
 
     start: float
     end: float
     cause: str
     asked: float
+    permitted: float
     speed: float
     acceleration: float
     jerk: float
 
     def __str__(self) -> str:
-        slow = f"permits {self.speed:.4g} of {self.asked:.4g} m/s" if self.speed < self.asked else "binds on a ramp"
+        slow = self.permitted < self.asked
+        amount = f"permits {self.permitted:.4g} of {self.asked:.4g} m/s" if slow else "binds on a ramp"
         return (
-            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {slow}, "
+            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {amount}, "
             f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
         )
 
@@ -95,12 +112,12 @@ class Schedule:
 
 @interruptible
 def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
-    """Plan the line speed along a path from rest to rest.
+    """Plan the line speed along a path from rest to rest, in the least time that the limits allow.
 
     One jerk-limited motion if nothing but speed, acceleration and jerk binds; the speed is then constant at the asked
-    one, through the blends as well, between its ramps. Where a steady speed breaks a limit, a stretch gets the speed
-    that keeps it; where a ramp breaks a joint limit, it gets a gentler one. All limits hold on a grid that resolves
-    them to 0.1 %.
+    one, through the blends as well, between its ramps. Where that breaks another limit, the stretch about the place is
+    planned anew under all of them: by exact passes where no jerk is limited, else by convex programs. All limits hold
+    between the nodes too, to 0.1 %. A long path without limits of joints or tool is slowed by ramps.
 
     Args:
         path: A models.paths.SmoothPath, or whatever has what PathLike says.
@@ -110,66 +127,184 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
     Raises:
         ProblemError: Joint limits without joints, or a limit that would be broken at the asked speed, if strict;
-            limits that no schedule keeps.
+            limits that no motion keeps.
     """
     limited = check_line(path, limits, joints)
     checked_flag("strict", strict)
-    grid = make_grid(path, limits, limited)
-    found = search(grid, limits, limited)
-    dips = _dips(found, limits, cause_names(limited.names if limited is not None else ()))
+    base = _by_ramps(path, limits) if np.isfinite(limits.jerk) else None
+    more = limited is not None or limits.tool is not None or np.isfinite(limits.centripetal)
+    if base is not None and not more:
+        return Schedule(path, limits, base, (), joints)
+    if base is not None and limited is None and limits.tool is None and len(path.bounds) > LONG:
+        profile = ramps_below_the_curve(path, limits)
+        grid = nodes_only(path, limits)
+    else:
+        grid = make_grid(path, limits, limited)
+        profile = _planned(path, limits, limited, grid, base)
+    dips = () if profile is base else _dips(grid, profile, causes(limits, limited))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
         hint, one = "ask for less, larger blends, or strict=False", dips[0]
         message = f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}"
-        raise ProblemError(message, name=one.cause, value=one.asked, limit=one.speed, time=one.start)
-    return Schedule(path, limits, found.profile, dips, joints)
+        raise ProblemError(message, name=one.cause, value=one.asked, limit=one.permitted, time=one.start)
+    return Schedule(path, limits, profile, dips, joints)
 
 
-def _dips(state: Attempt, limits: LineLimits, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    grid, cause = state.grid, _causes(state, limits)
-    dips = []
-    for first, last in pairwise(np.flatnonzero(np.diff(cause, prepend=-1, append=-1)).tolist()):
-        if cause[first] < 0:
-            continue
-        inside = slice(first, last)
-        lowest = first + int((state.speed[inside] / grid.asked[inside]).argmin())
-        ends = (float(grid.distance[first]), float(grid.distance[last]))
-        speeds = (float(grid.asked[lowest]), float(state.speed[lowest]))
-        ramp = (float(state.acceleration[inside].min()), float(state.jerk[inside].min()))
-        dips.append(Dip(*ends, names[int(cause[first])], *speeds, *ramp))
-    return tuple(_joined(dips, state))
+def _by_ramps(path: PathLike, limits: LineLimits) -> SpeedProfile:
+    """The motion that keeps speed, acceleration and jerk of the line."""
+    asked, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
+    first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(asked))])
+    same = np.ones(len(first))
+    zones = Zones(bounds[np.append(first, len(asked))], asked[first], limits.acceleration * same, limits.jerk * same)
+    return plan(zones, {})
 
 
-def _causes(state: Attempt, limits: LineLimits) -> NDArray[np.intp]:
-    """Row of cause_names that slows each interval of the grid, -1 where nothing does. Shape (G - 1,)."""
-    grid, speed = state.grid, state.speed
-    gentle = state.acceleration < limits.acceleration * (1 - KEPT)
-    gentle |= state.jerk < limits.jerk * (1 - KEPT)
-    cause = np.where(gentle, state.ramp_cause, -1)
-    slow = speed < grid.asked * (1 - KEPT)
-    # where one speed holds, the slowest place says why
-    starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed)), [len(speed)]])
-    for first, last in pairwise(starts.tolist()):
-        if slow[first:last].any():
-            lowest = first + int(grid.permitted[first : last + 1].argmin())
-            for_ramp = (state.ramp_cause[first:last] >= 0) & (speed[first] < grid.permitted[lowest] * (1 - KEPT))
-            cause[first:last] = np.where(for_ramp, state.ramp_cause[first:last], grid.cause[lowest])
-    return cause
+def _planned(
+    path: PathLike, limits: LineLimits, joints: JointPath | None, grid: Grid, base: SpeedProfile | None
+) -> SpeedProfile:
+    """The base motion where it keeps all limits, the fastest motion elsewhere."""
+    count = len(grid.asked)
+    if base is None:
+        return fastest_over(Stretch(path, limits, joints, grid, 0, count))
+    broken = _broken(grid, base)
+    if not broken.any():
+        return base
+    s, reach = grid.distance, 1.0
+    while True:
+        stretches = _stretches(grid, base, broken, limits, reach)
+        found = []
+        for first, last in stretches:
+            ends = [(0.0 if k in (0, count) else float(grid.asked[k]) ** 2, 0.0) for k in (first, last)]
+            try:
+                motion = fastest_over(Stretch(path, limits, joints, grid, first, last, (ends[0], ends[1])))
+            except ProblemError:
+                if (first, last) == (0, count):
+                    raise
+                break  # too short to change the speed in
+            if not _long_enough(grid, motion, first, last):
+                break
+            found.append(motion)
+        if len(found) == len(stretches):
+            break
+        reach *= 2
+    parts: list[SpeedProfile] = []
+    passed = 0.0
+    for (first, last), motion in zip(stretches, found, strict=True):
+        if s[first] > passed:
+            parts.append(_cut(base, passed, float(s[first])))
+        parts.append(motion)
+        passed = float(s[last])
+    if passed < path.length:
+        parts.append(_cut(base, passed, path.length))
+    return joined(parts)
 
 
-def _joined(dips: list[Dip], state: Attempt) -> list[Dip]:
-    """Dips of one cause between which the schedule never gets back to the asked speed are one."""
-    peaks, grid = state.profile.peaks(), state.grid
-    order = np.argsort(peaks.distance)
-    places = peaks.distance[order]
-    back = peaks.speed[order] >= grid.asked[piece_of(grid.distance, places)] * (1 - KEPT)
-    joined: list[Dip] = []
-    for dip in dips:
-        last = joined[-1] if joined else dip
-        between = slice(*np.searchsorted(places, [last.end, dip.start]))
-        if joined and (last.cause, last.asked) == (dip.cause, dip.asked) and not back[between].any():
-            least = (min(getattr(last, kind), getattr(dip, kind)) for kind in ("speed", "acceleration", "jerk"))
-            joined[-1] = Dip(last.start, dip.end, dip.cause, dip.asked, *least)
+def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
+    """Intervals of the grid in which a motion breaks a limit. Shape (N,)."""
+    here = base.at_distance(grid.distance)
+    left, right = grid.ends()
+    motion = LineMotion(*(value[:-1] for value in here)), LineMotion(*(value[1:] for value in here))
+    over = np.maximum(left.demands(motion[0]).max(axis=1), right.demands(motion[1]).max(axis=1)) > 1 + KEPT
+    # inside an interval the jerk may change, and the speed be larger
+    turns = base.at(np.concatenate([base.t, np.maximum(base.t[1:] - 1e-12 * base.duration, 0.0), base.peaks().t]))
+    at = piece_of(grid.distance, turns.distance)
+    for rows in (left, right):
+        np.logical_or.at(over, at, (rows.of(at).demands(turns) > 1 + KEPT).any(axis=1))
+    return np.asarray(over)
+
+
+def _stretches(
+    grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], limits: LineLimits, reach: float
+) -> list[tuple[int, int]]:
+    """First and last nodes of the stretches to be planned anew: between them the base is steady, or the path ends.
+
+    On either side of what is broken they are `reach` times as long as a ramp to rest.
+    """
+    count, s = len(broken), grid.distance
+    here = base.at_distance(s)
+    steady = (np.abs(here.acceleration) <= KEPT * limits.acceleration) & (here.jerk == 0)
+    asked = np.minimum(np.append(grid.asked, np.inf), np.insert(grid.asked, 0, np.inf))
+    steady &= np.abs(here.speed - asked) <= KEPT * asked
+    steady[[0, -1]] = True
+    seats = np.flatnonzero(steady)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], broken.astype(np.int8), [0]]))).reshape(-1, 2)
+    found: list[tuple[int, int]] = []
+    for first, last in edges.tolist():
+        ramp = reach * ramp_distance(0.0, float(grid.asked[first:last].max()), limits.acceleration, limits.jerk)
+        low = int(np.searchsorted(s, s[first] - ramp, side="right")) - 1
+        high = int(np.searchsorted(s, s[last] + ramp))
+        begin = int(seats[np.searchsorted(seats, max(low, 0), side="right") - 1])
+        end = int(seats[np.searchsorted(seats, min(high, count))])
+        if found and begin <= found[-1][1]:
+            found[-1] = (found[-1][0], max(end, found[-1][1]))
         else:
-            joined.append(dip)
-    return joined
+            found.append((begin, end))
+    return found
+
+
+def _long_enough(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
+    """Whether a motion has not left the asked speed near those ends of its stretch that are none of the path."""
+    length = motion.distance[-1] - motion.distance[0]
+    for node, inside in ((first, first), (last, last - 1)):
+        if node in (0, len(grid.asked)):
+            continue
+        near = np.abs(motion.distance - grid.distance[node]) < 0.02 * length
+        if (motion.speed[near] < grid.asked[inside] * (1 - LEAVING)).any():
+            return False
+    return True
+
+
+def _cut(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
+    """The part of a profile between two distances."""
+    first, last = (profile.at_distance([place]) for place in (begin, end))
+    inside = (profile.t > first.t[0]) & (profile.t < last.t[0])
+    t, s, v, a = (
+        np.concatenate([[getattr(first, kind)[0]], getattr(profile, kind)[inside], [getattr(last, kind)[0]]])
+        for kind in ("t", "distance", "speed", "acceleration")
+    )
+    s[0], s[-1] = begin, end
+    if end == profile.distance[-1]:
+        v[-1], a[-1] = profile.speed[-1], profile.acceleration[-1]
+    return SpeedProfile(t - t[0], s, v, a, profile.jerk[piece_of(profile.t, (t[:-1] + t[1:]) / 2)])
+
+
+def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
+    """Where another limit than those of the line binds, while the motion stays below the asked speed."""
+    left, right = grid.ends()
+    middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
+    of_line = [k for k, name in enumerate(names) if name.startswith("line ")]
+    demand = np.maximum(left.demands(middle), right.demands(middle))
+    line = demand[:, of_line].max(axis=1, initial=0.0)
+    demand[:, of_line] = 0.0
+    cause, most = demand.argmax(axis=1), demand.max(axis=1)
+    binding = (middle.speed < grid.asked * (1 - REACHED)) & (most > BINDING) & (most >= line - (1 - BINDING))
+    permitted = np.minimum(np.minimum(left.steady()[0], right.steady()[0]), grid.asked)
+    found: list[Dip] = []
+    edges = np.flatnonzero(np.diff(np.where(binding, cause, -1), prepend=-1, append=-1))
+    for first, last in pairwise(edges.tolist()):
+        if not binding[first]:
+            continue
+        part = slice(first, last)
+        slowest = first + int((permitted[part] / grid.asked[part]).argmin())
+        name, asked = names[int(cause[first])], float(grid.asked[slowest])
+        rates = float(np.abs(middle.acceleration[part]).max()), float(np.abs(middle.jerk[part]).max())
+        place = float(grid.distance[first]), float(grid.distance[last])
+        dip = Dip(*place, name, asked, float(permitted[slowest]), float(middle.speed[part].min()), *rates)
+        before = found[-1] if found else None
+        if (
+            before
+            and (before.cause, before.asked) == (name, asked)
+            and not _back(grid, middle.speed, before.end, first)
+        ):
+            low, reached = min(before.permitted, dip.permitted), min(before.speed, dip.speed)
+            rates = max(before.acceleration, dip.acceleration), max(before.jerk, dip.jerk)
+            found[-1] = Dip(before.start, dip.end, name, asked, low, reached, *rates)
+        else:
+            found.append(dip)
+    return tuple(found)
+
+
+def _back(grid: Grid, speed: Array, end: float, first: int) -> bool:
+    """Whether the motion reaches the asked speed between a distance and an interval."""
+    between = slice(int(np.searchsorted(grid.distance, end)), first)
+    return bool((speed[between] >= grid.asked[between] * (1 - REACHED)).any())

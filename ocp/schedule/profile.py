@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 
-__all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "piece_of"]
+__all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "joined", "piece_of", "through"]
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 60
@@ -186,3 +187,43 @@ class SpeedProfile:
             moving = np.abs(new - x) > 4e-16 * np.abs(self.duration)
             todo, low, high = todo[moving], low[moving], high[moving]
         return np.asarray(t)
+
+
+def through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
+    """Pieces of constant jerk through given motions: two of one duration between neighbours, rest at an end with one.
+
+    Over a way h, T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
+
+    Args:
+        distance, speed, acceleration: At the nodes, in order; the first and last speed may be 0, and the acceleration
+            there is then that of constant jerk, 0. Shape (N + 1,).
+    """
+    h, mean = np.diff(distance), (speed[:-1] + speed[1:]) / 2
+    change = np.diff(acceleration)
+    time = 2 * h / (mean + np.sqrt(np.maximum(mean**2 - change * h / 3, 0.0)))
+    half = time / 2
+    first = (np.diff(speed) - acceleration[:-1] * time) / half**2 - 0.5 * change / half
+    second = change / half - first
+    _, middle, rate = advanced(speed[:-1], acceleration[:-1], first, half)
+    way = advanced(speed[:-1], acceleration[:-1], first, half)[0]
+    t = np.concatenate([[0.0], np.cumsum(np.repeat(half, 2))])
+
+    def both(nodes: Array, between: Array) -> Array:
+        return np.append(np.stack([nodes[:-1], between], axis=1).ravel(), nodes[-1])
+
+    jerk = np.stack([first, second], axis=1).ravel()
+    places = both(distance, distance[:-1] + way)
+    return SpeedProfile(t, places, both(speed, np.maximum(middle, 0.0)), both(acceleration, rate), jerk)
+
+
+def joined(parts: Sequence[SpeedProfile]) -> SpeedProfile:
+    """Profiles one after the other; each begins where the one before ends."""
+    if len(parts) == 1:
+        return parts[0]
+    starts = np.concatenate([[0.0], np.cumsum([part.duration for part in parts])])
+    t = np.concatenate([part.t[:-1] + start for part, start in zip(parts, starts, strict=False)] + [starts[-1:]])
+    s, v, a = (
+        np.concatenate([getattr(part, kind)[:-1] for part in parts] + [getattr(parts[-1], kind)[-1:]])
+        for kind in ("distance", "speed", "acceleration")
+    )
+    return SpeedProfile(t, s, v, a, np.concatenate([part.jerk for part in parts]))

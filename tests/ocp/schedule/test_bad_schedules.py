@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Path, Scara, scara_along, smooth
-from ocp import minimum_time_problem, plan_minimum_time
+from models import FixedBase, Joint, Link, Path, Robot, Scara, scara_along, smooth
+from ocp import joint_path, minimum_time_problem, plan_minimum_time
 from ocp.schedule import (
     JointLimits,
     JointTrajectory,
     LineLimits,
     Schedule,
     SpeedProfile,
+    ToolLimits,
     joint_motion,
     joint_trajectory,
     peak_acceleration,
@@ -44,11 +45,22 @@ from tests.bad_values import (
     panel,
 )
 
+
+def two_rods() -> Robot:
+    links = [Link("base", 1.0), Link("upper", 1.0), Link("fore", 1.0)]
+    joints = [
+        Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, (0.4 * i, 0, 0), axis=(0, 0, 1))
+        for i in (0, 1)
+    ]
+    return Robot(tuple(links), tuple(joints), tip_translation=(0.4, 0, 0))
+
+
 PATH = smooth(Path.through([(0.3, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 0.2, 0.0)]), 0.05)
 ARM = scara_along(Scara(0.4, 0.35), PATH)
 LIMITS = LineLimits(0.1, 0.5, 5.0)
 PLAN = schedule(PATH, LIMITS)
 JOINTS = joint_trajectory(PLAN, ARM, 0.1)
+SAMPLES = np.linspace(0.0, PATH.length, 20)
 EACH: Bad = LIMIT | {"table": [[1.0, 2.0]], "one of them zero": [1.0, 0.0]}
 TIMES = but(FINITE, "empty") | NOTHING | {"table": [[0.1]], "list of texts": ["1"]}
 SAMPLED = {
@@ -81,12 +93,19 @@ CASES = [
         {
             "speed": POSITIVE | NOTHING | {"table": [[1.0]], "texts": ["1"]},
             "acceleration": POSITIVE | NOTHING,
-            "jerk": POSITIVE | NOTHING,
+            "jerk": LIMIT | NOTHING,
             "centripetal": LIMIT | NOTHING,
             "joints": but(INSTANCE, "None"),
+            "tool": but(INSTANCE, "None"),
         },
     ),
-    Case("JointLimits", JointLimits, {}, dict.fromkeys(("velocity", "acceleration", "jerk"), EACH | NOTHING)),
+    Case(
+        "ToolLimits",
+        ToolLimits,
+        {},
+        dict.fromkeys(("acceleration", "jerk"), EACH | NOTHING) | {"turn_rate": LIMIT | NOTHING},
+    ),
+    Case("JointLimits", JointLimits, {}, dict.fromkeys(("velocity", "acceleration", "jerk", "torque"), EACH | NOTHING)),
     Case(
         "schedule",
         schedule,
@@ -167,6 +186,18 @@ CASES = [
                 "points are none": {"joint_names": ["a"], "points": [None]},
                 "texts": {**JOINTS.to_ros(), "joint_names": [1, 2, 3, 4]},
             }
+        },
+    ),
+    Case(
+        "joint_path",
+        joint_path,
+        {"machine": FixedBase(two_rods()), "plan": (SAMPLES, np.zeros((20, 2))), "path": PATH},
+        {
+            "machine": INSTANCE,
+            "plan": INSTANCE | {"one of them": (SAMPLES, None), "texts": (["a"], ["b"])},
+            "path": INSTANCE,
+            "samples": COUNT | NOTHING | {"few": 12},
+            "names": {"number": 3, "one": ("a",)},
         },
     ),
     Case(

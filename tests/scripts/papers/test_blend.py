@@ -162,7 +162,8 @@ def test_limits_asked_for_are_kept(run: Run[Results], summary: Summary) -> None:
     rows = {row["case"]: row for row in summary["limited"]}
     assert list(rows) == list(run.results.plans)
     for name, row in rows.items():
-        assert row["minimum_s"] <= row["duration_s"] * (1 + 1e-6), name
+        # the optimal control problem holds its jerk in intervals, which the schedule need not
+        assert row["minimum_s"] <= row["duration_s"] * (1 + 5e-3), name
         assert row["minimum_demand"] < 1.001, name
         if name.endswith("line speed"):
             # one jerk-limited motion is the time optimum
