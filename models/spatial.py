@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, floats
+from models.arrays import NOT_NUMBERS, Array, floats
 from models.errors import ModelError
 
 Expression = Any
@@ -185,6 +185,31 @@ def rotation_from_quaternion(quaternion: Expression) -> Expression:
         ca.horzcat(xy + wz, 1 - (xx + zz), yz - wx),
         ca.horzcat(xz - wy, yz + wx, 1 - (xx + yy)),
     )
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Unit quaternions [w, x, y, z], w not negative, of rotation matrices, as numbers (Shepperd 1978).
+
+    Shape (M, 3, 3) to (M, 4).
+    """
+    r = np.asarray(rotation, dtype=float)
+    trace = np.trace(r, axis1=1, axis2=2)
+    squares = np.column_stack([trace, r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]])
+    largest = squares.argmax(axis=1)  # so that nothing small is divided by
+    found = np.empty((len(r), 4))
+    for k in range(4):
+        mine = largest == k
+        m = r[mine]
+        spin = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
+        if k == 0:
+            found[mine] = np.column_stack([1 + trace[mine], spin])
+        else:
+            i = k - 1
+            row = m[:, i, :] + m[:, :, i]
+            row[:, i] = 1 + 2 * m[:, i, i] - trace[mine]
+            found[mine] = np.column_stack([spin[:, i], row])
+    found *= np.where(found[:, :1] < 0, -1.0, 1.0)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
 def quaternion_rate(quaternion: Expression, angular_velocity: Expression) -> Expression:

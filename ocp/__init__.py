@@ -18,6 +18,7 @@ from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.local.laws import Layer, Stabiliser
 from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
+from ocp.planning import Candidate, Plan, plan
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Solution
@@ -30,6 +31,7 @@ __all__ = [
     "Anywhere",
     "Audit",
     "AuditError",
+    "Candidate",
     "Certificate",
     "Collocation",
     "Finding",
@@ -42,6 +44,7 @@ __all__ = [
     "Limits",
     "MultipleShooting",
     "Pinned",
+    "Plan",
     "Problem",
     "ProblemError",
     "RefinementWarning",
@@ -56,6 +59,7 @@ __all__ = [
     "joint_path",
     "minimum_time_problem",
     "minimum_velocity_problem",
+    "plan",
     "plan_minimum_time",
     "plan_minimum_velocity",
     "plan_standing",

@@ -58,6 +58,13 @@ class PiecewisePolynomial:
         start, end = self.breaks[piece], self.breaks[piece + 1]
         return self.within(piece, np.clip((at - start) / (end - start), 0.0, 1.0))
 
+    def derivative(self) -> PiecewisePolynomial:
+        """Its derivative, by what the breaks are made of; zero where a piece has one node."""
+        if len(self.nodes) == 1:
+            return PiecewisePolynomial(self.breaks, self.nodes, np.zeros_like(self.values))
+        slopes = np.einsum("ij,kjn->kin", differentiation_matrix(self.nodes), self.values)
+        return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
+
     def within(self, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Values at ``place`` (M,) in 0..1 of pieces ``piece`` (M,), so that both sides of a break can be asked."""
         return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[piece]))

@@ -221,6 +221,14 @@ class Solution:
                 reads.
             OSError: The file cannot be written.
         """
+        write_arrays(path, self.arrays(path))
+
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """What :meth:`save` writes to a file at ``path``, by name.
+
+        Raises:
+            ProblemError: The head of the plan is larger than :meth:`load` reads.
+        """
         arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in PLAIN}
         for kind in POOLS:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
@@ -240,7 +248,7 @@ class Solution:
         if arrays["head"].nbytes > MOST_HEAD:
             words = f"{path}: the settings of the plan take more than the {MOST_HEAD:.3g} bytes that are read"
             raise ProblemError(words, name="head", value=arrays["head"].nbytes, limit=MOST_HEAD)
-        write_arrays(path, arrays)
+        return arrays
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:

@@ -9,7 +9,7 @@ import re
 import secrets
 import stat
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -18,7 +18,7 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["MOST_BYTES", "read_arrays", "write_arrays"]
+__all__ = ["MOST_BYTES", "read_arrays", "write_arrays", "write_text"]
 
 MOST_BYTES = 2**28  # of all arrays of a file, unpacked: 30 million numbers
 MOST_ENTRIES = 2**20  # bytes of an archive's table of contents
@@ -31,10 +31,7 @@ LONG = b"PK\x06\x07"
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write one compressed ``.npz`` file, whole or not at all, and see it on the disk.
-
-    A link is followed, the mode of a file that is there kept. Until it is whole the file bears a name of its own,
-    ``NAME.xxxxxxxx.part``, and is locked; one that is not locked any more, because who wrote it was killed, is removed.
+    """Write one compressed ``.npz`` file, as :func:`write_whole` does.
 
     Raises:
         ProblemError: path is no path, no file but a folder, a pipe or a device, or the arrays are larger than is read
@@ -46,6 +43,25 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     if size > MOST_BYTES:
         words = f"{path}: {size:.3g} bytes of arrays, at most {MOST_BYTES:.3g} are written"
         raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+    write_whole(path, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text in UTF-8, as :func:`write_whole` does."""
+    write_whole(path, lambda stream: stream.write(text.encode()))
+
+
+def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
+    """Write a file whole or not at all, and see it on the disk.
+
+    A link is followed, the mode of a file that is there kept. Until it is whole the file bears a name of its own,
+    ``NAME.xxxxxxxx.part``, and is locked; one that is not locked any more, because who wrote it was killed, is removed.
+
+    Raises:
+        ProblemError: path is no path, no file but a folder, a pipe or a device.
+        OSError: The file cannot be written.
+    """
+    checked_path(path)
     target = Path(os.path.realpath(path))
     mode = None
     with suppress(FileNotFoundError):
@@ -58,7 +74,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
         with stream:
             if mode is not None:
                 os.fchmod(stream.fileno(), mode)
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+            write(stream)
             stream.flush()
             os.fsync(stream.fileno())
             os.replace(stream.name, target)

@@ -14,12 +14,14 @@ from tests.models.robot.test_bad_robots import CASES as ROBOTS
 from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
 from tests.ocp.builders.test_bad_tasks import CASES as TASKS
 from tests.ocp.files.test_bad_files import CASES as FILES
+from tests.ocp.planning.test_bad_plans import CASES as PLANS
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
 
-CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS, *FILES]
+CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS]
 MADE_BY_THE_PACKAGE = {
     "Audit",
+    "Candidate",
     "Certificate",
     "Cut",
     "Dip",
@@ -33,6 +35,7 @@ MADE_BY_THE_PACKAGE = {
     "Machine",
     "Note",
     "PathLike",
+    "Plan",
     "Pause",
     "Program",
     "ProgramMotion",

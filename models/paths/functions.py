@@ -51,7 +51,7 @@ def path_function(path: SmoothPath) -> Any:
     """
     knots, columns = _table(checked_instance(path, SmoothPath, "path_function", "path"))
     s = ca.MX.sym("distance")
-    inside = ca.fmin(ca.fmax(s, 0.0), path.length)
+    inside = _inside(s, path.length)
     cell = ca.low(ca.DM(knots), inside, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
     outputs = _in_cell()(ca.MX(ca.DM(columns))[:, cell], inside)
     return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
@@ -65,11 +65,16 @@ def turn_function(path: SmoothPath) -> Any:
     reference, theta = checked_instance(path, SmoothPath, "turn_function", "path").charts
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
     s = ca.MX.sym("distance")
-    inside = ca.fmin(ca.fmax(s, 0.0), path.length)
+    inside = _inside(s, path.length)
     piece = ca.low(ca.DM(path.bounds), inside, {"lookup_mode": "binary"}) if len(path.bounds) > 2 else ca.MX(0)
     column = ca.MX(ca.DM(columns))[:, piece]
     outputs = orientation_function()(column[:4], column[4:22], column[22], (inside - column[23]) / column[22])
     return ca.Function("turn", [s], list(outputs), ["distance"], ["quaternion", "rate", "acceleration", "jerk"])
+
+
+def _inside(distance: Any, length: float) -> Any:
+    """The nearest distance on the path, whose derivative is 1 at both ends too."""
+    return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
 
 
 @lru_cache(maxsize=1)

@@ -86,6 +86,12 @@ class Path:
         """Whether the tool's orientation changes anywhere."""
         return bool(np.any(self.turn != 0))
 
+    @property
+    def oriented(self) -> bool:
+        """Whether the tool's orientation is given anywhere."""
+        given = (orientation for s in self.segments for orientation in (s.start_orientation, s.end_orientation))
+        return any(orientation is not None for orientation in given)
+
     def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
         """Position and three derivatives by the distance, at a distance (m) along segments.
 

@@ -20,12 +20,16 @@ import numpy as np
 from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
+from ocp.audit.sizes import FLOOR
 from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Variable
 
 __all__ = ["AccessoryProblem", "end_conditions"]
 
 NOISE = 1e-14
 """Curvature along a control of its size, of the largest, below which it is rounding."""
+STILL = 10 * FLOOR
+"""Share of the largest entry of a state or a control below which another one stands still."""
 AT_BOUND = 1e-5
 """A value nearer to its bound than this share of its spread or range is held by it."""
 
@@ -66,16 +70,22 @@ class AccessoryProblem:
     def _units(self) -> None:
         """Units in which a sweep is well conditioned: they judge nothing.
 
-        Horizon and states by their sizes. Controls so that the Hamiltonian curves alike along each, however little it
-        moves; by their sizes where it does not curve.
+        Horizon and states by their sizes, those that stand still by that of the others of their unit. Controls so that
+        the Hamiltonian curves alike along each, however little it moves; by their sizes where it does not curve, which
+        for one that never moves is its value.
         """
         sizes, horizon = self.along.sizes, [self.along.solution.horizon] if self.free else []
         bend = np.abs(np.einsum("kii->ki", self.curved)).mean(axis=0)
-        weight = bend * sizes.control**2
+        least, most = self.along.u.min(axis=0, initial=np.inf), self.along.u.max(axis=0, initial=-np.inf)
+        value = np.maximum(np.abs(least), np.abs(most))
+        size = np.where(most - least <= FLOOR * value, np.maximum(value, sizes.control), sizes.control)
+        weight = bend * size**2
         largest = float(weight.max(initial=0.0))
-        curves = weight > NOISE * largest
+        still = size <= STILL * size.max(initial=0.0)  # whose size says nothing
+        curves = (weight > NOISE * largest) | (still & (bend > NOISE * bend.max(initial=0.0)))
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, bend, 1.0)), sizes.control)
-        state = self.along.state_size
+        state = self.along.state_size.copy()
+        _as_others(state, self.along.form.states, self.along.form.problem.declared.states)
         self.unit = np.concatenate([state, horizon, *([state] if self.tied else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
@@ -213,6 +223,17 @@ class AccessoryProblem:
                 steep = np.polynomial.polynomial.polyfit(at[near].ravel(), pull[near, :, i].ravel(), 1)[1]
                 if steep * rise < 0:
                     self.moved[k, i], self.switching[k, i] = True, abs(steep) / abs(rise)
+
+
+def _as_others(size: np.ndarray, places: dict[str, slice], declared: dict[str, Variable]) -> None:
+    """What stands still among others of its unit might have moved as they do: it is given their size."""
+    largest: dict[str, float] = {}
+    for name, place in places.items():
+        unit = declared[name].unit or name
+        largest[unit] = max(largest.get(unit, 0.0), float(size[place].max()))
+    for name, place in places.items():
+        others = largest[declared[name].unit or name]
+        size[place] = np.where(size[place] <= STILL * others, others, size[place])
 
 
 def obstacle(form: Formulation) -> str:

@@ -8,6 +8,7 @@ that dx/ds = T f, and a change of the horizon T is a change of the integrands.
 from __future__ import annotations
 
 from copy import copy
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -248,7 +249,8 @@ class Linearisation:
         form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
         arcs = np.zeros((len(self.s), len(equal), form.nu))
         for which, slopes in form.kept("arcs", lambda: arcs_of(form, self.still[equal])):
-            found = slopes(*self.here[:2], self.t[:, None], *self.here[3:5])[0]
+            rates = [form.signals_at(self.t, order) for order in range(MOST_DERIVATIVES + 1 if form.signals else 1)]
+            found = slopes(*self.here[:2], self.t[:, None], *self.here[3:5], *rates)[0]
             arcs[:, which] = found.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
         self.hold_u = np.concatenate([self.hold_u, arcs], axis=1)
         self.hold.extend(len(equal))
@@ -256,15 +258,17 @@ class Linearisation:
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
     """Which of some path rows contain the controls first in one same derivative in time, and its slopes in these."""
-    at, left, found = form.path.expression[rows.tolist()], np.arange(len(rows)), []
+    at, left, found = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
+    rates = [form.sym("w_rate", form.w.numel()) for _ in range(MOST_DERIVATIVES)] if form.signals else []
     for _ in range(MOST_DERIVATIVES):
         if not left.size or not form.nu:
             break
-        at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t)
+        moving = [ca.mtimes(ca.jacobian(at, w), rate) for w, rate in pairwise([form.w, *rates])]
+        at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t) + sum(moving)
         in_control = ca.jacobian(at, form.u)
         seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
         if seen.any():
-            found.append((left[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]])))
+            found.append((left[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
             at, left = at[np.flatnonzero(~seen).tolist()], left[~seen]
     return found
 

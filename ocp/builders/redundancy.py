@@ -120,7 +120,8 @@ def minimum_velocity_problem(
             the local motion stops early. Small values start near the pseudo-inverse; large ones avoid its singular
             passages and may lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03
             to J = 1.7467.
-        symbols: casadi.SX, or casadi.MX when a track or velocity calls an interpolant.
+        symbols: casadi.SX; or casadi.MX for the indirect method where a track or velocity calls an interpolant, which
+            else becomes a signal (`Problem.signal`).
 
     Returns:
         The problem, its guesses attached; nothing is solved but the local motion.
@@ -170,9 +171,8 @@ def minimum_velocity_problem(
     problem.horizon(duration)
     try:
         targets = equations.targets(problem.time)
-    except (RuntimeError, NotImplementedError) as error:
-        message = "the task calls an interpolant or an external function: pass symbols=casadi.MX"
-        raise ProblemError(message, name="symbols", value=symbols, limit=ca.MX) from error
+    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
+        targets = problem.signal("targets", equations.targets)
     closure: Any = ca.DM(equations.size, 1)
     if cyclic and (directions := equations.closing(place, start)).shape[1]:
         slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
@@ -325,7 +325,7 @@ def plan_minimum_velocity(
 
     Args:
         machine, ..., symbols: As of `minimum_velocity_problem`.
-        method: Collocation; 50 Radau intervals of degree 4 if None.
+        method: Collocation; 50 Radau intervals of degree 4 if None, with nodes where the pieces of the tasks meet.
         dampings: Of the guesses (`guess_damping`), in the order in which they are tried.
         options: Of IPOPT, besides at most 150 iterations.
 
@@ -360,7 +360,7 @@ def plan_minimum_velocity(
             target = float(local.cost[-1])
     asked |= {"free_start": free_start, "cyclic": cyclic, "formulation": formulation, "limits": limits}
     declare = partial(minimum_velocity_problem, machine, **asked, symbols=symbols)
-    mesh, settings = method or Collocation(intervals=50, degree=4), {**IPOPT, **options}
+    mesh, settings = method or _default_mesh(tasks, checked_horizon(horizon)), {**IPOPT, **options}
     tried: list[_Outcome] = []
     for attempt in _attempts(declare, mesh, dampings, target, tried):
         # what conflicts is looked for once: it takes long
@@ -376,6 +376,12 @@ def plan_minimum_velocity(
             name=why.name, value=why.value, limit=why.limit, time=why.time,
         )  # fmt: skip
     return min(standing.values(), key=lambda plan: plan.cost)
+
+
+def _default_mesh(tasks: Sequence[TipTask], horizon: float) -> Collocation:
+    """50 intervals, with nodes at the breaks of the tasks."""
+    at = np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]) / horizon
+    return Collocation(intervals=50, degree=4).with_nodes_at(at[(at > 0) & (at < 1)])
 
 
 def _attempts(
@@ -395,8 +401,7 @@ def _attempts(
             if not (outcome.flaw and helps):
                 break
             excess = excess if outcome.plan else outcome.excess
-            finer = replace(attempt.mesh, intervals=2 * attempt.mesh.intervals, mesh=None)
-            attempt = replace(attempt, mesh=finer, guess=outcome.solution, why=outcome.flaw)
+            attempt = replace(attempt, mesh=attempt.mesh.halved(), guess=outcome.solution, why=outcome.flaw)
         if plan and plan.cost <= target * (1 + DEARER):
             return
 

@@ -104,11 +104,11 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
         (np.repeat(controls[:, 0], d, axis=0) if held else controls.reshape(n * d, nu)).T,
         stage_of,
     )
-    data = form.sym("d", 3)  # fraction, width, weight
+    numbers = np.vstack([form.moments(at), np.repeat(width, d), np.outer(width, weights).ravel()])
+    data = form.sym("d", len(numbers))  # fraction and signals, width, weight
     function = form.point_function(
-        "point", data, data[2] * form.T * form.running, ca.vertcat(-data[1] * form.T * form.f, rows.expression)
+        "point", data, data[-1] * form.T * form.running, ca.vertcat(-data[-2] * form.T * form.f, rows.expression)
     )
-    numbers = np.vstack([at, np.repeat(width, d), np.outer(width, weights).ravel()])
     build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
 
     # the other places of the path constraints

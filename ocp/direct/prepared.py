@@ -96,6 +96,13 @@ class DirectMethod(ABC):
         """The same method on another mesh (N + 1,)."""
         return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
 
+    def halved(self) -> Self:
+        """The same method with every interval cut in two."""
+        if self.mesh is None:
+            return dataclasses.replace(self, intervals=2 * self.intervals)  # type: ignore[type-var]
+        nodes = self.fractions
+        return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
+
     def with_nodes_at(self, fractions: Any) -> Self:
         """The same method with nodes at some fractions 0..1 of the horizon too, where something jumps or bends.
 

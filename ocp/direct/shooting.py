@@ -17,6 +17,7 @@ from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
 from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
+from ocp.problem.values import symbols_of
 
 __all__ = ["MultipleShooting"]
 
@@ -172,7 +173,7 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
     if method.integrator == "cvodes":
         return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
-    sym = form.sym
+    sym = symbols_of(function).sym  # of MX where the dynamics need signals
     x, w, d, i = sym("x", form.nx), sym("w", controls_of(form, method)), sym("d", 2), sym("i")
     horizon, p = sym("T"), sym("p", form.np)
     h = d[1] * horizon / method.steps

@@ -1,6 +1,7 @@
-"""Files: tool paths from waypoints and from G-code."""
+"""Files: tool paths from waypoints and from G-code, plans as logs."""
 
 from ocp.files.gcode import read_gcode
+from ocp.files.mcap import write_mcap
 from ocp.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Stretch, TimedProgram
 from ocp.files.waypoints import Waypoints, read_waypoints
 
@@ -16,4 +17,5 @@ __all__ = [
     "Waypoints",
     "read_gcode",
     "read_waypoints",
+    "write_mcap",
 ]

@@ -112,6 +112,9 @@ class PreparedIndirect:
         began = time.monotonic()
         self.problem, self.method, self._seeding = problem, method, seeding
         self.formulation = Formulation.of(problem)
+        for name in self.formulation.signals:
+            words = f"problem {problem.name!r}: the indirect method takes no signals; {name!r} is one"
+            raise ProblemError(words, name=name)
         self.hamiltonian = Hamiltonian.of(self.formulation)
         backward = method.shooting == "backward"
         self.boundary = BoundaryProblem(self.hamiltonian, backward=backward, tolerance=method.tolerance)

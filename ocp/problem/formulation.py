@@ -6,7 +6,7 @@ Time runs as the fraction ``s`` of the horizon, ``t = s * T``, so that a free fi
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
@@ -14,12 +14,14 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, unknown_name
-from ocp.problem.problem import Constraint, Declarations, Problem, Variable, checked_problem
+from ocp.problem.problem import Constraint, Declarations, Problem, Signal, Variable, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "Sampler", "at_samples", "in_blocks"]
 
 BLOCKS = (512, 32)  # samples in one call of a function: a map of them all takes longer to make than to evaluate
+
+MOST_SAMPLED = 16  # grids at which signals are remembered
 
 Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
@@ -97,6 +99,7 @@ class Formulation:
 
     Attributes:
         x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Makes more.
+        w: Symbols of the signals (nw, 1), in what holds inside the horizon; at its ends they are numbers.
         x0, u0: Symbols of states and controls at the start, for what ties both ends.
         f: State derivative. Shape (nx, 1).
         running, terminal: Cost densities, scalars.
@@ -132,27 +135,31 @@ class Formulation:
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
         self.x0, self.u0 = sym("x0", self.nx), sym("u0", self.nu)
         self.t, self.T = sym("t"), sym("T")
+        self.signals = slices(declared.signals)
+        self.w = sym("w", total(self.signals))
         self._declared, self._made_of = declared, entries_of(declared)
         self._kept: dict[Any, Any] = {}
+        self._sampled_signals: dict[tuple[int, bytes], np.ndarray] = {}
         self.horizon_is_free = not horizon.fixed
         self.horizon_guess = horizon.guess
 
         self.f = self._flat(ca.vertcat(*[declared.dynamics[name] for name in self.states]))
         self.running = self._flat(0 if declared.running is None else declared.running)
         self.terminal = self._flat(0 if declared.terminal is None else declared.terminal)
+        self.horizon_value = self._flat(horizon.lower)  # of use where it is fixed
+        self._signal = self._signal_function()
         self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
-        self.horizon_value = self._flat(horizon.lower)  # of use where it is fixed
         self.path = self._rows("path", declared.path)
-        self.start = self._rows("start", declared.start)
-        self.end = self._rows("end", declared.end)
+        self.start = self._rows("start", declared.start, 0.0)
+        self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)
         watched = declared.watch.values()
         self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
         ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
         self.watch_way = self._flat(ca.vertcat(problem.symbols(0, 1), *ways))
         inner = ca.vertcat(self.f, self.running, self.path.expression)
-        self.autonomous = not ca.depends_on(inner, self.t)
+        self.autonomous = not ca.depends_on(inner, ca.vertcat(self.t, self.w))
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
         both = ca.vertcat(self.end.expression, self.terminal)
         self.ties_ends = bool(ca.depends_on(both, ca.vertcat(self.x0, self.u0)))
@@ -174,8 +181,43 @@ class Formulation:
         return self._kept[name]
 
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
-        """A casadi Function of (x, u, t, T, p)."""
-        return ca.Function(name, [self.x, self.u, self.t, self.T, self.p], outputs, ["x", "u", "t", "T", "p"], names)
+        """A casadi Function of (x, u, t, T, p), of MX where it needs signals."""
+        inputs, of = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
+        if not (self.signals and ca.depends_on(ca.vertcat(*map(ca.vec, outputs)), self.w)):
+            return ca.Function(name, inputs, outputs, of, names)
+        inner = ca.Function(name, [*inputs, self.w], outputs)
+        at = [ca.MX.sym(symbol, part.numel()) for symbol, part in zip(of, inputs, strict=True)]
+        return ca.Function(name, at, inner.call([*at, self._signal(at[2])]), of, names)
+
+    def moments(self, fractions: np.ndarray) -> np.ndarray:
+        """What of the time a point function needs at fractions (K,): these, and the signals. Shape (1 + nw, K)."""
+        return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
+
+    def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
+        """Signals, or their derivatives in time of an order, at times (M,), s. Shape (M, nw)."""
+        times = np.reshape(times, (-1, 1)).astype(float)
+        if not self.signals:
+            return np.zeros((len(times), 0))
+
+        def make() -> Sampler:
+            t = ca.MX.sym("t")
+            value = self._signal(t)
+            for _ in range(order):
+                value = ca.jacobian(value, t)
+            return Sampler([t], [ca.densify(value)])
+
+        key = order, times.tobytes()
+        if key not in self._sampled_signals:  # an audit asks for the same times again and again
+            sampler = self.kept(f"signals, order {order}", make)
+            if len(self._sampled_signals) >= MOST_SAMPLED:
+                self._sampled_signals.clear()
+            self._sampled_signals[key] = sampler(times)[0]
+        return self._sampled_signals[key]
+
+    @property
+    def duration(self) -> float:
+        """The horizon where there are signals, s; 1 where there are none and it may not be known."""
+        return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
         self,
@@ -204,12 +246,15 @@ class Formulation:
             return self.sampler(outputs() if callable(outputs) else outputs, *(symbol for symbol, _ in more))
 
         function = make() if kept is None else self.kept(kept, make)
-        return list(function(x, u, np.reshape(t, (-1, 1)), horizon, p, *(values for _, values in more)))
+        times = np.reshape(t, (-1, 1))
+        values = (value for _, value in more)
+        return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """The function (x, u, t, T, p, *more) -> outputs, to be called at many samples."""
+        """The function (x, u, t, T, p, w, *more) -> outputs, to be called at many samples."""
         symbols = self.problem.symbols
-        return Sampler([self.x, self.u, self.t, self.T, self.p, *more], [symbols(output) for output in outputs])
+        inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
+        return Sampler(inputs, [symbols(output) for output in outputs])
 
     def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
         """The terminal cost of a final state, and of the state and controls at the start."""
@@ -224,14 +269,15 @@ class Formulation:
     def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
         """A block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T where free].
 
-        ``cost`` and ``g`` are expressions of x, u, t, T, p and of the data ``d``, whose first entry is the fraction s.
+        ``cost`` and ``g`` are expressions of x, u, t, T, p, w and of the data ``d``, whose first entries are what
+        :meth:`moments` says of the fraction s.
         """
         v = self.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
         horizon = v[self.nx + self.nu] if self.horizon_is_free else self.horizon_value
-        new = [v[: self.nx, :], v[inside, :], d[0] * horizon, horizon]
+        new = [v[: self.nx, :], v[inside, :], d[0] * horizon, horizon, d[1 : 1 + self.w.numel(), :]]
         symbols = self.problem.symbols
-        outputs = ca.substitute([symbols(cost), symbols(g)], [self.x, self.u, self.t, self.T], new)
+        outputs = ca.substitute([symbols(cost), symbols(g)], [self.x, self.u, self.t, self.T, self.w], new)
         return ca.Function(name, [v, d, self.p], outputs, {"cse": True})
 
     def parameter_vector(self, values: dict[str, Any] | None) -> np.ndarray:
@@ -296,6 +342,7 @@ class Formulation:
             (d.states, self.x, self.states),
             (d.controls, self.u, self.controls),
             (d.parameters, self.p, self.parameters),
+            (d.signals, self.w, self.signals),
         ):
             old += [variable.symbol for variable in pool.values()]
             new += [vector[places[name]] for name in pool]
@@ -307,9 +354,29 @@ class Formulation:
             new.append(self.T)
         return ca.densify(ca.substitute([self.problem.symbols(expression)], old, new)[0])
 
-    def _rows(self, kind: str, pool: dict[str, Constraint]) -> Rows:
+    def _signal_function(self) -> Any:
+        """casadi Function time -> all signals.
+
+        Raises:
+            ProblemError: The horizon is free, or made of parameters.
+        """
+        if not self.signals:
+            return None
+        if self.horizon_is_free or ca.symvar(self.horizon_value):
+            name = next(iter(self.signals))
+            words = f"problem {self.name!r}: signals need a horizon that is a number; {name!r} is one"
+            raise ProblemError(words, name=name)
+        t = ca.MX.sym("t")
+        parts = [signal.function(t) for signal in self._declared.signals.values()]
+        return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
+
+    def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
+        """Rows of a place; at an ``end``, 0 or 1, of the horizon the signals are numbers."""
         symbols = self.problem.symbols
         expression = self._flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
+        if self.signals and end is not None:
+            values = symbols(ca.DM(self.signals_at(np.array([end * self.duration]))[0]))
+            expression = ca.densify(ca.substitute([expression], [self.w], [values])[0])
         names = labels(pool)
         lower = ca.vertcat(symbols(0, 1), *[c.lower for c in pool.values()])
         upper = ca.vertcat(symbols(0, 1), *[c.upper for c in pool.values()])
@@ -373,6 +440,7 @@ class Sampler:
             packed = ca.MX.sym("packed", sum(self._inputs))
             found = inner(*ca.vertsplit(packed, np.cumsum([0, *self._inputs]).tolist()))
         self._function = ca.Function("sampled", [packed], [found], {"cse": True})
+        self._filled = np.array(self._function.sparsity_out(0).row(), dtype=int)  # CasADi drops constants that are zero
         self._maps: dict[int, Any] = {}
 
     def __call__(self, *columns: Any) -> list[np.ndarray]:
@@ -385,7 +453,7 @@ class Sampler:
         values = [np.asarray(column, dtype=float) for column in columns]
         m = next(len(value) for value in values if value.ndim == 2)
         whole = -(-m // BLOCKS[-1]) * BLOCKS[-1]
-        given, found = np.empty((whole, sum(self._inputs))), np.empty((whole, sum(self._outputs)))
+        given, filled = np.empty((whole, sum(self._inputs))), np.empty((whole, self._filled.size))
         first = 0
         for size, value in zip(self._inputs, values, strict=True):
             given[:m, first : first + size] = value
@@ -396,8 +464,10 @@ class Sampler:
             end = whole - (whole - at) % size
             if end > at:
                 block = self._maps.get(size) or self._maps.setdefault(size, self._function.map(size))
-                in_blocks(block, size, given[at:end], [found[at:end]])
+                in_blocks(block, size, given[at:end], [filled[at:end]])
             at = end
+        found = np.zeros((whole, sum(self._outputs)))
+        found[:, self._filled] = filled
         return np.split(found[:m], np.cumsum(self._outputs[:-1]), axis=1)
 
 
@@ -437,7 +507,7 @@ def entries_of(declared: Declarations) -> list[Any]:
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 
 
-def slices(pool: dict[str, Variable]) -> dict[str, slice]:
+def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
     """Where each variable stands in the stacked vector."""
     places, offset = {}, 0
     for name, variable in pool.items():

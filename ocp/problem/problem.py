@@ -28,7 +28,7 @@ from ocp.problem.values import (
     stacked,
 )
 
-__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Variable", "checked_problem"]
+__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Signal", "Variable", "checked_problem"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
 Guess = Any  # a value, or a function of time that returns one
@@ -89,6 +89,25 @@ class Variable:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """A named, known function of time.
+
+    Attributes:
+        name: Its name, unique in the problem.
+        symbol: What stands for its value. Shape (n, 1).
+        function: casadi Function time (s) -> value.
+    """
+
+    name: str
+    symbol: Any
+    function: Any
+
+    @property
+    def size(self) -> int:
+        return int(self.symbol.numel())
+
+
+@dataclass(frozen=True)
 class Constraint:
     """A named vector constraint ``lower <= expression <= upper``; equal bounds make an equality.
 
@@ -137,6 +156,7 @@ class Declarations:
     states: dict[str, Variable] = field(default_factory=dict)
     controls: dict[str, Variable] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
+    signals: dict[str, Signal] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
     path: dict[str, Constraint] = field(default_factory=dict)
     start: dict[str, Constraint] = field(default_factory=dict)
@@ -188,7 +208,7 @@ class Problem:
         Raises:
             ProblemError: It is something else.
         """
-        kinds = (Variable, Constraint, Horizon, Declarations)
+        kinds = (Variable, Signal, Constraint, Horizon, Declarations)
         self.name, self.symbols, self.time, self.declared = restored(state, kinds)
         self.formulated = None
 
@@ -268,6 +288,28 @@ class Problem:
         size = checked_count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
+
+    @_about_its_name
+    def signal(self, name: str, track: Callable[[Any], Any]) -> Any:
+        """Declare a known function of time and return the symbol of its value, shape (n, 1).
+
+        For what the time alone decides and takes long to say: interpolants, paths of many pieces. It is evaluated
+        before anything is solved, never differentiated twice, and may call what takes MX symbols only, in a problem of
+        SX symbols. The horizon has to be a number then; the indirect method takes none.
+
+        Args:
+            name: Unique name.
+            track: casadi time (s), an MX symbol -> a column of expressions.
+        """
+        time = ca.MX.sym("time")
+        try:
+            value = ca.densify(ca.vec(ca.MX(track(time))))
+            function = ca.Function("signal", [time], [value])
+        except Exception as error:  # of the function's own, too
+            words = f"signal {name!r}: a function of the time alone is expected, that gives a column: {error}"
+            raise ProblemError(words, value=track) from error
+        self.declared.signals[name] = Signal(name, self._symbol("signal", name, value.numel()), function)
+        return self.declared.signals[name].symbol
 
     def horizon(
         self, value: Value = None, *, lower: Value = None, upper: Value = None, guess: float | None = None
@@ -391,6 +433,7 @@ class Problem:
             lines.append(f"  state        {state}{''.join(ends)}")
         lines += [f"  control      {control}" for control in d.controls.values()]
         lines += [f"  parameter    {p.name} ({p.size})" for p in d.parameters.values()]
+        lines += [f"  signal       {s.name} ({s.size})" for s in d.signals.values()]
         lines += [f"  d{state}/dt = {_short(rate)}" for state, rate in d.dynamics.items()]
         for kind in ("path", "start", "end", "watch"):
             lines += [f"  {kind:<12} {constraint}" for constraint in getattr(d, kind).values()]
@@ -459,14 +502,15 @@ class Problem:
         """Symbols that may stand inside the horizon."""
         d = self.declared
         variables = (*d.states.values(), *d.controls.values(), *d.parameters.values())
-        return [v.symbol for v in variables] + [self.time, *self._horizon_symbol()]
+        known = [s.symbol for s in d.signals.values()]
+        return [v.symbol for v in variables] + [*known, self.time, *self._horizon_symbol()]
 
     def _symbol(self, kind: str, name: str, size: int) -> Any:
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
             raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
-        for other in ("states", "controls", "parameters"):
+        for other in ("states", "controls", "parameters", "signals"):
             if name in getattr(self.declared, other):
                 raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
         return self.symbols.sym(name, size)

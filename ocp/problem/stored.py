@@ -38,6 +38,8 @@ def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
         if isinstance(value, ca.SX | ca.MX):
             outputs.append(value)
             return {"output": len(outputs) - 1}
+        if isinstance(value, ca.Function):
+            return {"function": value.serialize()}
         if value is None or callable(value):
             return None
         if isinstance(value, dict):
@@ -107,6 +109,8 @@ def _restored(record: dict[str, Any], kinds: dict[str, type]) -> tuple[str, Any,
             return inputs[value["input"]]
         if "output" in value:
             return outputs[value["output"]]
+        if "function" in value:
+            return ca.Function.deserialize(value["function"])
         if "pool" in value:
             return {key: got(item) for key, item in value["pool"]}
         return kinds[value["kind"]](**{key: got(part) for key, part in value["fields"].items()})

@@ -25,6 +25,8 @@ __all__ = ["Stretch", "fastest_over"]
 
 KEPT, ROOM = 1e-9, 3e-4
 """Limits count as kept up to the first, relative; the second is left for what lies between the places looked at."""
+INSIDE = (0.25, 0.5, 0.75)
+"""Where each constant jerk is looked at between its ends, as shares of its time."""
 ROUNDS = 8
 """Of tightening."""
 ROUGH, ACCURACY = 1e-3, 1e-10
@@ -370,8 +372,11 @@ def _excess(stretch: Stretch, seam: int, profile: SpeedProfile) -> Array:
     look(right, pieces + each - 1, 1.0)
     for at in range(each):
         piece = pieces + at
-        way = advanced(profile.speed[piece], profile.acceleration[piece], profile.jerk[piece], duration[piece] / 2)[0]
-        look(rows_at(stretch.path, stretch.limits, stretch.joints, profile.distance[piece] + way), piece, 0.5)
+        for share in INSIDE:
+            t = share * duration[piece]
+            way = advanced(profile.speed[piece], profile.acceleration[piece], profile.jerk[piece], t)[0]
+            place = profile.distance[piece] + way
+            look(rows_at(stretch.path, stretch.limits, stretch.joints, place), piece, share)
         if at:
             rows = rows_at(stretch.path, stretch.limits, stretch.joints, profile.distance[piece])
             look(rows, piece - 1, 1.0)

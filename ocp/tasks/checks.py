@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array, warn_of_degrees
@@ -24,12 +25,14 @@ __all__ = [
     "checked_tasks",
     "checked_weights",
     "dependent_rows",
+    "ignorable_joints",
 ]
 
 TRACK_SAMPLES = 201
 CLOSURE_SAMPLES = 2001
 CLOSED = 1e-6
 """Largest gap of a closed path, m and rad."""
+IGNORABLE, IGNORABLE_SAMPLES = 1e-9, 4
 STILL = 1e-6
 """Largest velocity asked for where the joints are to rest, m/s and rad/s."""
 
@@ -143,14 +146,43 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
     """The task's name where its rows are linearly dependent there, to rounding; None where they are not."""
+    if not equations.size:
+        return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
     return f"the task of rows {_rows_by_name(equations)}" if values[-1] <= 1e-12 * values[0] else None
+
+
+def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
+    """Which joints may be anywhere without anything changing that tasks and base ask of the joint rates. Shape (n,).
+
+    Judged in random configurations, to rounding: by the rates that do the tasks, by those that are left free, by how
+    all of them move the base, and by how tool axes lean.
+    """
+    machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
+    b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
+    targets = ca.SX.sym("targets", sum(target_size(part.task) for part in equations.bound))
+    parts = [equations.jacobian(b, q), equations.right(b, q, targets)]
+    parts += [machine.base_rate(b, q, u), equations.leans(b, q, targets)]
+    function = ca.Function("asked", [b, q, u, targets], parts, {"cse": True})
+    at_zero = np.array(equations.target_function()(0.0)).ravel()
+    found = np.ones(n, dtype=bool)
+    for _ in range(IGNORABLE_SAMPLES):
+        rates, places = rng.normal(size=n), np.tile(rng.normal(size=n), (n + 1, 1))
+        places[np.arange(n), np.arange(n)] += rng.normal(size=n)
+        seen = []
+        for at in places:
+            jacobian, right, base_rate, lean = (np.array(part) for part in function(base, at, rates, at_zero))
+            inverse = np.linalg.pinv(jacobian, rcond=1e-10)
+            seen.append(np.concatenate([np.ravel(v) for v in (inverse @ jacobian, inverse @ right, base_rate, lean)]))
+        changes = np.abs(np.array(seen[:-1]) - seen[-1]).max(axis=1, initial=0.0)
+        found &= changes <= IGNORABLE * (1 + np.abs(seen[-1]).max(initial=0.0))
+    return found
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
     """The twist rows of a single task; else the numbers of the stacked rows."""
     alone = equations.bound[0].task
-    if len(equations.bound) == 1 and alone.direction is None:
+    if len(equations.bound) == 1 and not alone.tilts:
         return list(alone.chosen)
     return list(range(equations.size))
 
@@ -185,6 +217,8 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
 
 
 def _has_full_rank(jacobian: Array) -> bool:
+    if not jacobian.size:  # axes that lean alone
+        return True
     values = np.linalg.svd(jacobian, compute_uv=False)
     return bool(np.isfinite(values).all() and values[-1] > 1e-9 * values[0])
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -77,7 +78,7 @@ class TaskEquations:
         """
         found: dict[str, None] = {}
         for task in (part.task for part in self.bound):
-            tilt = ["rad"] if task.direction is not None else []
+            tilt = ["rad"] if task.tilts else []
             kinds = [*tilt, *("rad" if row in ANGULAR else "m" for row in task.chosen)]
             found |= dict.fromkeys(kind + (pose if task.is_pose else velocity) for kind in kinds)
         return ", ".join(found)
@@ -98,21 +99,30 @@ class TaskEquations:
         parts = []
         for task in (part.task for part in self.bound):
             if task.velocity is not None:
-                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "tip_velocity"))
+                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "tip_velocity", task.begin))
             if task.position is not None:
                 value = _whole(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
                 given = derivative(value, time) if rate is None else _whole(task, rate, time, "position rate")
                 parts += [value, pace * given]
             if task.orientation is not None:
-                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation")
+                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation", task.begin)
                 turn = rotation_of(value) if value.shape == (4, 1) else value
-                spin = angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))
+                rate = getattr(task.orientation, "rate", None)
+                if rate is None:
+                    spin = angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))
+                else:
+                    spin = track_expression(rate, time, (3, 1), "orientation rate", task.begin)
                 parts += [ca.vec(turn), pace * spin]
             if task.direction is not None:
-                value = track_expression(task.direction, time, (3, 1), "direction")
-                unit = value / ca.norm_2(value)
-                parts += [unit, pace * cross_product(unit, derivative(unit, time))]
+                value = track_expression(task.direction, time, (3, 1), "direction", task.begin)
+                length = ca.norm_2(value)
+                unit, rate = value / length, getattr(task.direction, "rate", None)
+                if rate is None:
+                    change = derivative(unit, time)
+                else:
+                    change = track_expression(rate, time, (3, 1), "direction rate", task.begin) / length
+                parts += [unit, pace * cross_product(unit, change)]
         return ca.densify(ca.vertcat(*parts))
 
     @on_scalars
@@ -180,7 +190,7 @@ class TaskEquations:
         """Which rows turn, rather than move. Shape (size,), bool."""
         found: list[bool] = []
         for task in (part.task for part in self.bound):
-            found += [*([True, True] if task.direction is not None else []), *(row in ANGULAR for row in task.chosen)]
+            found += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
         return np.array(found, dtype=bool)
 
     def acceleration(
@@ -244,7 +254,9 @@ class TaskEquations:
             error = pose_error(part, base, joints, wanted)
             if turning is not None:
                 goal = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
-                if task.direction is not None:
+                if task.within is not None:
+                    rows.append(ca.fmax(float(np.cos(task.within)) - self._cosine(part, base, joints, wanted), 0))
+                elif task.direction is not None:
                     rows.append(goal - ca.mtimes(turn, ca.DM(task.tool_axis)))
                 elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(turning_rows(part)):
                     rows.append(ca.vec(goal - turn) / np.sqrt(2))
@@ -254,10 +266,34 @@ class TaskEquations:
                     angular = [i for i, row in enumerate(task.chosen) if row in ANGULAR]
                     rows.append(rows_of(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
             if place is not None:
-                tilt = 0 if task.direction is None else 2
+                tilt = 2 if task.tilts else 0
                 linear = [tilt + i for i, row in enumerate(task.chosen) if row not in ANGULAR]
                 rows.append(rows_of(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
         return ca.densify(ca.vertcat(*rows))
+
+    @on_scalars
+    def leans(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Cosines of the angles by which tool axes lean from their directions, of the tasks that let them.
+
+        Shape (number of tasks with `within`, 1).
+        """
+        rows: list[Any] = [ca.DM(0, 1)]
+        for part, wanted in self._with_targets(targets):
+            if part.task.within is not None:
+                rows.append(self._cosine(part, base, joints, wanted))
+        return ca.densify(ca.vertcat(*rows))
+
+    @property
+    def most_lean(self) -> Array:
+        """Angles that the tool axes of `leans` may lean, rad. Shape as of `leans`, (k,)."""
+        return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
+
+    def _cosine(self, part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
+        """Of the angle between a task's tool axis and its direction."""
+        _, turning = split_targets(part.task, wanted)
+        reference = reference_pose(part, base, joints)
+        goal = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
+        return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
         """Pose at (at_base, at_joints) less pose at (base, joints), in the rows of the velocity tasks.
@@ -280,8 +316,35 @@ class TaskEquations:
             yield part, targets[at : at + size]
             at += size
 
+    def errors(self, t: Any, base: Any, joints: Any) -> Array:
+        """As `task_errors`. Shape (M, size)."""
+        times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
+        place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+        targets = self.target_function().map(len(times))(times[None, :])
+        return np.array(self.function().map(len(times))(place.T, angles.T, targets)[2]).reshape(-1, len(times)).T
+
+    def overhangs(self, t: Any, base: Any, joints: Any) -> Array:
+        """Angles by which tool axes lean further than they may, rad, arguments as of `errors`. Shape (M, k)."""
+        times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
+        place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+        if not self.most_lean.size:
+            return np.zeros((len(times), 0))
+        targets = self.target_function().map(len(times))(times[None, :])
+        cosines = np.array(self._lean_function.map(len(times))(place.T, angles.T, targets)).T
+        return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.most_lean, 0.0))
+
+    @cached_property
+    def _lean_function(self) -> Any:
+        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
+        targets = ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+        return ca.Function("leans", [base, joints, targets], [self.leans(base, joints, targets)], {"cse": True})
+
     def function(self) -> Any:
         """Casadi Function (base, joints, targets) -> (J, b, error, misfit)."""
+        return self._function
+
+    @cached_property
+    def _function(self) -> Any:
         base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
         targets = ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
         parts = [self.jacobian(base, joints)]
@@ -345,7 +408,11 @@ def on_symbols(make: Callable[[Any], _Made]) -> _Made:
 
 
 def track_expression(
-    track: Any, time: Any, shapes: tuple[int, int] | tuple[tuple[int, int], ...], what: str = "track"
+    track: Any,
+    time: Any,
+    shapes: tuple[int, int] | tuple[tuple[int, int], ...],
+    what: str = "track",
+    begin: float = 0.0,
 ) -> Any:
     """A constant or a function of time as a dense matrix of expressions of the symbol `time`.
 
@@ -354,12 +421,13 @@ def track_expression(
         time: The symbol.
         shapes: The shape it has, or several that it may have.
         what: Its name in errors.
+        begin: When the track begins, s, from where on it counts its time.
 
     Raises:
         ProblemError: Another shape, not finite, or an expression of anything but the time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
-    value = _asked(track, time, what) if callable(track) else track
+    value = _asked(track, time - begin if begin else time, what) if callable(track) else track
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value.ravel())
     if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
@@ -399,7 +467,7 @@ def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
     """A track of positions with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
-    value = track_expression(track, time, shapes, what)
+    value = track_expression(track, time, shapes, what, task.begin)
     if value.shape[0] == 3:
         return value
     whole = type(value)(3, 1)
@@ -453,11 +521,7 @@ def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, ba
     Returns:
         Shape (M, rows of all tasks).
     """
-    equations = bind(machine, tasks)
-    times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
-    place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
-    targets = equations.target_function().map(len(times))(times[None, :])
-    return np.array(equations.function().map(len(times))(place.T, angles.T, targets)[2]).reshape(-1, len(times)).T
+    return bind(machine, tasks).errors(t, base, joints)
 
 
 def _is_symbolic(*values: Any) -> bool:

@@ -72,7 +72,7 @@ def rows_of(part: Bound, base: Any, joints: Any, twist: Any) -> Any:
         turn = part.reference.tip_pose(base, joints).rotation
     along = twist if turn is None else ca.vertcat(ca.mtimes(turn.T, angular), ca.mtimes(turn.T, linear))
     chosen = along[list(task.chosen), :]
-    if task.direction is None:
+    if not task.tilts:
         return chosen
     across = ca.mtimes(part.tip.tip_pose(base, joints).rotation, _across(task))
     return ca.vertcat(ca.mtimes(across.T, angular), chosen)
@@ -97,7 +97,7 @@ def pose_error(part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
     if part.task.orientation is not None:
         turn = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
         angular = sum((cross_product(pose.rotation[:, i], turn[:, i]) for i in range(3)), start=ca.DM(3, 1)) / 2
-    elif part.task.direction is not None:
+    elif part.task.tilts:
         tool = ca.mtimes(pose.rotation, ca.DM(part.task.tool_axis))
         angular = cross_product(tool, turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0]))
     return ca.vertcat(angular, linear)

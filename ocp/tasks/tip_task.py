@@ -8,31 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
 
-from models import ModelError
+from models import ModelError, SmoothPath
 from models.arrays import Array, ArrayInput, checked_array
-from models.paths.blends import rest_to_rest
-from models.paths.functions import path_function
-from models.paths.orientation import exponential
-from models.paths.smooth_path import SmoothPath
 from models.robot.indices import checked_rows
-from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_nonnegative, checked_text, real
+from models.spatial import expression
+from ocp.errors import ProblemError, checked_choice, checked_each, checked_nonnegative, checked_positive, checked_text
+from ocp.tasks.tracks import Track, along, run_by
 
-__all__ = ["Axes", "PoseLine", "TipTask", "Track", "Velocity", "along", "one_of", "pose_line", "timed"]
+__all__ = ["Axes", "Roll", "TipTask", "Velocity", "one_of", "timed"]
 
-Track: TypeAlias = Any
-"""A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
 Velocity: TypeAlias = Any
 """A track with one entry for each row of the task."""
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
+Roll: TypeAlias = Literal["free", "given"]
 
 ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
-LARGEST_TURN = np.pi - 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +49,7 @@ class TipTask:
             or matrix, shape (3, 3).
         direction: Of the tool axis, in the reference; the roll about it is free. Constant or function of time, of any
             length but zero. Shape (3,).
+        within: Angle that the tool axis may lean from the direction, rad, between 0 and pi; None: it may not.
         tool_axis: In the frame. Shape (3,).
         axes: Along which axes the rows are taken: of the world, of the base (root) link, of the frame itself ("tip"),
             or of the reference. The twist is the same in all: it is not relative to these axes.
@@ -64,6 +60,10 @@ class TipTask:
         gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves. Where
             accelerations are asked for it damps critically, and velocities decay to what a `velocity` asks.
         start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
+        begin: When the task begins, s; its tracks are functions of the time from there on.
+        duration: How long it lasts, s; None: to the end of the motion.
+        breaks: Times from its beginning at which its tracks are less smooth, where a mesh should have nodes. Shape
+            (k,), s.
 
     Raises:
         ProblemError: A task that is not one of the two kinds, rows that it does not define, wrong sizes or values.
@@ -81,6 +81,10 @@ class TipTask:
     relative_to: str | None = None
     gain: float = 1.0
     start_gap: float = 1e-6
+    within: float | None = None
+    begin: float = 0.0
+    duration: float | None = None
+    breaks: ArrayInput = ()
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):
@@ -94,12 +98,20 @@ class TipTask:
             name = getattr(self, what)
             if name is not None and not checked_text(f"tip task: {what}", name):
                 raise ProblemError(f"tip task: {what} is an empty name", name=what, value=name)
-        for what in ("gain", "start_gap"):
+        for what in ("gain", "start_gap", "begin"):
             checked_nonnegative(what, getattr(self, what))
+        if self.duration is not None:
+            checked_positive("duration", self.duration)
+        if self.within is not None:
+            checked_positive("within", self.within, below=np.pi)
+            if self.direction is None:
+                words = "a tool axis leans within an angle of a direction: give direction=... too"
+                raise ProblemError(words, name="within", value=self.within)
         try:
             axis = checked_array(self.tool_axis, (3,), "tip task", "tool_axis")
             object.__setattr__(self, "point", checked_array(self.point, (3,), "tip task", "point"))
             object.__setattr__(self, "rows", self._checked_rows())
+            object.__setattr__(self, "breaks", self._checked_breaks())
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
@@ -108,6 +120,50 @@ class TipTask:
         if self.link is None and np.any(self.point):
             words = "a point is given in the frame of a link: name the link too"
             raise ProblemError(words, name="point", value=self.point)
+
+    @classmethod
+    def along(
+        cls,
+        path: SmoothPath,
+        speed: Any,
+        *,
+        roll: Roll = "free",
+        tool_axis: ArrayInput = (0.0, 0.0, 1.0),
+        **others: Any,
+    ) -> Self:
+        """The task of running along a path: its position, and the tool as the path turns it.
+
+        Where the path says nothing of the tool's orientation, only the position is asked for, unless `direction` or
+        `orientation` says more. Duration and breaks are those of the path.
+
+        Args:
+            path: As `models.smooth` makes it.
+            speed: Constant, m/s; or a Schedule of the path.
+            roll: "free": the tool axis points where the path turns it, the roll about it is free (a `within` lets it
+                lean, too); "given": the whole orientation is the path's.
+            tool_axis: In the tool's frame. Shape (3,).
+            others: Further attributes of the task: `link`, `gain`, `within`, `begin`, ...; `direction` or `orientation`
+                instead of the path's.
+
+        Raises:
+            ProblemError: No path, a speed that is none, or what the attributes say.
+        """
+        checked_choice("roll", roll, get_args(Roll))
+        tracks = along(path, speed)
+        given: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
+        if path.path.oriented and not {"direction", "orientation"} & set(others):
+            axis = checked_array(tool_axis, (3,), "tip task", "tool_axis")
+            told = {"orientation": tracks.orientation} if roll == "given" else {"direction": tracks.axis(axis)}
+            given |= told
+        return cls(tool_axis=tool_axis, **{**given, **others})
+
+    def _checked_breaks(self) -> Array:
+        times = np.unique(checked_array(self.breaks, ("times",), "tip task", "breaks", least=0))
+        last = np.inf if self.duration is None else float(self.duration)
+        if not ((times >= 0).all() and (times <= last * (1 + 1e-9)).all()):
+            words = f"breaks must be times from the task's beginning to its end, 0 to {last:g} s, not {times.tolist()}"
+            raise ProblemError(words, name="breaks", value=times, limit=(0.0, last))
+        return times
 
     def _checked_rows(self) -> tuple[int, ...]:
         if not self.is_pose:
@@ -118,7 +174,7 @@ class TipTask:
         defined = (ANGULAR if self.orientation is not None else ()) + (LINEAR if self.position is not None else ())
         if self.rows is None:
             return defined
-        none = self.direction is not None and np.size(self.rows) == 0
+        none = self.direction is not None and np.size(self.rows) == 0  # the tilt alone, or a lean
         rows = () if none else tuple(checked_rows(self.rows))
         if strange := [row for row in rows if row not in defined]:
             needs = "rows 0..2 need an orientation, rows 3..5 a position; a direction fixes its own rows"
@@ -146,9 +202,19 @@ class TipTask:
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
+    def tilts(self) -> bool:
+        """Whether the direction fixes the two rows of the tilt; where the axis may lean it does not."""
+        return self.direction is not None and self.within is None
+
+    @property
     def size(self) -> int:
         """Number of rows, with those of the tilt."""
-        return len(self.chosen) + (2 if self.direction is not None else 0)
+        return len(self.chosen) + (2 if self.tilts else 0)
+
+    @property
+    def end(self) -> float:
+        """When the task ends, s; infinite where it lasts to the end of the motion."""
+        return np.inf if self.duration is None else float(self.begin + self.duration)
 
 
 def one_of(
@@ -164,103 +230,6 @@ def one_of(
     return [task] if isinstance(task, TipTask) else list(checked_each("task", task, TipTask))
 
 
-class PoseLine(NamedTuple):
-    """Tracks of a TipTask: `TipTask(position=line.position, orientation=line.orientation)`."""
-
-    position: Callable[[Any], Any]
-    orientation: Callable[[Any], Any]
-
-
-def pose_line(
-    first: tuple[ArrayInput, ArrayInput],
-    second: tuple[ArrayInput, ArrayInput],
-    duration: float,
-    *,
-    pace: Literal["constant", "rest"] = "rest",
-) -> PoseLine:
-    """Straight line between two poses, turning about one fixed axis at the same pace (slerp).
-
-    Args:
-        first, second: (Orientation, position), the orientation as a matrix (3, 3) or a quaternion (4,); a Frame of
-            numbers, such as `machine.tip_pose(base, q)`, will do.
-        duration: From the first to the second, s. Before and after it the pose stands still with pace "rest".
-        pace: "constant" for constant speed, "rest" for the polynomial that starts and ends at rest.
-
-    Raises:
-        ProblemError: Wrong sizes, no rotations, a turn of half a circle, whose sense is ambiguous, a duration that is
-            not positive.
-    """
-    checked_choice("pace", pace, ("constant", "rest"))
-    if not 0 < real(duration) < np.inf:
-        words = f"duration must be a positive number of seconds, not {duration!r}"
-        raise ProblemError(words, name="duration", value=duration, limit=0.0)
-    (turn, place), (other, there) = (_pose(pose, what) for pose, what in ((first, "first"), (second, "second")))
-    relative = turn.T @ other
-    axial = np.array(
-        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
-    )
-    sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(relative)) - 1) / 2
-    angle = float(np.arctan2(sine, cosine))
-    if angle > LARGEST_TURN:
-        words = f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous"
-        raise ProblemError(words, name="poses", value=angle, limit=LARGEST_TURN)
-    vector = axial / 2 * (angle / sine if sine > 0 else 1.0)
-
-    def share(time: Any) -> Any:
-        s = time / duration
-        if pace == "constant":
-            return s
-        return rest_to_rest(ca.fmin(ca.fmax(s, 0), 1))
-
-    def position(time: Any) -> Any:
-        return ca.DM(place) + share(time) * ca.DM(there - place)
-
-    def orientation(time: Any) -> Any:
-        return ca.mtimes(ca.DM(turn), rotation_from_quaternion(exponential(share(time) * ca.DM(vector))))
-
-    return PoseLine(position, orientation)
-
-
-class _Along:
-    """Position track whose velocity is the path's own tangent: at its ends and bounds a derivative would be half."""
-
-    def __init__(self, path: SmoothPath, speed: float) -> None:
-        self._at = path_function(path)
-        self._speed = speed
-
-    def __call__(self, time: Any) -> Any:
-        return self._at(self._speed * time)[0]
-
-    def rate(self, time: Any) -> Any:
-        """Velocity. Shape (3, 1), m/s."""
-        return self._speed * self._at(self._speed * time)[1]
-
-
-def along(path: SmoothPath, speed: float) -> Callable[[Any], Any]:
-    """Position track that runs along a path at constant speed (m/s); it needs symbols=casadi.MX in builders.
-
-    A mesh whose nodes are where the pieces of the path begin, `path.bounds / path.length`, keeps the full order.
-    """
-    if not isinstance(path, SmoothPath):
-        raise ProblemError(f"path must be a SmoothPath, as smooth makes it, not {path!r}", name="path", value=path)
-    if not 0 < real(speed) < np.inf:
-        words = f"speed must be a positive number of m/s, not {speed!r}"
-        raise ProblemError(words, name="speed", value=speed, limit=0.0)
-    return _Along(path, float(speed))
-
-
-class _Timed:
-    """Track over a path parameter, run through by a clock; asked for its velocity where the track is."""
-
-    def __init__(self, track: Callable[[Any], Any], clock: Callable[[Any], Any]) -> None:
-        self._track, self._clock = track, clock
-        if hasattr(track, "rate"):
-            self.rate = lambda time: ca.jacobian(clock(time), time) * track.rate(clock(time))
-
-    def __call__(self, time: Any) -> Any:
-        return self._track(self._clock(time))
-
-
 def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
     """A task over a path parameter as one over time.
 
@@ -274,25 +243,9 @@ def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
         given = task.velocity(at) if callable(task.velocity) else task.velocity
         return ca.jacobian(at, time) * expression(given)
 
-    tracks = {name: getattr(task, name) for name in ("position", "orientation", "direction")}
-    changed: dict[str, Any] = {name: _Timed(track, clock) for name, track in tracks.items() if callable(track)}
+    changed: dict[str, Any] = {
+        name: run_by(getattr(task, name), clock) for name in ("position", "orientation", "direction")
+    }
     if task.velocity is not None:
         changed["velocity"] = velocity
     return replace(task, **changed)
-
-
-def _pose(pose: tuple[ArrayInput, ArrayInput], what: str) -> tuple[Array, Array]:
-    try:
-        orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
-    except NOT_NUMBERS as error:
-        words = f"the {what} pose must be (orientation, position) in numbers, not {pose!r}"
-        raise ProblemError(words, name=what, value=str(pose)) from error
-    if orientation.size == 4 and np.linalg.norm(orientation) > 0:
-        orientation = np.array(rotation_from_quaternion(ca.DM(orientation.ravel())))
-    if orientation.shape != (3, 3) or position.size != 3 or not np.isfinite(position).all():
-        words = f"the {what} pose has the shapes {orientation.shape}, {position.shape}; finite (3, 3), (3,) expected"
-        raise ProblemError(words, name=what, value=(orientation.shape, position.shape), limit=((3, 3), (3,)))
-    if not (np.abs(orientation @ orientation.T - np.eye(3)).max() < 1e-6 and np.linalg.det(orientation) > 0):
-        words = f"the {what} pose has the orientation {orientation.tolist()}, which is no rotation"
-        raise ProblemError(words, name=what, value=orientation)
-    return orientation, position.ravel()

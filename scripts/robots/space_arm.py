@@ -10,7 +10,7 @@ import numpy as np
 from models import FreeFloating
 from models.spatial import rotation_from_rpy
 from ocp import Collocation, TipTask, plan_minimum_velocity, resolve
-from ocp.tasks.tip_task import pose_line
+from ocp.tasks.tracks import pose_line
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.frames import frames_along

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, TypedDict, Unpack
 
@@ -19,6 +19,7 @@ from ocp.errors import ProblemError, SolveError, checked_instance, checked_mappi
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.tasks.checks import checked_horizon
 from ocp.tasks.equations import bind, task_errors
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
@@ -107,7 +108,11 @@ def plan_standing(
     options = checked_mapping("options", options)
     judge = _Judge(machine, tasks, tolerances, asked.get("along") == "parameter")
     settings = {**IPOPT, **options}
-    trials = _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
+    breaks = [] if isinstance(horizon, FreeTime) or judge.along_parameter else _breaks(machine, tasks, horizon)
+    trials = [
+        (level, mesh.with_nodes_at(breaks))
+        for level, mesh in _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
+    ]
     reasons: list[str] = []
     why = SolveError()
     refused: list[ProblemError] = []
@@ -131,6 +136,13 @@ def plan_standing(
         "no standing plan passes its audit:\n" + "\n".join(reasons), last, why.conflicts,
         name=why.name, value=why.value, limit=why.limit, time=why.time,
     )  # fmt: skip
+
+
+def _breaks(machine: Standing, tasks: TipTask | Sequence[TipTask], horizon: float) -> list[float]:
+    """Fractions of the horizon at which the tasks are less smooth."""
+    times = [task.begin + np.asarray(task.breaks) for task in (part.task for part in bind(machine, tasks).bound)]
+    inside = np.unique(np.concatenate(times)) / checked_horizon(horizon)
+    return [float(at) for at in inside if 0 < at < 1]
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Formulation]:
@@ -170,7 +182,7 @@ def _attempts(
         if attempt.exceeded:
             drawn_in = partial(tighten, problem, mesh, options=settings, guess=guess)
             yield judge(f"{name}, tightened", problem, drawn_in)
-        mesh = replace(mesh, intervals=2 * mesh.intervals, mesh=None)
+        mesh = mesh.halved()
 
 
 @dataclass(frozen=True)

@@ -286,7 +286,8 @@ def _curvature(folder: Path, results: Results) -> None:
 
 def _limits(folder: Path, results: Results) -> None:
     note = (
-        f"Thick: the schedule; thin: the minimum time by optimal control. Centripetal acceleration at most "
+        "Thick: the schedule; thin: by optimal control, its jerk held over intervals, which costs up to 1 %. "
+        f"Centripetal acceleration at most "
         f"{CENTRIPETAL:g} m/s². Joint limits (chosen) of shoulder, elbow, quill, wrist: {joint_limits()}. "
         "The cubic's curvature jumps, so that it can keep no joint jerk limit."
     )

@@ -32,7 +32,7 @@ from ocp import (
     spline_targets,
     standing_problem,
 )
-from ocp.tasks.tip_task import along, pose_line
+from ocp.tasks.tracks import along, pose_line
 from tests.bad_values import (
     CALLABLE,
     CHOICE,

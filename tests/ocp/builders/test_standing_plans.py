@@ -15,7 +15,8 @@ from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import FreeTime, IndexAtLeast, InFoot, Pinned, ZmpRule, plan_standing, standing_problem
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import pose_line, timed
+from ocp.tasks.tip_task import timed
+from ocp.tasks.tracks import pose_line
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.builders.standing_replay import assert_stands
 from tests.ocp.builders.standing_tasks import (

@@ -14,7 +14,7 @@ from ocp import ProblemError, TipTask, resolve, resolve_accelerations
 from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser
 from ocp.local.laws import Law, accelerations
 from ocp.tasks.equations import bind, task_errors, track_expression
-from ocp.tasks.tip_task import pose_line
+from ocp.tasks.tracks import pose_line
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
 from tests.ocp.builders.standing_tasks import (

@@ -25,6 +25,8 @@ from tests.models.paths.test_paths import example
 from tests.ocp.problems import Array
 from tests.ocp.schedule.check import dense, largest
 
+pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
+
 Curve = Callable[[int, Array], Array]
 """(n, distances) -> n-th derivative of a joint by the distance."""
 LENGTH, LINE = 2.0, LineLimits(1.0, 5.0, 200.0)

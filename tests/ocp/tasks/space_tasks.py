@@ -12,7 +12,7 @@ from models import FixedBase, FreeFloating, Link, Machine, Robot, merged
 from models.paths import rest_to_rest
 from ocp import Solution
 from ocp.tasks.equations import task_errors
-from ocp.tasks.tip_task import PoseLine, pose_line
+from ocp.tasks.tracks import PoseLine, pose_line
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array, numeric
 

@@ -1,0 +1,305 @@
+"""Motions whose tools do tasks, each in its own interval of time, with the least joint velocity.
+
+The cost is that of `redundancy`, the integral of half the weighted squared joint rates. The horizon falls into
+stretches in which the same tasks are done. All stretches run at once, each over the whole horizon of the problem at a
+pace of its own, as states side by side; the end of each is tied to the start of the next. So a task that begins or ends
+on the way asks for no more than conditions at both ends, which every method and the audit know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import Machine
+from models.arrays import Array
+from ocp.direct.guess import Samples
+from ocp.errors import ProblemError
+from ocp.local.following import Followed
+from ocp.problem.problem import Problem
+from ocp.tasks.checks import check_closed
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.limits import JointBounds
+from ocp.tasks.tip_task import TipTask
+
+__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
+
+CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
+"""Names where the time is free: of the time as a state, of the derivatives of joints and time by the tasks' own."""
+SAME_TIME = 1e-9
+"""Share of the horizon: times nearer to each other are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A part of the horizon in which the same tasks are done.
+
+    Attributes:
+        begin, end: s.
+        tasks: Which of the tasks of the motion, by their numbers.
+        equations: Of these; None where there are none, and the machine moves as it likes.
+        new: Whether each of these begins here. Shape (len(tasks),).
+        breaks: Times at which the tasks are less smooth, between begin and end. Shape (k,), s.
+        suffix: Of the names of its states and controls.
+    """
+
+    begin: float
+    end: float
+    tasks: tuple[int, ...]
+    equations: TaskEquations | None
+    new: tuple[bool, ...]
+    breaks: Array
+    suffix: str
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.end - self.begin
+
+
+@dataclass(frozen=True, eq=False)
+class ToolMotion:
+    """A problem of `tool_motion_problem`, and how its time is that of the motion.
+
+    Attributes:
+        problem: States "joints" and, on a floating base, "base", control "rates", with the suffix of each stretch.
+        stretches: One after the other.
+        horizon: Of the motion and of the problem, s.
+        breaks: Fractions 0..1 of the horizon at which a mesh should have nodes. Shape (k,).
+    """
+
+    problem: Problem
+    stretches: tuple[Stretch, ...]
+    horizon: float
+    breaks: Array
+
+    def guess(self, followed: Sequence[Followed], number: int) -> dict[str, Any]:
+        """The motion `number` of those that were followed through each stretch, as a guess for a solve."""
+        given: dict[str, Any] = {}
+        for stretch, part in zip(self.stretches, followed, strict=True):
+            t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
+            given[f"joints{stretch.suffix}"] = Samples(t, part.joints[number])
+            slow = SLOPES if CLOCK in self.problem.declared.states else f"rates{stretch.suffix}"
+            given[slow] = Samples(t, part.rates[number])
+            if part.base.shape[2]:
+                given[f"base{stretch.suffix}"] = Samples(t, part.base[number])
+        return given
+
+
+def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
+    """The parts of a horizon (s) in which the same tasks are done.
+
+    Raises:
+        ProblemError: A task that begins or ends outside the horizon.
+    """
+    slack = SAME_TIME * horizon
+    for number, task in enumerate(tasks):
+        last = task.begin if task.duration is None else task.end
+        if last > horizon + slack or task.begin > horizon - slack:
+            words = f"task {number} is from {task.begin:g} to {task.end:g} s, the motion from 0 to {horizon:g} s"
+            raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, horizon))
+    times = sorted({0.0, horizon, *(t for task in tasks for t in (task.begin, min(task.end, horizon)))})
+    bounds = [times[0], *(t for before, t in pairwise(times) if t - before > slack and horizon - t > slack), horizon]
+    found: list[Stretch] = []
+    for begin, end in pairwise(bounds):
+        middle = (begin + end) / 2
+        active = tuple(i for i, task in enumerate(tasks) if task.begin < middle < task.end)
+        before = found[-1].tasks if found else ()
+        inside = [tasks[i].begin + np.asarray(tasks[i].breaks) for i in active]
+        breaks = np.unique(np.concatenate([np.zeros(0), *inside]))
+        breaks = breaks[(breaks > begin + slack) & (breaks < end - slack)]
+        equations = bind(machine, [tasks[i] for i in active]) if active else None
+        suffix = f" {len(found) + 1}" if len(bounds) > 2 else ""
+        new = tuple(i not in before for i in active)
+        found.append(Stretch(begin, end, active, equations, new, breaks, suffix))
+    return tuple(found)
+
+
+def tool_motion_problem(
+    machine: Machine,
+    stretches: Sequence[Stretch],
+    *,
+    base: Array,
+    start: Array | None,
+    reference: Array,
+    cyclic: bool,
+    weights: Array,
+    bounds: JointBounds,
+    time_cost: float | None = None,
+) -> ToolMotion:
+    """Do tasks while the integral of half the weighted squared joint rates is least.
+
+    Args:
+        machine: On a fixed or a floating base.
+        stretches: Of the horizon, see `stretches_of`.
+        base: At the start. Shape (base_size,).
+        start: Joints at the start, rad or m; where they are nan, or None, the start is free, but for the tips to be
+            where their tasks begin. Shape (joint_size,).
+        reference: Joints that do the tasks at the start, where a cyclic task is looked at, and where the tip is that
+            a velocity task starts from where the start is free. Shape (joint_size,).
+        cyclic: Whether the joints end where they start.
+        weights: Of the squared joint rates. Shape (joint_size,).
+        bounds: Of the joints' positions and rates.
+        time_cost: Of every second, in units of the cost, where the tasks may be slower than they say: the horizon of
+            the problem is then that of the tasks, its states over it are "joints", "base" and CLOCK, the time, its
+            controls are SLOPES, the derivatives of the joints, and PACE, that of the time, at least 1. None where the
+            tasks' own time is kept.
+
+    Raises:
+        ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last. Where
+            the time is free: several stretches, a base that drifts.
+    """
+    if time_cost is not None:
+        return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost)
+    horizon = stretches[-1].end
+    problem = Problem("tool motion")
+    problem.horizon(horizon)
+    running: Any = 0
+    moving: list[list[Any]] = []
+    for stretch in stretches:
+        begins, ends = stretch is stretches[0], stretch is stretches[-1]
+        pace = stretch.duration / horizon
+        free = not begins or start is None or bool(np.isnan(start).any())
+        told: dict[str, Any] = {"initial": start if begins else None}
+        told["terminal"] = start if cyclic and ends and not free else None
+        place, joints = _declared_states(problem, machine, bounds, stretch.suffix, base if begins else None, told)
+        unit = machine.robot.unit("/s")
+        most = bounds.velocity
+        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, lower=-most, upper=most, unit=unit)
+        slack = _closure(problem, stretches, base, reference) if cyclic and ends else 0
+        if stretch.equations is not None:
+            _declare_tasks(problem, stretch, place, joints, rates, pace, slack, free, (base, reference))
+        if machine.base_size:
+            problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
+        problem.dynamics(joints, pace * rates)
+        running += pace * ca.dot(rates, ca.DM(weights) * rates) / 2
+        states = [*([place] if machine.base_size else []), joints]
+        if moving:
+            here = ca.vertcat(*[problem.at_start(state) for state in states])
+            unit = "" if machine.base_size else machine.robot.unit()
+            problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*moving[-1]), 0, 0, unit=unit)
+        moving.append(states)
+        if cyclic and ends and free:
+            problem.end("cyclic", joints - problem.at_start(moving[0][-1]), 0, 0, unit=machine.robot.unit())
+    problem.minimize(running=running)
+    inside = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in stretches]
+    return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
+
+
+def _declared_states(
+    problem: Problem, machine: Machine, bounds: JointBounds, suffix: str, base: Array | None, ends: dict[str, Any]
+) -> tuple[Any, Any]:
+    """Base, where it moves, and joints."""
+    place: Any = np.zeros(0)
+    if machine.base_size:
+        unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
+        place = problem.state(f"base{suffix}", machine.base_size, initial=base, unit=unit)
+    told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit(), **ends}
+    return place, problem.state(f"joints{suffix}", machine.joint_size, **told)
+
+
+def _in_free_time(
+    machine: Machine,
+    stretches: Sequence[Stretch],
+    base: Array,
+    start: Array | None,
+    reference: Array,
+    cyclic: bool,
+    weights: Array,
+    bounds: JointBounds,
+    time_cost: float,
+) -> ToolMotion:
+    """As `tool_motion_problem`, the time being a state over the tasks' own.
+
+    With q' = dq/ds and z = dt/ds the cost, the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2 z))
+    ds, is convex in both; the tasks, J q' = v(s), and the limits of the rates, |q'| <= v z, are linear in them.
+    """
+    if len(stretches) > 1 or stretches[0].equations is None:
+        words = "a free horizon is for tasks that begin and end together; give each its time, or one task"
+        raise ProblemError(words, name="horizon", value=len(stretches))
+    momentum = getattr(machine, "conserved_momentum", None)
+    if momentum is not None and np.any(np.asarray(momentum) != 0):
+        words = "a free horizon is for a base that rests when the joints do; its momentum carries this one on"
+        raise ProblemError(words, name="conserved_momentum", value=momentum)
+    (stretch,) = stretches
+    free = start is None or bool(np.isnan(start).any())
+    problem = Problem("tool motion in free time")
+    problem.horizon(stretch.end)
+    clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
+    told: dict[str, Any] = {"initial": start, "terminal": start if cyclic and not free else None}
+    place, joints = _declared_states(problem, machine, bounds, "", base, told)
+    unit = machine.robot.unit("/s")
+    slopes = problem.control(SLOPES, machine.joint_size, unit=unit)
+    pace = problem.control(PACE, lower=1.0, guess=1.0)
+    slack = _closure(problem, stretches, base, reference) if cyclic else 0
+    _declare_tasks(problem, stretch, place, joints, slopes, 1.0, slack, free, (base, reference))
+    limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
+    if limited:
+        most = ca.DM(bounds.velocity[limited]) * pace
+        problem.path("rates", ca.vertcat(most - slopes[limited], most + slopes[limited]), lower=0, unit=unit)
+    problem.dynamics(clock, pace)
+    if machine.base_size:
+        problem.dynamics(place, machine.base_rate(place, joints, slopes))
+    problem.dynamics(joints, slopes)
+    problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(weights) * slopes) / (2 * pace))
+    if cyclic and free:
+        problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
+    return ToolMotion(problem, tuple(stretches), stretch.end, stretch.breaks / stretch.end)
+
+
+def _closure(problem: Problem, stretches: Sequence[Stretch], base: Array, reference: Array) -> Any:
+    """What a closed task gives way by, so that the joints close exactly, see `minimum_velocity_problem`."""
+    equations = stretches[-1].equations
+    if equations is None:
+        return 0
+    if len(stretches) > 1:
+        words = "a cyclic motion of several stretches has to end without a task, so that the joints can return"
+        raise ProblemError(words, name="cyclic", value=len(stretches))
+    check_closed(equations, stretches[-1].end)
+    directions = equations.closing(base, reference)
+    if not directions.shape[1]:
+        return 0
+    slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
+    problem.dynamics(slack, np.zeros(directions.shape[1]))
+    return ca.mtimes(ca.DM(directions), slack)
+
+
+def _declare_tasks(
+    problem: Problem,
+    stretch: Stretch,
+    base: Any,
+    joints: Any,
+    rates: Any,
+    pace: float,
+    closure: Any,
+    free: bool,
+    reference: tuple[Array, Array],
+) -> None:
+    """The tasks of a stretch, over the time of the problem; `free`: what begins here has to be at its start."""
+    equations, when = stretch.equations, stretch.suffix
+    assert equations is not None
+    targets_at = equations.target_function()
+    targets = problem.signal(f"targets{when}", lambda time: targets_at(stretch.begin + pace * time))
+    residual = ca.cse(equations.residual(base, joints, rates, targets))
+    if equations.size:
+        problem.path(f"task{when}", residual - closure, lower=0, upper=0, unit=equations.unit())
+    most = equations.most_lean
+    if most.size:
+        problem.path(f"lean{when}", equations.leans(base, joints, targets), lower=np.cos(most))
+    for name, stray in equations.strays(base, joints, rates, targets).items():
+        if stray["integral"]:
+            stray = {**stray, "expression": pace * stray["expression"]}
+        problem.watch(f"{name}{when}", **{**stray, "way": pace * stray["way"]})
+    if not free:
+        return
+    begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
+    error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
+    # a velocity says nothing of places: at the start of the motion its tip is where the reference has it
+    held = [] if stretch.begin else [equations.holding(base, joints, *reference)]
+    if (condition := ca.vertcat(error, *held)).numel():
+        problem.start(f"start pose{when}", condition, 0, 0, unit=equations.unit("", ""))

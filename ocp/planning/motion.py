@@ -1,0 +1,369 @@
+"""What a plan is: a machine's motion over time, its cost, its audit, and the other motions that were found."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models import Machine
+from models.arrays import Array
+from models.spatial import quaternion_from_rotation
+from ocp.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
+from ocp.console import interruptible
+from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_positive, floats, unknown_name
+from ocp.planning.machines import machine_of, written_machine
+from ocp.schedule.trajectory import JointTrajectory
+from ocp.solution import Solution
+from ocp.storage import read_arrays, write_arrays, write_text
+
+__all__ = ["Candidate", "Part", "Plan", "PlanSample", "failed", "parts_of"]
+
+RATES = ("rates", SLOPES, "velocities")
+HALVINGS = 52
+SLACK = 1e-9
+"""Of the horizon: times beyond it by less are its ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A motion that was found, or looked for.
+
+    Attributes:
+        start: Joints that the search began with, rad or m. Shape (n,).
+        cost: Of the motion; nan where none was found, and where `solution` is None an estimate on a coarse mesh.
+        why: Why it is not the plan; "" for the plan itself.
+        solution: Of the motion, where it was solved on the fine mesh.
+    """
+
+    start: Array
+    cost: float
+    why: str = ""
+    solution: Solution | None = None
+
+
+class Part(NamedTuple):
+    """A stretch of a plan's time, and the suffix of the names that its states and controls have in the solution."""
+
+    begin: float
+    end: float
+    suffix: str
+
+
+class PlanSample(NamedTuple):
+    """A plan at M times.
+
+    Attributes:
+        t: s. Shape (M,).
+        joints: rad or m. Shape (M, n).
+        rates, accelerations: Of the joints, their derivatives. Shape (M, n).
+        tip: Pose of the machine's tip in the world, position (m) and quaternion [w, x, y, z]. Shape (M, 7).
+    """
+
+    t: Array
+    joints: Array
+    rates: Array
+    accelerations: Array
+    tip: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The cheapest motion that was found and that passes its audit.
+
+    Attributes:
+        machine: What moves.
+        solution: Of the problem that was solved, with it.
+        parts: Stretches of time in which the same tasks are done; in the solution they stand side by side.
+        candidates: Every motion found, the plan among them, the cheapest first.
+        bound: A lower bound of the cost of any motion that does the tasks; None where none was looked for.
+    """
+
+    machine: Machine
+    solution: Solution
+    parts: tuple[Part, ...]
+    candidates: tuple[Candidate, ...] = ()
+    bound: float | None = None
+    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    # ---- what it says ------------------------------------------------------------------------------------------
+
+    @property
+    def cost(self) -> float:
+        """Of the motion."""
+        return self.solution.cost
+
+    @property
+    def horizon(self) -> float:
+        """Final time, s."""
+        return self.parts[-1].end
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the joints that move."""
+        return tuple(self.machine.robot.joint_names)
+
+    @property
+    def t(self) -> Array:
+        """Times of the plan's own grid; where two parts meet there are two of the same. Shape (M,), s."""
+        if CLOCK in self.solution.states:
+            return np.asarray(self.solution[CLOCK][:, 0])
+        share = self.solution.t / self.solution.horizon
+        return np.concatenate([part.begin + (part.end - part.begin) * share for part in self.parts])
+
+    def __getitem__(self, name: str) -> Array:
+        """Values of "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
+        self._check_name(name)
+        if self.rated == SLOPES and name == "rates":
+            return np.asarray(self.solution[SLOPES] / self.solution[PACE])
+        own = self.rated if name == "rates" else name
+        return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
+
+    def at(self, time: Any) -> dict[str, Array]:
+        """Values of "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
+
+        Raises:
+            ProblemError: A time outside 0 to the horizon, or not finite.
+        """
+        times = self._checked_times(time)
+
+        def named(name: str) -> Array:
+            def said(part: Part, fraction: Array) -> Array:
+                sample = self.solution.at_fraction(fraction)
+                if name == "rates":
+                    return sample[self.rated + part.suffix] / (sample[PACE] if self.rated == SLOPES else 1.0)
+                return sample[name + part.suffix]
+
+            return self._over(times.ravel(), said)
+
+        found = {name: named(name) for name in self._names()}
+        return {name: values[0] if times.ndim == 0 else values for name, values in found.items()}
+
+    def sample(self, period: float) -> PlanSample:
+        """The motion every `period` s from 0; the last sample, at the end, comes as early as the horizon says.
+
+        Rates may jump where the tasks do, for example where a path begins at full speed; accelerations there are
+        those after the jump.
+
+        Raises:
+            ProblemError: A period that is not positive.
+        """
+        checked_positive("sample: period", period)
+        count = int(np.ceil(self.horizon / period * (1 - 1e-12)))
+        return self.sampled(np.append(np.arange(count) * float(period), self.horizon))
+
+    def sampled(self, times: Any) -> PlanSample:
+        """The motion at times (M,), s."""
+        t = np.atleast_1d(self._checked_times(times))
+        at = self.at(t)
+        bases = at["base"] if "base" in at else np.zeros((len(t), 0))
+        return PlanSample(
+            t, at["joints"], at["rates"], self._over(t, self._accelerations), self._tips(bases, at["joints"])
+        )
+
+    @interruptible
+    def audit(self, **settings: Any) -> Any:
+        """Check the motion independently of what made it; see `ocp.audit.audit.audit`. Done once for each setting."""
+        key = repr(sorted(settings.items()))
+        if key not in self._audits:
+            self._audits[key] = self.solution.audit(**settings)
+        return self._audits[key]
+
+    def __str__(self) -> str:
+        found = sum(1 for candidate in self.candidates if candidate.solution is not None)
+        low = "" if self.bound is None else f", at least {self.bound:.6g} any"
+        names = ", ".join(self.names)
+        lines = [
+            f"plan of {self.horizon:.6g} s for {names}: cost {self.cost:.6g}{low}; {found} of "
+            f"{len(self.candidates)} motions solved"
+        ]
+        lines += [f"  {c.cost:10.6g}  {c.why or 'the plan'}" for c in self.candidates]
+        return "\n".join(lines)
+
+    # ---- files -------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the plan with its machine and its problem to one `.npz` file, whole or not at all, without pickle.
+
+        Raises:
+            ProblemError, OSError: As `Solution.save`; a machine that is none of models'.
+        """
+        told = {
+            "machine": written_machine(self.machine),
+            "parts": self.parts,
+            "bound": self.bound,
+            "candidates": [[c.start.tolist(), c.cost, c.why] for c in self.candidates],
+        }
+        text = json.dumps(told).encode()
+        write_arrays(path, {**self.solution.arrays(path), "plan": np.frombuffer(text, dtype=np.uint8)})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Plan:
+        """Read a file that `save` wrote. Of the candidates only the plan has its solution.
+
+        Raises:
+            FileNotFoundError, ProblemError: As `Solution.load`; a file that is no plan's.
+        """
+        solution = Solution.load(path)
+        arrays = read_arrays(path)
+        if "plan" not in arrays:
+            words = f"{path} holds a solution and no plan; read it with Solution.load"
+            raise ProblemError(words, name="path", value=str(path))
+        try:
+            told = json.loads(arrays["plan"].tobytes())
+            parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in told["parts"])
+            candidates = tuple(
+                Candidate(np.array(start, dtype=float), float(cost), str(why), None if why else solution)
+                for start, cost, why in told["candidates"]
+            )
+            bound = None if told["bound"] is None else float(told["bound"])
+            made = cls(machine_of(told["machine"]), solution, parts, candidates, bound)
+            made._check_parts()
+            return made
+        except (*NOT_NUMBERS, KeyError, AttributeError) as error:
+            raise ProblemError(f"{path}: the plan in it is damaged: {error}", name="plan", value=str(path)) from error
+
+    def trajectory(self, period: float) -> JointTrajectory:
+        """The joints every `period` s, as a trajectory of joints."""
+        found = self.sample(period)
+        return JointTrajectory(self.names, found.t, found.joints, found.rates, found.accelerations)
+
+    def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
+        """Write times and joints every `period` s, in full precision.
+
+        A header names the columns: `time` (s), the joints (rad or m), `NAME.velocity` and `NAME.acceleration` of each.
+        """
+        found = self.sample(period)
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        more = [f"{name}.{kind}" for kind in ("velocity", "acceleration") for name in self.names]
+        writer.writerow(["time", *self.names, *more])
+        rows = np.column_stack([found.t, found.joints, found.rates, found.accelerations])
+        writer.writerows([repr(value) for value in row] for row in rows.tolist())
+        write_text(path, stream.getvalue())
+
+    def to_ros(self, period: float = 0.01) -> dict[str, Any]:
+        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory, a point every `period` s."""
+        return self.trajectory(period).to_ros()
+
+    # ---- between the motion's time and the solution's ----------------------------------------------------------
+
+    def _check_parts(self) -> None:
+        """Raise ValueError where the parts are not the solution's, or its joints are not the machine's."""
+        ends = [0.0, *(part.end for part in self.parts)]
+        follow = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
+        clock = self.solution.states.get(CLOCK)
+        if not (self.parts and follow and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
+            raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
+        found = {name: values.shape[1] for name, values in {**self.solution.states, **self.solution.controls}.items()}
+        sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
+        for part in self.parts:
+            rated = [found.get(name + part.suffix) for name in RATES]
+            known = [found.get(name + part.suffix, 0) for name in sizes]
+            if known != list(sizes.values()) or sizes["joints"] not in rated:
+                raise ValueError(f"the solution has no joints and rates of this machine, {sizes}, in {part}")
+
+    def _names(self) -> tuple[str, ...]:
+        return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
+
+    def _check_name(self, name: str) -> None:
+        if name not in self._names():
+            raise unknown_name("name in a plan", name, self._names())
+
+    def _checked_times(self, time: Any) -> Array:
+        try:
+            times = floats(time)
+        except NOT_NUMBERS as error:
+            words = f"a time or an array of times is expected, not {time!r}"
+            raise ProblemError(words, name="time", value=time) from error
+        slack = SLACK * self.horizon
+        if not ((times >= -slack) & (times <= self.horizon + slack)).all():
+            words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
+            raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
+        return np.asarray(np.clip(times, 0.0, self.horizon))
+
+    @property
+    def rated(self) -> str:
+        """What the joint rates are called in the solution; SLOPES by the path, over the pace, are these too."""
+        told = {**self.solution.states, **self.solution.controls}
+        return next(name for name in RATES if name + self.parts[0].suffix in told)
+
+    def _accelerations(self, part: Part, fraction: Array) -> Array:
+        """Of the joints, at fractions (M,) of a part. Shape (M, n)."""
+        sample, name, long = self.solution.at_fraction(fraction), self.rated + part.suffix, part.end - part.begin
+        if "accelerations" + part.suffix in sample:
+            return sample["accelerations" + part.suffix]
+        slope = self._slope(name, fraction)
+        if self.rated != SLOPES:
+            return np.asarray(slope / long)
+        pace, change = sample[PACE], self._slope(PACE, fraction)
+        return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
+
+    def _slope(self, name: str, fraction: Array) -> Array:
+        """Derivative of a state or a control by the fraction. Shape (M, n)."""
+        own = name in self.solution.states
+        pool = self.solution.states if own else self.solution.controls
+        curve = self.solution.state_interpolant if own else self.solution.control_interpolant
+        before = sum(values.shape[1] for values in list(pool.values())[: list(pool).index(name)])
+        return np.asarray(curve.derivative()(fraction)[:, before : before + pool[name].shape[1]])
+
+    def _fractions(self, part: Part, times: Array) -> Array:
+        """Fractions of the solution's horizon at times (M,) of a part."""
+        if CLOCK not in self.solution.states:
+            return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
+        low, high = np.zeros(len(times)), np.ones(len(times))
+        for _ in range(HALVINGS):  # the clock never stands still
+            middle = (low + high) / 2
+            late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
+            low, high = np.where(late, low, middle), np.where(late, middle, high)
+        return np.asarray((low + high) / 2)
+
+    def _over(self, times: Array, ask: Callable[[Part, Array], Array]) -> Array:
+        """What each part says at its fractions, of the times (M,) that it covers; the later one where two meet."""
+        begins = [part.begin for part in self.parts]
+        which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
+        found: Array | None = None
+        for number in np.unique(which):
+            part, rows = self.parts[number], np.flatnonzero(which == number)
+            values = ask(part, self._fractions(part, times[rows]))
+            found = np.empty((len(times), values.shape[1])) if found is None else found
+            found[rows] = values
+        return np.zeros((0, self.machine.joint_size)) if found is None else found
+
+    def _tips(self, bases: Array, joints: Array) -> Array:
+        if self.machine.robot.tip is None:
+            return np.zeros((len(joints), 7)) * np.nan
+        b, q = ca.SX.sym("b", self.machine.base_size), ca.SX.sym("q", self.machine.joint_size)
+        pose = self.machine.tip_pose(b, q)
+        function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
+        position, rotation = function.map(len(joints))(bases.T, joints.T)
+        turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
+        return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])
+
+
+def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
+    """The parts of a plan made of stretches."""
+    return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
+
+
+def failed(told: list[Candidate], cause: SolveError | None = None) -> SolveError:
+    """That no motion passes, with the reasons, the most frequent first, and what a last solve says of them."""
+    reasons: dict[str, int] = {}
+    for one in told:
+        reasons[one.why] = reasons.get(one.why, 0) + 1
+    listed = "\n".join(
+        f"  {count} of {len(told)} postures: {why}" for why, count in sorted(reasons.items(), key=lambda item: -item[1])
+    )
+    last = next((one.solution for one in told if one.solution is not None), None)
+    words = f"no motion passes its audit:\n{listed}"
+    if cause is None:
+        return SolveError(words, last, name="plan")
+    details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
+    return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)

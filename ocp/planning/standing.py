@@ -1,0 +1,126 @@
+"""The cheapest motion of a machine that stands unfastened on the ground, from the postures in which it can stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from models import Standing
+from models.arrays import Array
+from ocp.builders.standing.plan import Asked, plan_standing
+from ocp.builders.standing.problem import Weights
+from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance, checked_positive
+from ocp.local.inverse_kinematics import inverse_kinematics
+from ocp.planning.motion import Candidate, Part, Plan, failed
+from ocp.tasks.checks import check_rest
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.limits import Limits
+from ocp.tasks.tip_task import TipTask
+
+__all__ = ["plan_to_stand"]
+
+
+def plan_to_stand(
+    machine: Standing,
+    tasks: TipTask | Sequence[TipTask],
+    horizon: Any,
+    *,
+    start: Any,
+    cyclic: bool,
+    weights: Weights | None,
+    limits: Limits | None,
+    search: str,
+    seed: int,
+) -> Plan:
+    """Do the tasks with the zero moment point inside the foot, at the least cost of `plan_standing`.
+
+    The joints start and end at rest where their tasks do, else they are free to move. From every posture at the start
+    that inverse kinematics finds and that stands, or, with search "start", from the best conditioned that leads to a
+    plan.
+
+    Args:
+        machine: What stands.
+        tasks, horizon, start, limits, search, seed: As of `ocp.planning.plan`.
+        cyclic: False: a standing motion is not closed by this.
+        weights: Of the parts of the cost.
+
+    Raises:
+        ProblemError: A cyclic motion, tasks in intervals of time, a horizon that is no number, or as plan_standing.
+        SolveError: No posture leads to a plan that passes its audit.
+    """
+    checked_flag("cyclic", cyclic)
+    if cyclic:
+        words = "a standing motion is not closed: give plan_standing(..., end_joints=...) the joints at the end"
+        raise ProblemError(words, name="cyclic", value=cyclic)
+    if weights is not None:
+        checked_instance("weights", weights, Weights)
+    given = [part.task for part in bind(machine, tasks).bound]
+    ends = [task.end for task in given if task.duration is not None]
+    if horizon is None and not ends:
+        words = "horizon is missing: no task says how long it lasts; give plan(..., horizon=...) in s"
+        raise ProblemError(words, name="horizon")
+    duration = checked_positive("horizon", max(ends) if horizon is None else horizon)
+    for number, task in enumerate(given):
+        if task.begin > 0 or task.end < duration * (1 - 1e-9):
+            words = (
+                f"task {number} is from {task.begin:g} to {task.end:g} s; a standing motion does all its tasks at once"
+            )
+            raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
+    equations = bind(machine, given)
+    asked: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
+    asked["start"], asked["end"] = _rest(equations, 0.0), _rest(equations, duration)
+    told: list[Candidate] = []
+    for joints in _postures(machine, given, start, limits, seed):
+        try:
+            solution = plan_standing(machine, given, joints, duration, **asked)
+        except (ProblemError, SolveError) as error:
+            if start is not None:
+                raise
+            told.append(Candidate(joints, np.nan, str(error).split("\n")[0]))
+            continue
+        told.append(Candidate(joints, solution.cost, "", solution))
+        if search == "start":
+            break
+    solved = [one for one in told if not one.why]
+    if not solved:
+        raise failed(told)
+    best = min(solved, key=lambda one: one.cost)
+    ranked = sorted(told, key=lambda one: (one is not best, np.inf if one.why else one.cost))
+    ranked = [
+        one if one is best or one.why else Candidate(one.start, one.cost, "dearer", one.solution) for one in ranked
+    ]
+    assert best.solution is not None
+    return Plan(machine, best.solution, (Part(0.0, duration, ""),), tuple(ranked))
+
+
+def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
+    """Whether the joints rest at a time, as the tasks do."""
+    try:
+        check_rest(equations, time)
+    except ProblemError:
+        return "free"
+    return "rest"
+
+
+def _takes_scalars(equations: TaskEquations) -> bool:
+    """Whether the tracks are expressions of SX symbols."""
+    try:
+        equations.targets(ca.SX.sym("time"))
+    except (RuntimeError, NotImplementedError):
+        return False
+    return True
+
+
+def _postures(machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int) -> list[Array]:
+    """Joints at the start, the best conditioned first."""
+    if start is not None:
+        return [start]
+    poses = [task for task in tasks if task.is_pose]
+    if not poses:
+        words = "start is missing: no task says by a pose where the tip is at the start; give plan(..., start=...)"
+        raise ProblemError(words, name="start")
+    found = inverse_kinematics(machine, poses, seed=seed, limits=limits is None or limits.joints)
+    return [posture.joints for posture in found]

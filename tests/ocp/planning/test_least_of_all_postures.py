@@ -1,0 +1,63 @@
+"""What is found from every posture is the least that full solves from postures of another draw find."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, inverse_kinematics, minimum_velocity_problem, solve
+from ocp.planning import Plan, plan
+from tests.models.robot.trees import Array
+from tests.ocp.planning.motions import ASKED, planned
+
+APART = 0.3
+"""rad: postures nearer to each other, but for full turns, slide to the same motion."""
+
+
+@cache
+def cheapest() -> Plan:
+    what = ASKED["seam_ur5"]()
+    return plan(what.machine, what.tasks, search="postures")
+
+
+def other_postures() -> list[Array]:
+    what = ASKED["seam_ur5"]()
+    kept: list[Array] = []
+    for posture in inverse_kinematics(what.machine, what.tasks, starts=10, seed=5):
+        apart = [np.abs((posture.joints - other + np.pi) % (2 * np.pi) - np.pi).max() for other in kept]
+        if not apart or min(apart) > APART:
+            kept.append(posture.joints)
+    return kept
+
+
+def test_no_posture_leads_to_a_cheaper_seam() -> None:
+    """By `minimum_velocity_problem`, the start free along its self-motion, on a mesh of its own."""
+    what, found = ASKED["seam_ur5"](), cheapest()
+    assert found.audit().passed
+    task = what.tasks
+    mesh = Collocation(8, 7).with_nodes_at(task.breaks / task.duration)
+    costs = []
+    for joints in other_postures():
+        asked = {"start_joints": joints, "horizon": task.duration, "free_start": True, "symbols": ca.MX}
+        problem = minimum_velocity_problem(what.machine, task=task, **asked)
+        motion = solve(problem, mesh, options={"max_iter": 60}, check=False)
+        if motion.success:  # or the posture is lost on its way
+            costs.append(motion.cost)
+    assert len(costs) > 5
+    assert np.ptp(costs) > 0.1 * found.cost
+    assert min(costs) > found.cost * (1 - 1e-6)
+    assert min(costs) == pytest.approx(found.cost, rel=1e-6)
+
+
+def test_every_motion_is_told_with_its_cost_and_why_it_is_not_the_plan() -> None:
+    found, one = cheapest(), planned("seam_ur5")
+    first, *others = found.candidates
+    assert (first.why, first.cost, first.solution) == ("", found.cost, found.solution)
+    assert len(others) > 10
+    assert all(other.why for other in others)
+    assert all(np.isnan(other.cost) or other.cost > found.cost * (1 - 1e-5) for other in others)
+    assert found.cost <= one.cost * (1 + 1e-6)
+    assert [c.why for c in one.candidates].count("") == 1
