@@ -1,0 +1,206 @@
+"""Where a motion may begin: postures that inverse kinematics finds, followed through the tasks side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from models import Machine
+from models.arrays import Array
+from ocp.builders.tool_motion import Stretch
+from ocp.errors import ProblemError
+from ocp.local.following import Followed, follow
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.tasks.checks import ignorable_joints
+from ocp.tasks.equations import bind
+from ocp.tasks.limits import JointBounds, Limits
+from ocp.tasks.tip_task import TipTask
+
+__all__ = ["Asked", "followed_from", "misfits_of", "postures_at_the_start", "settled"]
+
+LEAST_INTERVALS = 8
+"""Of a motion, where its pieces are fewer."""
+FOLLOWED = 64
+"""Steps of the local motions, beside the breaks of the tasks."""
+DAMPINGS = (0.01, 0.1, 1.0)
+"""Of the local motions, relative to the singular values; the next is tried where no posture follows with one."""
+STARTS = 64
+"""Random starts of inverse kinematics."""
+OUT_OF_REACH = 1e-4
+"""m or rad: a pose missed by more may be out of reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is asked, checked.
+
+    Attributes:
+        machine, tasks, horizon: As of `plan`.
+        start: Joints at the start, or None. base: Base there. weights: Of the joint rates.
+        limits: Of the joints.
+    """
+
+    machine: Machine
+    tasks: tuple[TipTask, ...]
+    horizon: float
+    stretches: tuple[Stretch, ...]
+    start: Array | None
+    base: Array
+    weights: Array
+    limits: Limits
+    cyclic: bool
+    seed: int
+    time_cost: float | None
+
+    @cached_property
+    def bounds(self) -> JointBounds:
+        """Of the joints."""
+        return self.limits.bounds(self.machine)
+
+
+def postures_at_the_start(asked: Asked) -> Array:
+    """Joints at the start, the best conditioned first. Shape (K, n)."""
+    if asked.start is not None:
+        return asked.start[None]
+    first = [asked.tasks[i] for i in asked.stretches[0].tasks if asked.tasks[i].is_pose]
+    if not first:
+        words = "start is missing: no task says by a pose where the tip is at the start; give plan(..., start=...)"
+        raise ProblemError(words, name="start")
+    options: dict[str, Any] = {"base": asked.base, "seed": asked.seed, "limits": asked.limits.joints, "starts": STARTS}
+    try:
+        found = inverse_kinematics(asked.machine, first, **options)
+    except Unreachable as error:
+        raise _placed(asked, error, 0.0) from error
+    joints = np.array([posture.joints for posture in found])
+    return joints
+
+
+def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
+    """Joints at the start, nan where they are free, and the postures moved to those that are told.
+
+    An ignorable coordinate, by whose value nothing that is asked changes but the joint itself (the last joint of an arm
+    whose roll is free turns about the tool's axis), has the middle of its range: with it free, every motion would be
+    one of a family of the same cost.
+    """
+    bounds = asked.bounds
+    start = np.full(asked.machine.joint_size, np.nan)
+    with np.errstate(invalid="ignore"):
+        middle = (bounds.lower + bounds.upper) / 2
+    ignorable = np.ones(asked.machine.joint_size, dtype=bool)
+    for stretch in asked.stretches:
+        if stretch.equations is not None:
+            ignorable &= ignorable_joints(stretch.equations, asked.base)
+    start[ignorable] = np.where(np.isfinite(middle), middle, postures[0])[ignorable]
+    return start, np.where(np.isnan(start), postures, start)
+
+
+def followed_from(asked: Asked, postures: Array) -> list[Followed]:
+    """The local motions from all postures through all stretches, with the least damping that lets one of them follow.
+
+    Raises:
+        Unreachable: A place on the way that no posture reaches.
+    """
+    bounds = asked.bounds
+    best: list[Followed] = []
+    for damping in DAMPINGS:
+        found: list[Followed] = []
+        base, joints = np.tile(asked.base, (len(postures), 1)), postures
+        for stretch in asked.stretches:
+            if stretch.begin > 0:
+                joints = _begun(asked, stretch, base, joints)
+                if asked.stretches[len(found) - 1].equations is None:
+                    found[-1] = _straight(found[-1], joints)
+            share = max(int(np.ceil(FOLLOWED * stretch.duration / asked.horizon)), LEAST_INTERVALS)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
+            equations = stretch.equations
+            if equations is None:
+                found.append(_resting(times, base, joints))
+            else:
+                soft: dict[str, Any] = {"weights": asked.weights, "damping": damping}
+                found.append(follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft))
+            base, joints = found[-1].base[:, -1], found[-1].joints[:, -1]
+        best = best or found
+        if min(misfits_of(found)) <= OUT_OF_REACH:
+            return found
+    _check_reach(asked, best)
+    return best
+
+
+def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
+    """Joints (K, n) at which the poses that begin in a stretch are met, each the nearest to where it comes from.
+
+    There they still do what was asked until then.
+    """
+    before = asked.stretches[asked.stretches.index(stretch) - 1]
+    begins = [asked.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
+    if not any(begins):
+        return joints
+    tasks = [asked.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
+    options: dict[str, Any] = {"near": joints, "seed": asked.seed, "limits": asked.limits.joints, "starts": STARTS}
+    try:
+        found = inverse_kinematics(asked.machine, tasks, time=stretch.begin, base=base[0], **options)
+    except Unreachable as error:
+        if asked.machine.base_size:  # which may come nearer
+            return joints
+        raise _placed(asked, error, stretch.begin) from error
+    ways = np.array([posture.joints for posture in found])
+    far = (asked.weights * (joints[:, None] - ways) ** 2).sum(axis=2)
+    return np.asarray(ways[far.argmin(axis=1)])
+
+
+def _straight(part: Followed, joints: Array) -> Followed:
+    """A motion without a task that leads straight to joints (K, n)."""
+    share = ((part.t - part.t[0]) / (part.t[-1] - part.t[0]))[:, None]
+    way = (joints - part.joints[:, 0])[:, None]
+    rates = np.repeat(way / (part.t[-1] - part.t[0]), len(part.t), axis=1)
+    return replace(part, joints=part.joints[:, :1] + share * way, rates=rates)
+
+
+def _resting(times: Array, base: Array, joints: Array) -> Followed:
+    """Where nothing is asked for nothing moves."""
+    count, many = len(joints), len(times)
+    still = np.zeros((count, many, joints.shape[1]))
+    none = np.zeros(count)
+    return Followed(
+        times, np.repeat(base[:, None], many, axis=1), np.repeat(joints[:, None], many, axis=1), still, none, none, none
+    )
+
+
+def misfits_of(followed: list[Followed]) -> list[float]:
+    """Of each posture the largest pose error on its way."""
+    return np.max([part.misfit for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
+
+
+def _check_reach(asked: Asked, followed: list[Followed]) -> None:
+    """Raise where no posture follows the tasks and no joints reach them, seen from a fixed base."""
+    if asked.machine.base_size:
+        return
+    for stretch, part in zip(asked.stretches, followed, strict=True):
+        poses = [
+            asked.tasks[i] for i in stretch.tasks if asked.tasks[i].is_pose and asked.tasks[i].start_gap <= OUT_OF_REACH
+        ]
+        if not poses:
+            continue
+        lost = np.unique(part.lost_at[part.misfit > OUT_OF_REACH])
+        for time in lost.tolist():
+            near = part.joints[:, int(np.searchsorted(part.t, time))]
+            try:
+                inverse_kinematics(
+                    asked.machine, poses, time=time, near=near, limits=asked.limits.joints, tolerance=OUT_OF_REACH
+                )
+            except Unreachable as error:
+                raise _placed(asked, error, time) from error
+
+
+def _placed(asked: Asked, error: Unreachable, time: float) -> Unreachable:
+    """The same with its time and the places that are asked for there."""
+    places = []
+    for number, task in enumerate(asked.tasks):
+        if task.position is not None and task.begin <= time <= task.end:
+            targets = np.array(bind(asked.machine, task).target_function()(time)).ravel()
+            places.append(f"task {number} is at {np.round(targets[:3], 6).tolist()} m")
+    where = f" ({', '.join(places)})" if places else ""
+    return Unreachable(f"at {time:.4g} s{where}: {error}", **{**vars(error), "time": time})
