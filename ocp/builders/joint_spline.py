@@ -2,22 +2,23 @@
 
 The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. Torques
 are linear in the line's acceleration and squared speed: with joints q(s), inverse dynamics tau(q, rate, acceleration)
-and rest tau(q, 0, 0),
+without gravity, and rest that of gravity alone,
 
-    tau = (tau(q, 0, q') - rest) a + (tau(q, q', q'') - rest) v^2 + rest.
+    torque = tau(q, 0, q') a + tau(q, q', q'') v^2 + rest(q).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import factorial
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
-from models.robot.dynamics import inverse_dynamics
+from models.robot.dynamics import GRAVITY, inverse_dynamics
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_each, checked_instance, floats
 from ocp.schedule import PathLike
 from ocp.schedule.profile import Array
@@ -27,6 +28,21 @@ __all__ = ["PlannedJoints", "joint_path"]
 
 DEGREE = 5
 DERIVATIVES = 3
+AT_ONCE = 1024
+"""Places whose torques are computed side by side."""
+ON_ROWS = {
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TWICE: lambda of, into: np.add(of, of, into),
+}
+"""Instructions that dynamics consist of, on rows of numbers: of the operands, into the last."""
 
 
 class _Along(NamedTuple):
@@ -62,8 +78,8 @@ class PlannedJoints:
     names: tuple[str, ...]
     length: float
     error: float
-    curves: Any
-    forces: Any
+    curves: _Pieces
+    forces: _OnRows | None
 
     def at(self, distance: Any) -> _Along:
         """Joints and their derivatives at distances from the start. Shape (M,), m.
@@ -71,8 +87,7 @@ class PlannedJoints:
         Raises:
             ProblemError: nan, or a distance off the path by more than rounding.
         """
-        s = self._checked(distance)
-        return _Along(*(np.array(value).T for value in self.curves.map(len(s))(s[None])))
+        return _Along(*self.curves(self._checked(distance)))
 
     def torques(self, distance: Any) -> _Torques:
         """Torques at distances from the start, as a linear form of the line's motion. Shape (M,), m.
@@ -84,8 +99,7 @@ class PlannedJoints:
             message = f"torques along a path need a machine on a fixed base, not a {type(self.machine).__name__}"
             raise ProblemError(message, name="machine", value=self.machine)
         along = self.at(distance)
-        inputs = [value.T for value in along[:DERIVATIVES]]
-        return _Torques(*(np.array(value).T for value in self.forces.map(len(along.position))(*inputs)))
+        return _Torques(*self.forces(along.position, along.first, along.second))
 
     def _checked(self, distance: Any) -> Array:
         try:
@@ -136,7 +150,7 @@ def joint_path(
     curves = _spline(s, joints)
     half = np.arange(0, len(s), 2)
     half = half if half[-1] == len(s) - 1 else np.append(half, len(s) - 1)
-    coarse = np.array(_spline(s[half], joints[half]).map(len(s))(s[None])[0]).T
+    coarse = _spline(s[half], joints[half])(s)[0]
     error = float(np.abs(coarse - joints).max())
     return PlannedJoints(machine, own, float(length), error, curves, _forces(machine))
 
@@ -170,29 +184,103 @@ def _samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, 
     return s, joints
 
 
-def _spline(s: Array, joints: Array) -> Any:
-    """casadi Function distance -> joints and three derivatives, (n, 1) each: the spline through samples."""
+class _Pieces:
+    """A spline as one polynomial a piece, about its middle.
+
+    Args:
+        breaks: Where pieces meet. Shape (K + 1,), m.
+        derivatives: Of order 0 to DEGREE in the middle of each piece, by `unit`. Shape (DEGREE + 1, K, n).
+        unit: m.
+    """
+
+    def __init__(self, breaks: Array, derivatives: Array, unit: float) -> None:
+        self.breaks, self.middle, self.unit = breaks, (breaks[:-1] + breaks[1:]) / 2, unit
+        self.derivatives = np.ascontiguousarray(derivatives.transpose(1, 0, 2))
+        # the k-th derivative at x from the middle is the sum of the m-th there times x^(m - k) / (m - k)!
+        orders = np.arange(DEGREE + 1) - np.arange(DERIVATIVES + 1)[:, None]
+        self.power = np.maximum(orders, 0)
+        self.weight = np.array([[1 / factorial(m) if m >= 0 else 0.0 for m in row] for row in orders.tolist()])
+        self.weight /= unit ** np.arange(DERIVATIVES + 1)[:, None]
+
+    def __call__(self, distance: Array) -> Array:
+        """Values and three derivatives at distances (M,). Shape (4, M, n)."""
+        piece = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
+        x = (distance - self.middle[piece]) / self.unit
+        powers = x[:, None] ** np.arange(DEGREE + 1)
+        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[piece]).transpose(1, 0, 2))
+
+
+class _OnRows:
+    """A casadi SX Function of vectors at many places at once: each of its instructions works on a row of numbers."""
+
+    def __init__(self, function: Any) -> None:
+        self.sizes = [function.size1_out(k) for k in range(function.n_out())]
+        # rows: the function's own memory, its inputs, its outputs, its constants
+        size = [function.size1_in(k) for k in range(function.n_in())]
+        seats = np.cumsum([function.sz_w(), *size, *self.sizes]).tolist()
+        inputs, outputs, self.rows = seats[: len(size)], seats[len(size) : -1], seats[-1]
+        self.inputs, self.outputs = slice(inputs[0], outputs[0]), slice(outputs[0], self.rows)
+        self.constants: list[float] = []
+        self.steps: list[tuple[Any, ...]] = []
+        seat: dict[int, int] = {}  # the row of what each place of the memory holds
+        for k in range(function.n_instructions()):
+            kind, of, into = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+            if kind == ca.OP_INPUT:
+                seat[into[0]] = inputs[of[0]] + of[1]
+            elif kind == ca.OP_CONST:
+                seat[into[0]] = self.rows + len(self.constants)
+                self.constants.append(function.instruction_constant(k))
+            elif kind == ca.OP_OUTPUT:
+                self.steps.append((np.copyto, outputs[into[0]] + into[1], seat[of[0]]))
+            else:
+                self.steps.append((ON_ROWS[kind], *(seat[place] for place in of), into[0]))
+                seat[into[0]] = into[0]
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """Its outputs at inputs, shape (M, n) each."""
+        given = np.concatenate([value.T for value in inputs])
+        count = given.shape[1]
+        found = np.empty((sum(self.sizes), count))
+        width = max(min(AT_ONCE, count), 1)
+        table = np.zeros((self.rows + len(self.constants), width))
+        table[self.rows :] = np.array(self.constants).reshape(-1, 1)
+        rows = list(table)
+        steps = [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
+        for first in range(0, count, width):
+            here = min(width, count - first)
+            table[self.inputs, :here] = given[:, first : first + here]
+            for operation, places in steps:
+                operation(*places)
+            found[:, first : first + here] = table[self.outputs, :here]
+        return [part.T for part in np.split(found, np.cumsum(self.sizes)[:-1])]
+
+
+def _spline(s: Array, joints: Array) -> _Pieces:
+    """The spline through samples."""
     # in units of the length, which keeps the derivatives of the fit in range
     unit = float(s[-1])
     fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
     place = ca.MX.sym("distance")
-    values = [fit(place / unit)]
-    for _ in range(DERIVATIVES):
+    values = [fit(place)]
+    for _ in range(DEGREE):
         values.append(ca.jacobian(values[-1], place))
-    return ca.Function("joints", [place], values)
+    found = ca.Function("joints", [place], values).map(len(s) - 1)(((s[:-1] + s[1:]) / 2 / unit)[None])
+    return _Pieces(s, np.array([value.full().T for value in found]), unit)
 
 
-def _forces(machine: Machine) -> Any:
-    """casadi Function (q, q', q'') -> inertia, drag and rest; None where the base is not fixed."""
+def _forces(machine: Machine) -> _OnRows | None:
+    """(q, q', q'') -> inertia, drag and rest; None where the base is not fixed."""
     if not isinstance(machine, FixedBase):
         return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))
     still = ca.SX.zeros(machine.joint_size)
 
-    def torque(rate: Any, acceleration: Any) -> Any:
-        return inverse_dynamics(
-            machine.robot, q, rate, acceleration, world_from_base=machine.world_from_base(ca.DM(0, 1))
-        )
+    def torque(rate: Any, acceleration: Any, gravity: Any = (0.0, 0.0, 0.0)) -> Any:
+        base = machine.world_from_base(ca.DM(0, 1))
+        return inverse_dynamics(machine.robot, q, rate, acceleration, gravity=gravity, world_from_base=base)
 
-    rest = torque(still, still)
-    return ca.Function("torques", [q, first, second], [torque(still, first) - rest, torque(first, second) - rest, rest])
+    # what gravity asks is the same in all three: without it the first two are less work
+    values = ca.cse(
+        [ca.densify(each) for each in (torque(still, first), torque(first, second), torque(still, still, GRAVITY))]
+    )
+    return _OnRows(ca.Function("torques", [q, first, second], values))

@@ -8,6 +8,8 @@ acceleration takes to build up. Towards rest, where v ~ s^(2/3), they shrink in 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +21,10 @@ from ocp.schedule.rows import Rows, causes, rows_at
 
 __all__ = ["Grid", "make_grid", "nodes_only", "reach"]
 
-UNEVEN, UNEVEN_SPEED = 0.1, 0.005
+UNEVEN, UNEVEN_SPEED = 0.2, 0.02
 """Largest error of a demand between two nodes, over its limit, when it is taken as even; of the rows of speed, too."""
+AT_ONCE = 10_000
+"""Intervals halved at once."""
 HALVINGS = 8
 JUST_BEFORE = 1e-9
 """What "just before" means, over the length of the path."""
@@ -28,11 +32,12 @@ SHORTEST = 1e-7
 """Pieces shorter than this share of the path count with the next."""
 CLOSE = 0.05
 """Ratio of neighbouring intervals below which their node goes, unless pieces meet there."""
+ROUNDING = 1e-9
 PER_CELL, PER_PATH = 4, 64
 """Intervals of the first grid in each cell of a blend, and on all segments together at least."""
-OF_BUILD_UP = 0.3
+OF_BUILD_UP = 0.5
 """Duration of an interval over the time in which the acceleration builds up..."""
-OF_RAMP = 1 / 30
+OF_RAMP = 1 / 20
 """...or over the time in which the top speed is reached, if that is more."""
 OF_TURN = 0.25
 """...but no more of that time than this: the speed must not change much in an interval."""
@@ -50,7 +55,6 @@ class Grid:
         distance: Of the nodes, from 0 to the path's length. Shape (N + 1,), m.
         asked: Speed in each interval. Shape (N,), m/s.
         rows: At the nodes, just after them where they jump. Shape (N + 1,).
-        middle: Rows of speed in the middle of each interval. Shape (N, K).
         jumps: Nodes where the path's pieces meet. Shape (B,).
         before: Rows just before these. Shape (B,).
     """
@@ -58,16 +62,39 @@ class Grid:
     distance: Array
     asked: Array
     rows: Rows
-    middle: Array
     jumps: NDArray[np.intp]
     before: Rows
 
-    def ends(self) -> tuple[Rows, Rows]:
-        """Rows at the first and at the last place of each interval. Shape (N,) each."""
-        last = Rows(*(kind[1:].copy() for kind in self.rows))
-        for kind, before in zip(last, self.before, strict=True):
-            kind[self.jumps - 1] = before
-        return self.rows.of(slice(-1)), last
+    def ends(self, first: int = 0, last: int | None = None) -> tuple[Rows, Rows]:
+        """Rows at the first and at the last place of the intervals between two nodes. Shape (N,) each."""
+        last = len(self.asked) if last is None else last
+        right = Rows(*(kind[first + 1 : last + 1].copy() for kind in self.rows))
+        at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
+        for kind, before in zip(right, self.before, strict=True):
+            kind[self.jumps[at] - first - 1] = before[at]
+        return self.rows.of(slice(first, last)), right
+
+    def parts(self) -> list[tuple[int, int]]:
+        """First and last nodes of parts of bounded length."""
+        ends = [*range(0, len(self.asked), AT_ONCE), len(self.asked)]
+        return list(pairwise(ends))
+
+
+class _Cells(NamedTuple):
+    """Intervals that resolve the limits. Shape (N,) each.
+
+    Attributes:
+        begin: Where they begin, m.
+        top: Fastest steady speed, m/s.
+        rates: Acceleration that no motion exceeds, m/s^2.
+        most, sharp: Greatest acceleration and jerk of the line at rest, m/s^2 and m/s^3.
+    """
+
+    begin: Array
+    top: Array
+    rates: Array
+    most: Array
+    sharp: Array
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
@@ -86,26 +113,49 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     some = np.concatenate([[True], np.diff(bounds)[:-1] > SHORTEST * path.length, [True]])
     some[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SHORTEST * path.length
     nodes = bounds[some]
-    s = _apart(np.concatenate([path.dense(PER_CELL, max(1, PER_PATH // len(bounds))), nodes]), nodes)
-    rows = rows_at(path, limits, joints, s)
-    _check_rest(rows, s, causes(limits, joints))
-    for _ in range(HALVINGS):
-        top = _top(rows, s, bounds, asked)
-        middle = (s[:-1] + s[1:]) / 2
-        between = rows_at(path, limits, joints, middle)
-        wide = np.flatnonzero(_uneven(rows, between, top) & (np.diff(s) > SHORTEST * path.length))
-        if not wide.size:
-            break
-        s = np.insert(s, wide + 1, middle[wide])
-        rows = Rows(*(np.insert(a, wide + 1, b[wide], axis=0) for a, b in zip(rows, between, strict=True)))
-    s = _apart(np.concatenate([_in_time(s, rows, _top(rows, s, bounds, asked)), nodes]), nodes)
-    rows = rows_at(path, limits, joints, s)
+    first = _apart(np.concatenate([path.dense(PER_CELL, max(1, PER_PATH // len(bounds))), nodes]), nodes)
+    parts = [
+        _halved(path, limits, joints, first[begin : begin + AT_ONCE + 1], (bounds, asked))
+        for begin in range(0, len(first) - 1, AT_ONCE)
+    ]
+    cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
+    s = _apart(np.concatenate([_in_time(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
     before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(nodes)[:-1] / 2)
-    jumps = np.searchsorted(s, inner)
     of_interval = np.asarray(asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
-    middle = rows_at(path, limits, joints, (s[:-1] + s[1:]) / 2).speed
-    return Grid(s, of_interval, rows, middle, jumps, rows_at(path, limits, joints, before))
+    rows = rows_at(path, limits, joints, s)
+    return Grid(s, of_interval, rows, np.searchsorted(s, inner), rows_at(path, limits, joints, before))
+
+
+def _halved(
+    path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, asked: tuple[Array, Array]
+) -> _Cells:
+    """Intervals between places, halved until their rows change evenly.
+
+    Args:
+        path, limits, joints: As of `make_grid`.
+        s: Places. Shape (M + 1,), m.
+        asked: Bounds of the path's pieces, and the speed in each.
+    """
+    rows = rows_at(path, limits, joints, s)
+    _check_rest(rows, s, causes(limits, joints))
+    new = np.arange(len(s) - 1)
+    for _ in range(HALVINGS):
+        middle = (s[new] + s[new + 1]) / 2
+        between = rows_at(path, limits, joints, middle)
+        wide = _uneven(rows.of(new), between, rows.of(new + 1), _top(rows, s, *asked)[new])
+        wide &= s[new + 1] - s[new] > SHORTEST * path.length
+        if not wide.any():
+            break
+        cut = new[wide]
+        s = np.insert(s, cut + 1, middle[wide])
+        rows = Rows(*(np.insert(a, cut + 1, b[wide], axis=0) for a, b in zip(rows, between, strict=True)))
+        new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
+    top, left, right = _top(rows, s, *asked), rows.of(slice(-1)), rows.of(slice(1, None))
+    with np.errstate(divide="ignore"):
+        sharp = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
+    most = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
+    return _Cells(s[:-1], top, _rates(left, right, top**2, top**2), most, sharp)
 
 
 def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
@@ -115,7 +165,7 @@ def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
     rows = rows_at(path, limits, None, s)
     asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
     none = np.zeros(0, dtype=np.intp)
-    return Grid(s, asked, rows, rows.speed[:-1], none, rows.of(none))
+    return Grid(s, asked, rows, none, rows.of(none))
 
 
 def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
@@ -149,17 +199,18 @@ def _top(rows: Rows, s: Array, bounds: Array, asked: Array) -> Array:
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)]))
 
 
-def _uneven(rows: Rows, between: Rows, top: Array) -> NDArray[np.bool_]:
+def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
     """Which intervals' middles differ from what their ends say, at the top speed. Shape (N,)."""
-    wide = np.zeros(len(top), dtype=bool)
-    kinds = zip(
-        (rows.speed, rows.acceleration[:, :, 1], rows.jerk[:, :, 2]),
-        (between.speed, between.acceleration[:, :, 1], between.jerk[:, :, 2]),
-        (UNEVEN_SPEED, UNEVEN, UNEVEN),
-        strict=True,
+    sides = left, middle, right
+    kinds = (
+        # by the squared speed, as the rows of speed are in the program
+        ([rows.speed**2 for rows in sides], top**2, 2 * UNEVEN_SPEED),
+        ([rows.acceleration[:, :, 1] for rows in sides], top**2, UNEVEN),
+        ([rows.jerk[:, :, 2] for rows in sides], top**3, UNEVEN),
     )
-    for power, (at, middle, most) in enumerate(kinds, start=1):
-        bent = np.abs(middle - (at[:-1] + at[1:]) / 2) * top[:, None] ** power
+    wide = np.zeros(len(top), dtype=bool)
+    for (first, between, last), scale, most in kinds:
+        bent = np.abs(between - (first + last) / 2) * scale[:, None]
         wide |= bent.max(axis=1, initial=0.0) > most
     return wide
 
@@ -176,36 +227,45 @@ def reach(distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[
     Returns:
         Squared speeds at the nodes (N + 1,), accelerations in the intervals (N,).
     """
-    rates = np.full(len(distance) - 1, np.inf)
-    for side, most in ((left, caps[:-1]), (right, caps[1:])):
+    rates = _rates(left, right, caps[:-1], caps[1:])
+    return _reached(distance, caps, rates, at_rest), rates
+
+
+def _rates(left: Rows, right: Rows, first: Array, last: Array) -> Array:
+    """Accelerations that none exceeds in intervals, by the greatest squared speeds at their ends. Shape (N,) each."""
+    rates = np.full(len(first), np.inf)
+    for side, most in ((left, first), (right, last)):
         of = np.abs(side.acceleration)
         with np.errstate(divide="ignore", invalid="ignore"):
             one = (1 + of[:, :, 1] * most[:, None] + of[:, :, 2]) / of[:, :, 0]
         rates = np.minimum(rates, np.where(of[:, :, 0] > 0, one, np.inf).min(axis=1, initial=np.inf))
+    return rates
+
+
+def _reached(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
+    """Squared speeds at nodes that keep to caps and to accelerations in the intervals."""
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     up = caps.copy()
     up[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
     up = np.minimum.accumulate(up - gain) + gain
     up = np.minimum.accumulate((up + gain)[::-1])[::-1] - gain
-    return np.maximum(up, 0.0), rates
+    return np.asarray(np.maximum(up, 0.0))
 
 
-def _in_time(s: Array, rows: Rows, top: Array) -> Array:
-    """Nodes cut into intervals that are short in time as well, and shrink towards both ends."""
-    left, right = rows.of(slice(-1)), rows.of(slice(1, None))
+def _in_time(cells: _Cells, length: float) -> Array:
+    """Nodes that cut intervals into such that are short in time as well, and shrink towards both ends."""
+    _, top, rates, most, sharp = cells
+    s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
-    up = reach(s, caps, left, right, (True, True))[0]
-    with np.errstate(divide="ignore"):
-        sharp = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
-    most = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
+    up = _reached(s, caps, rates, (True, True))
     ramp = top / most
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(most / sharp, np.sqrt(top / sharp))
     duration = np.minimum(np.maximum(OF_BUILD_UP * build_up, OF_RAMP * ramp), OF_TURN * ramp)
-    length = float(s[-1])
     speed = np.sqrt(np.maximum(np.maximum(up[:-1], up[1:]), 0.0))
     longest = np.minimum(speed * duration, length)
-    parts = np.maximum(np.ceil(np.diff(s) / longest), 1).astype(np.intp)
+    # what is a whole number but for rounding is one: the unit of length must not change the nodes
+    parts = np.maximum(np.ceil(np.diff(s) / longest * (1 - ROUNDING)), 1).astype(np.intp)
     nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _count(parts), length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):

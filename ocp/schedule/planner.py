@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
 from ocp.schedule.ramps import Zones, plan, ramp_distance
 from ocp.schedule.rows import causes
-from ocp.schedule.stretch import Stretch, fastest_over
+from ocp.schedule.stretch import fastest_over
+from ocp.schedule.window import Stretch
 from ocp.schedule.zones import ramps_below_the_curve
 
 __all__ = ["Dip", "Schedule", "schedule"]
@@ -201,16 +201,19 @@ def _planned(
 
 def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
     """Intervals of the grid in which a motion breaks a limit. Shape (N,)."""
-    here = base.at_distance(grid.distance)
-    left, right = grid.ends()
-    motion = LineMotion(*(value[:-1] for value in here)), LineMotion(*(value[1:] for value in here))
-    over = np.maximum(left.demands(motion[0]).max(axis=1), right.demands(motion[1]).max(axis=1)) > 1 + KEPT
+    over = np.zeros(len(grid.asked), dtype=bool)
     # inside an interval the jerk may change, and the speed be larger
     turns = base.at(np.concatenate([base.t, np.maximum(base.t[1:] - 1e-12 * base.duration, 0.0), base.peaks().t]))
     at = piece_of(grid.distance, turns.distance)
-    for rows in (left, right):
-        np.logical_or.at(over, at, (rows.of(at).demands(turns) > 1 + KEPT).any(axis=1))
-    return np.asarray(over)
+    for first, last in grid.parts():
+        here, inside = base.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
+        turn = LineMotion(*(value[inside] for value in turns))
+        for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
+            motion = LineMotion(*(value[ends] for value in here))
+            over[first:last] |= (np.abs(rows.demands(motion)) > 1 + KEPT).any(axis=1)
+            passed = (np.abs(rows.of(at[inside] - first).demands(turn)) > 1 + KEPT).any(axis=1)
+            np.logical_or.at(over, at[inside], passed)
+    return over
 
 
 def _stretches(
@@ -270,41 +273,44 @@ def _cut(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
 
 def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
     """Where another limit than those of the line binds, while the motion stays below the asked speed."""
-    left, right = grid.ends()
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     of_line = [k for k, name in enumerate(names) if name.startswith("line ")]
-    demand = np.maximum(left.demands(middle), right.demands(middle))
-    line = demand[:, of_line].max(axis=1, initial=0.0)
-    demand[:, of_line] = 0.0
-    cause, most = demand.argmax(axis=1), demand.max(axis=1)
-    binding = (middle.speed < grid.asked * (1 - REACHED)) & (most > BINDING) & (most >= line - (1 - BINDING))
-    permitted = np.minimum(np.minimum(left.steady()[0], right.steady()[0]), grid.asked)
-    found: list[Dip] = []
-    edges = np.flatnonzero(np.diff(np.where(binding, cause, -1), prepend=-1, append=-1))
-    for first, last in pairwise(edges.tolist()):
-        if not binding[first]:
-            continue
-        part = slice(first, last)
-        slowest = first + int((permitted[part] / grid.asked[part]).argmin())
-        name, asked = names[int(cause[first])], float(grid.asked[slowest])
-        rates = float(np.abs(middle.acceleration[part]).max()), float(np.abs(middle.jerk[part]).max())
-        place = float(grid.distance[first]), float(grid.distance[last])
-        dip = Dip(*place, name, asked, float(permitted[slowest]), float(middle.speed[part].min()), *rates)
-        before = found[-1] if found else None
-        if (
-            before
-            and (before.cause, before.asked) == (name, asked)
-            and not _back(grid, middle.speed, before.end, first)
-        ):
-            low, reached = min(before.permitted, dip.permitted), min(before.speed, dip.speed)
-            rates = max(before.acceleration, dip.acceleration), max(before.jerk, dip.jerk)
-            found[-1] = Dip(before.start, dip.end, name, asked, low, reached, *rates)
-        else:
-            found.append(dip)
-    return tuple(found)
+    cause, steady = np.zeros(len(grid.asked), dtype=np.intp), np.zeros(len(grid.asked))
+    binding = middle.speed < grid.asked * (1 - REACHED)
+    for first, last in grid.parts():
+        part, sides = slice(first, last), grid.ends(first, last)
+        here = LineMotion(*(value[part] for value in middle))
+        demand = np.maximum(*(np.abs(rows.demands(here)) for rows in sides))
+        line = demand[:, of_line].max(axis=1, initial=0.0)
+        demand[:, of_line] = 0.0
+        cause[part], most = demand.argmax(axis=1), demand.max(axis=1)
+        binding[part] &= (most > BINDING) & (most >= line - (1 - BINDING))
+        steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
+    permitted = np.minimum(steady, grid.asked)
+    changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.asked) != 0)
+    edges = np.concatenate([[0], 1 + np.flatnonzero(changes), [len(binding)]])
+    runs = np.stack([edges[:-1], edges[1:]], axis=1)[binding[edges[:-1]]]
+    if not runs.size:
+        return ()
+    # runs of one cause are one dip, unless the asked speed is reached between them: the count of such intervals grows
+    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.asked * (1 - REACHED))])
+    begin, end = runs[1:, 0], runs[:-1, 1]
+    apart = (cause[begin] != cause[end - 1]) | (grid.asked[begin] != grid.asked[end - 1])
+    groups = np.concatenate([[0], 1 + np.flatnonzero(apart | (reached[begin] != reached[end]))])
 
+    def extreme(of: np.ufunc, values: Array) -> Array:
+        each = of.reduceat(np.append(values, values[-1]), runs.ravel())[::2]
+        return np.asarray(of.reduceat(each, groups))
 
-def _back(grid: Grid, speed: Array, end: float, first: int) -> bool:
-    """Whether the motion reaches the asked speed between a distance and an interval."""
-    between = slice(int(np.searchsorted(grid.distance, end)), first)
-    return bool((speed[between] >= grid.asked[between] * (1 - REACHED)).any())
+    begin, end = runs[groups, 0], np.append(runs[groups[1:] - 1, 1], runs[-1, 1])
+    columns = (
+        grid.distance[begin],
+        grid.distance[end],
+        [names[k] for k in cause[begin].tolist()],
+        grid.asked[begin],
+        extreme(np.minimum, permitted),
+        extreme(np.minimum, middle.speed),
+        extreme(np.maximum, np.abs(middle.acceleration)),
+        extreme(np.maximum, np.abs(middle.jerk)),
+    )
+    return tuple(Dip(*row) for row in zip(*(np.asarray(column).tolist() for column in columns), strict=True))

@@ -51,7 +51,9 @@ def piece_of(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"
 def _inside(value: ArrayLike, most: float, what: str, place: str) -> Array:
     """A row of numbers of [0, most], clipped to that; ProblemError where one lies outside by more than rounding."""
     try:
-        array = np.atleast_1d(floats(value))
+        # an array that holds its numbers, and is no view of a few, may have as many as it does
+        made = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
+        array = np.atleast_1d(np.asarray(value, dtype=float) if made else floats(value))
     except NOT_NUMBERS as error:
         raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
     if array.ndim != 1:

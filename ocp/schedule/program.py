@@ -90,6 +90,10 @@ class Spline:
         step = np.diff(b)
         return b[:-1] + self.share * step, 2 * step / self.width
 
+    def through(self, x: Array, slope: Array) -> Array:
+        """Coefficients of the spline with x and x' at the nodes. Shape (N + 1,) each."""
+        return np.append(x - self.share * self.width * slope / 2, x[-1])
+
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
         """(x, x', x'') at places as linear functions of the three coefficients of their interval. Shape (M, 3, 3)."""
         h, inside = self.h[interval], fraction * self.h[interval]
@@ -129,17 +133,74 @@ class _Ends:
         for (outer, inner, _, _, end), ratio in zip(self.sides, self.ratio, strict=True):
             change[outer] = ratio * change[inner] if end.rest else 0.0
 
-    def reduce(self, gradients: Array, interval: NDArray[np.intp], touched: NDArray[np.intp]) -> None:
-        """Gradients (3, M) by the coefficients of their intervals as those by the free ones, in place."""
-        for (outer, inner, _, _, end), ratio in zip(self.sides, self.ratio, strict=True):
-            at = touched[np.abs(interval[touched] + 1 - outer) <= 1]
-            seat = outer - interval[at]
-            if end.rest:
-                gradients[inner - interval[at], at] += ratio * gradients[seat, at]
-            gradients[seat, at] = 0.0
-            if not end.rest:
-                at = touched[np.abs(interval[touched] + 1 - inner) <= 1]
-                gradients[inner - interval[at], at] = 0.0
+    def reduce(self, slope: Array) -> None:
+        """Make a slope by the coefficients one by the free ones, in place."""
+        for (outer, inner, *_), ratio in zip(self.sides, self.ratio, strict=True):
+            slope[inner] += ratio * slope[outer]
+        slope[self.fixed] = 0.0
+
+    def band(self, main: Array, beside: Array, apart: Array) -> Array:
+        """Nonzeros, by columns, of a curvature by the free coefficients; what is fixed stands alone.
+
+        Args:
+            main, beside, apart: Its diagonals by all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
+        """
+        n = len(main)
+        for (outer, inner, *_), ratio in zip(self.sides, self.ratio, strict=True):
+            at, next_at = (0, 1) if outer == 0 else (n - 2, n - 3)
+            main[inner] += ratio * (2 * beside[at] + ratio * main[outer])
+            beside[next_at] += ratio * apart[min(at, n - 3)]
+        free = np.ones(n)
+        free[self.fixed] = 0.0
+        full = np.zeros((n, 5))
+        full[:, 2] = np.where(free > 0, main, 1.0)
+        full[1:, 1] = full[:-1, 3] = beside * free[:-1] * free[1:]
+        full[2:, 0] = full[:-2, 4] = apart * free[:-2] * free[2:]
+        return np.concatenate([full[0, 2:], full[1, 1:], full[2:-2].ravel(), full[-2, :-1], full[-1, :-2]])
+
+
+class _Steps:
+    """Equations of five diagonals, solved by casadi in place."""
+
+    def __init__(self, n: int) -> None:
+        pattern = ca.Sparsity.banded(n, 2)
+        matrix, right = ca.MX.sym("matrix", pattern), ca.MX.sym("right", n)
+        self.function = ca.Function("steps", [matrix, right], [ca.solve(matrix, right, "ldl")])
+        self.memory = [np.zeros(size) for size in (pattern.nnz(), n, n)]
+        self.buffer, self.run = self.function.buffer()
+        for k in (0, 1):
+            self.buffer.set_arg(k, memoryview(self.memory[k]))  # type: ignore[arg-type]
+        self.buffer.set_res(0, memoryview(self.memory[2]))  # type: ignore[arg-type]
+
+    def matrix(self, band: Array) -> None:
+        """Take a matrix by its nonzeros."""
+        self.memory[0][:] = band
+
+    def solve(self, right: Array) -> Array:
+        self.memory[1][:] = right
+        self.run()
+        return self.memory[2].copy()
+
+
+class _Group:
+    """Rows in the order of their intervals: what they are of coefficients, and sums over those of each interval."""
+
+    def __init__(self, interval: NDArray[np.intp], count: int) -> None:
+        self.interval = interval
+        self.first = np.flatnonzero(np.diff(interval, prepend=-1))
+        self.each = np.diff(np.append(self.first, len(interval)))
+        some = interval[self.first]
+        self.present = slice(None) if len(some) == count else some
+
+    def of(self, weights: Array, b: Array) -> Array:
+        """Weights (3, M) times the three coefficients of each row. Shape (M,)."""
+        near = np.repeat(np.stack([b[:-2], b[1:-1], b[2:]])[:, self.present], self.each, axis=1)
+        return np.asarray(weights[0] * near[0] + weights[1] * near[1] + weights[2] * near[2])
+
+    def add(self, values: Array, sums: Array) -> None:
+        """Add values (k, M) to sums (k, N) of the intervals, in place."""
+        if self.first.size:
+            sums[:, self.present] += np.add.reduceat(values, self.first, axis=1)
 
 
 def least_time(
@@ -165,64 +226,71 @@ def least_time(
     Raises:
         SolveError: No motion was found that keeps the rows, with the distance of the worst as its `time`.
     """
-    n = len(spline.h) + 2
+    count = len(spline.h)
+    n = count + 2
     bounded = np.flatnonzero(np.isfinite(most))
-    order = np.argsort(rows.jerk, kind="stable")
-    size = [n - 2, len(bounded), len(order)]
-    # the coefficients themselves come first: positive, and at most so much; then the rows, those of jerk at the end
-    interval = np.concatenate([np.arange(n - 2), np.clip(bounded - 1, 0, n - 3), rows.interval[order]])
-    linear = size[0] + size[1] + int((~rows.jerk).sum())
+    # linear rows: the coefficients themselves, which are positive (one an interval) and at most so much, and others
+    other = np.flatnonzero(~rows.jerk)
+    interval = np.concatenate([np.arange(count), np.clip(bounded - 1, 0, count - 1), rows.interval[other]])
     weights = np.zeros((3, len(interval)))
-    weights[1, : size[0]] = -1.0
-    weights[bounded - interval[size[0] : size[0] + size[1]], np.arange(size[0], size[0] + size[1])] = 1.0
-    basis = spline.basis(rows.interval[order], rows.fraction[order])
-    weights[:, size[0] + size[1] :] = np.einsum("mi,mij->jm", rows.of[order], basis)
-    late = order[linear - size[0] - size[1] :]
+    weights[1, :count] = -1.0
+    weights[bounded - interval[count : count + len(bounded)], np.arange(count, count + len(bounded))] = 1.0
+    weights[:, count + len(bounded) :] = _weights(spline, rows, other)
+    bound = np.concatenate([np.zeros(count), most[bounded], rows.bound[other]])
+    order = np.argsort(interval, kind="stable")
+    lines, bound, linear = _Group(interval[order], count), bound[order], len(order)
+    positive = np.flatnonzero(order < count)
+    late = np.flatnonzero(rows.jerk)
+    late = late[np.argsort(rows.interval[late], kind="stable")]
+    jerks, sharp = _Group(rows.interval[late], count), rows.bound[late]
+    of_jerks = _weights(spline, rows, late)
     square = np.ascontiguousarray(spline.basis(rows.interval[late], rows.root[late])[:, 0].T)
-    del basis
-    bound = np.concatenate([np.zeros(size[0]), most[bounded], rows.bound[order]])
-    columns = [interval, interval + 1, interval + 2]
-    inside = [column[linear:] for column in columns]
-    touched = np.flatnonzero((interval <= 1) | (interval >= n - 4))
-    fixing = _Ends(spline, ends)
-    gradients = weights.copy()
-    fixing.reduce(gradients, interval, touched)
-    bent = touched[touched >= linear]
+    gradients = np.concatenate([weights[:, order], of_jerks], axis=1)
+    weights = gradients[:, :linear]
+
+    fixing, steps = _Ends(spline, ends), _Steps(n)
     share, cost_weights = spline.share, spline.width / 2
     cost_weights[0] += 3 * ends[0].rest
     cost_weights[-1] += 3 * ends[1].rest
-    pattern = ca.Sparsity.banded(n, 2)
-    factor = ca.Linsol("steps", "ldl", pattern)
+
+    def summed(values: Array) -> Array:
+        sums = np.zeros((len(values), count))
+        lines.add(values[:, :linear], sums)
+        jerks.add(values[:, linear:], sums)
+        return sums
 
     def gathered(values: Array) -> Array:
-        return np.asarray(sum(np.bincount(c, g * values, n) for c, g in zip(columns, gradients, strict=True)))
+        sums, out = summed(gradients * values), np.zeros(n)
+        for k in range(3):
+            out[k : count + k] += sums[k]
+        return out
 
     b, slack, price = fixing.start(start), np.zeros(0), np.zeros(0)
     found: Array | None = None
     latest = 0
     for number in range(STEPS):
-        gap = weights[0] * b[columns[0]] + weights[1] * b[columns[1]] + weights[2] * b[columns[2]]
-        at = square[0] * b[inside[0]] + square[1] * b[inside[1]] + square[2] * b[inside[2]]
-        root = bound[linear:] / np.sqrt(at)
-        gap[:linear] -= bound[:linear]
-        gap[linear:] -= root
-        gradients[:, linear:] = weights[:, linear:] + (0.5 * root / at) * square
-        fixing.reduce(gradients, interval, bent)
+        at = jerks.of(square, b)
+        root = sharp / np.sqrt(at)
+        gap = np.concatenate([lines.of(weights, b) - bound, jerks.of(of_jerks, b) - root])
+        gradients[:, linear:] = of_jerks + (0.5 * root / at) * square
+        size = np.concatenate([np.abs(bound), root]) + 1e-300
 
         x = b[:-1] + share * np.diff(b)
         times = cost_weights / np.sqrt(x)
         time = float(times.sum())
-        slope, main, beside = _cost(fixing, share, -0.5 * times / x, 0.75 * times / x**2)
+        slope, main, beside = _cost(share, -0.5 * times / x, 0.75 * times / x**2)
         if number == 0:
-            slack = np.maximum(-gap, 0.1 * np.concatenate([np.maximum(np.abs(bound[:linear]), 1e-300), root]))
-            slack[: size[0]] = b[1:-1]
+            slack = np.maximum(-gap, 0.1 * size)
+            slack[positive] = b[1:-1]
             price = center * time / len(gap) / slack
         np.maximum(slack, -gap, out=slack)
         missed = gap + slack
         mean = float(slack @ price) / len(gap)
         residual = slope + gathered(price)
-        residual[fixing.fixed] = 0.0
-        worst = float((missed[size[0] :] / np.concatenate([np.abs(bound[size[0] : linear]) + 1e-300, root])).max())
+        fixing.reduce(residual)
+        lacking = missed / size
+        lacking[positive] = 0.0
+        worst = float(lacking.max())
         if not np.isfinite(mean + worst) or mean * len(gap) > DIVERGED * time:
             if found is not None:
                 return found
@@ -236,23 +304,23 @@ def least_time(
             latest = number + MORE_STEPS
 
         pull = price / slack
-        pulled = gradients * pull
-        _, g1, g2 = gradients
-        main += np.asarray(sum(np.bincount(c, g * w, n) for c, g, w in zip(columns, gradients, pulled, strict=True)))
-        beside[:-1] += np.bincount(columns[0], pulled[0] * g1, n)[:-1] + np.bincount(columns[1], pulled[1] * g2, n)[:-1]
-        apart = np.asarray(np.bincount(columns[0], pulled[0] * g2, n), dtype=float)
-        matrix = ca.DM(pattern, _band(main, beside, apart, fixing.fixed))
-        factor.nfact(matrix)
+        g = gradients
+        pulled = g * pull
+        squares = summed(np.concatenate([g * pulled, g[:2] * pulled[1:], g[:1] * pulled[2:]]))
+        for k in range(3):
+            main[k : count + k] += squares[k]
+        beside[:-1] += squares[3]
+        beside[1:] += squares[4]
+        steps.matrix(fixing.band(main, beside, squares[5]))
 
         def step(target: Any, pull: Array = pull, slope: Array = slope, missed: Array = missed) -> tuple[Array, ...]:
             """Change of coefficients, slacks and prices towards slack x price = target."""
             right = -(slope + gathered(target / slack + pull * missed))  # noqa: B023
-            right[fixing.fixed] = 0.0
-            change = np.array(factor.solve(matrix, ca.DM(right))).ravel()  # noqa: B023
+            fixing.reduce(right)
+            change = steps.solve(right)
             fixing.follow(change)
-            # the reduced gradients know the free coefficients only
-            g = gradients
-            of_slack = -missed - (g[0] * change[columns[0]] + g[1] * change[columns[1]] + g[2] * change[columns[2]])
+            of_lines = lines.of(gradients[:, :linear], change)
+            of_slack = -missed - np.concatenate([of_lines, jerks.of(gradients[:, linear:], change)])
             return change, of_slack, target / slack - price - pull * of_slack  # noqa: B023
 
         _, of_slack, of_price = step(0.0)
@@ -266,14 +334,19 @@ def least_time(
             change, more_slack, more_price = step(max(sigma, 0.1) * mean)
             free, priced = _longest(slack, more_slack, TO_BOUNDARY), _longest(price, more_price, TO_BOUNDARY)
         b, slack, price = b + free * change, slack + free * more_slack, price + priced * more_price
-    miss = missed[size[0] :]
-    row = int((miss / np.concatenate([np.abs(bound[size[0] : linear]) + 1e-300, root])).argmax())
-    place = float(spline.nodes[interval[size[0] + row]])
+    row = int(lacking.argmax())
+    place = float(spline.nodes[np.append(lines.interval, jerks.interval)[row]])
     message = f"no motion keeps the limits near {place:g} m: they miss one another by {worst:.2g}"
     raise SolveError(message, name="limits", value=worst, limit=INFEASIBLE, time=place)
 
 
-def _cost(fixing: _Ends, share: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
+def _weights(spline: Spline, rows: SplineRows, which: NDArray[np.intp]) -> Array:
+    """Some rows by the coefficients of their intervals. Shape (3, M)."""
+    basis = spline.basis(rows.interval[which], rows.fraction[which])
+    return np.ascontiguousarray(np.einsum("mi,mij->jm", rows.of[which], basis))
+
+
+def _cost(share: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
     """Slope of the time by the coefficients, and the two diagonals of its curvature; of values at the nodes."""
     n = len(share) + 1
     slope, main = np.zeros(n), np.zeros(n)
@@ -281,27 +354,7 @@ def _cost(fixing: _Ends, share: Array, first: Array, second: Array) -> tuple[Arr
     slope[1:] += share * first
     main[:-1] += (1 - share) ** 2 * second
     main[1:] += share**2 * second
-    beside = np.append(share * (1 - share) * second, 0.0)
-    for (outer, inner, *_), ratio in zip(fixing.sides, fixing.ratio, strict=True):
-        slope[inner] += ratio * slope[outer]
-        main[inner] += 2 * ratio * beside[min(outer, inner)] + ratio**2 * main[outer]
-    return slope, main, beside
-
-
-def _band(main: Array, beside: Array, apart: Array, fixed: NDArray[np.intp]) -> Array:
-    """Nonzeros of a symmetric matrix of five diagonals by columns; what is fixed stands alone."""
-    n = len(main)
-    main[fixed] = 1.0
-    free = np.ones(n)
-    free[fixed] = 0.0
-    beside[:-1] *= free[:-1] * free[1:]
-    apart[:-2] *= free[:-2] * free[2:]
-    full = np.zeros((n, 5))
-    full[2:, 0], full[1:, 1], full[:, 2] = apart[:-2], beside[:-1], main
-    full[:-1, 3], full[:-2, 4] = beside[:-1], apart[:-2]
-    kept = np.ones((n, 5), dtype=bool)
-    kept[0, :2] = kept[1, 0] = kept[-1, 3:] = kept[-2, 4] = False
-    return np.asarray(full[kept])
+    return slope, main, share * (1 - share) * second
 
 
 def _longest(value: Array, change: Array, share: float) -> float:

@@ -192,9 +192,11 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
     ends = [0.0, *np.minimum(zones.speed[:-1], zones.speed[1:]).tolist(), 0.0]
     count = len(lengths)
     for i in range(count):
-        ends[i + 1] = _limited(ends[i + 1], ends[i], lengths[i], limits[i])
+        if ends[i + 1] > ends[i]:
+            ends[i + 1] = _limited(ends[i + 1], ends[i], lengths[i], limits[i])
     for i in reversed(range(count)):
-        ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
+        if ends[i] > ends[i + 1]:
+            ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
     rows: list[tuple[float, ...]] = []  # duration, distance, speed, acceleration at the start and jerk of each phase
     for i, ((top, most, jerk), length) in enumerate(zip(limits, lengths, strict=True)):
@@ -220,7 +222,5 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
 
 
 def _limited(speed: float, other: float, length: float, limits: tuple[float, float, float]) -> float:
-    """The speed at one end of a zone, lowered to what can be reached from that at the other."""
-    if speed <= other:
-        return speed
+    """The greater speed at one end of a zone, lowered to what can be reached from that at the other."""
     return min(speed, reach(other, length * (1 - REACH_MARGIN), *limits[1:]))

@@ -59,15 +59,20 @@ class Rows(NamedTuple):
             return np.full(len(speeds), np.inf), np.zeros(len(speeds), dtype=np.intp)
         return speeds.min(axis=1), speeds.argmin(axis=1)
 
+    @property
+    def total(self) -> int:
+        """Of rows at a place."""
+        return sum(kind.shape[1] for kind in self)
+
     def demands(self, motion: LineMotion) -> Array:
-        """Each row of `causes` over its limit during a motion at these places. Shape (S, K + L + P)."""
+        """Each row of `causes` over its limit, with its sign, during a motion at these places. Shape (S, K + L + P)."""
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
         of_a, of_j = self.acceleration, self.jerk
         return np.concatenate(
             [
                 self.speed * v,
-                np.abs(of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2]),
-                np.abs(of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3),
+                of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2],
+                of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
             ],
             axis=1,
         )
@@ -106,11 +111,17 @@ def rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, distan
     Raises:
         ProblemError: A curvature or joints that are not finite, as at a singular arm, or of a wrong shape.
     """
-    parts = [
-        _rows_at(path, limits, joints, distance[first : first + AT_ONCE])
-        for first in range(0, max(len(distance), 1), AT_ONCE)
-    ]
-    return Rows(*(np.concatenate(kind) for kind in zip(*parts, strict=True))) if len(parts) > 1 else parts[0]
+    if len(distance) <= AT_ONCE:
+        return _rows_at(path, limits, joints, distance)
+    # into memory that is there: the parts of a long path and the whole would be twice as much
+    speed, acceleration, jerk = (len(kind) for kind in _kinds(limits, joints))
+    shapes = ((speed,), (acceleration, 3), (jerk, 3))
+    all_of_them = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
+    for first in range(0, len(distance), AT_ONCE):
+        part = _rows_at(path, limits, joints, distance[first : first + AT_ONCE])
+        for kind, own in zip(all_of_them, part, strict=True):
+            kind[first : first + AT_ONCE] = own
+    return all_of_them
 
 
 def _rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Rows:

@@ -30,6 +30,10 @@ HALVINGS = 12
 SMALLEST_INTERVAL = 1e-12
 """Intervals below this share of the path are not cut further."""
 JUST_BEFORE = 1e-9
+AT_ONCE = 20_000
+"""Pieces whose curve is made at once."""
+PLACES = 500_000
+"""Of the curve, looked at at once."""
 SPREAD = 1.2
 """A stretch of one speed spans permitted speeds up to this ratio."""
 ROUNDS, THOROUGH_FROM = 200, 40
@@ -55,31 +59,55 @@ def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
 def _curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
     """Distances, the speed permitted at them (G,), and the asked one in each interval (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
+    first = np.unique(np.concatenate([path.dense(8, 2), bounds]))
+    parts = []
+    for begin in range(0, len(of_pieces), AT_ONCE):
+        ends = bounds[begin : begin + AT_ONCE + 1]
+        low, high = np.searchsorted(first, ends[[0, -1]])
+        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + AT_ONCE]))
+    s = np.concatenate([part[0][:-1] for part in parts] + [first[-1:]])
+    permitted = np.concatenate([part[1][:-1] for part in parts] + [parts[-1][1][-1:]])
+    # where two parts meet, both sides count
+    seams = np.cumsum([len(part[0]) - 1 for part in parts])[:-1]
+    permitted[seams] = np.minimum(permitted[seams], [part[1][-1] for part in parts[:-1]])
+    return s, permitted * (1 - KEPT_BACK), np.concatenate([part[2] for part in parts])
+
+
+def _refined(
+    path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
+) -> tuple[Array, Array, Array]:
+    """`_curve` over some of the pieces, from distances that are halved until they resolve it."""
 
     def most(places: Array) -> Array:
         with np.errstate(divide="ignore"):
             return np.asarray(np.sqrt(limits.centripetal / curvature_along(path, places)))
 
-    s = np.unique(np.concatenate([path.dense(8, 2), bounds]))
     permitted = most(s)
-    if len(bounds) > 2:
-        inner = bounds[1:-1]
-        before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(bounds)[:-1] / 2)
-        at = np.searchsorted(s, inner)
-        permitted[at] = np.minimum(most(before), permitted[at])
+    inner = bounds[1:]
+    before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(bounds) / 2)
+    at = np.searchsorted(s, inner)
+    permitted[at] = np.minimum(most(before), permitted[at])
     for _ in range(HALVINGS):
-        cut = np.flatnonzero(_coarse(path.length, s, permitted, of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)]))
+        asked = of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)]
+        cut = np.flatnonzero(_coarse(path.length, s, permitted, asked, limits.acceleration))
         if not cut.size:
             break
         middle = (s[cut] + s[cut + 1]) / 2
         s, permitted = np.insert(s, cut + 1, middle), np.insert(permitted, cut + 1, most(middle))
-    return s, permitted * (1 - KEPT_BACK), np.asarray(of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
+    return s, permitted, np.asarray(of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
 
 
-def _coarse(length: float, s: Array, permitted: Array, asked: Array) -> NDArray[np.bool_]:
-    """Which intervals do not resolve the permitted speed, where that is near or below the asked one."""
+def _coarse(length: float, s: Array, permitted: Array, asked: Array, acceleration: float) -> NDArray[np.bool_]:
+    """Which intervals do not resolve the permitted speed, where that is near or below the asked one.
+
+    Nor where no motion that is slow enough in its neighbourhood gets near to it.
+    """
     low = np.minimum(permitted[:-1], permitted[1:])
-    matters = (low < 1.1 * asked) & (np.diff(s) > SMALLEST_INTERVAL * length)
+    gain = 2 * acceleration * (s - s[0])
+    within = np.minimum.accumulate(permitted**2 - gain) + gain
+    within = np.minimum.accumulate((within + gain)[::-1])[::-1] - gain
+    within = np.sqrt(np.maximum(within[:-1], within[1:]))
+    matters = (low < 1.1 * np.minimum(asked, within)) & (np.diff(s) > SMALLEST_INTERVAL * length)
     value = np.log(np.minimum(permitted, 2 * asked.max()))
     step, slope = np.diff(s), np.diff(value) / np.diff(s)
     bend, least = np.zeros(len(s)), np.zeros(len(s), dtype=bool)
@@ -98,7 +126,7 @@ def _zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, thoroughly: bool) -> bool:
     """Lower speeds, in place, where a plan is faster than permitted; False when it is nowhere."""
-    here = profile.at_distance(s).speed
+    here = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // PLACES + 1)])
     top = np.maximum(here[:-1], here[1:])
     peaks = profile.peaks()
     np.maximum.at(top, piece_of(s, peaks.distance), peaks.speed)

@@ -17,6 +17,7 @@ from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara_path import ScaraPath
 from ocp import ProblemError, plan_minimum_time
 from ocp.schedule import JointLimits, LineLimits, Schedule, ToolLimits, joint_motion, ramp_distance, ramp_time, schedule
+from ocp.schedule import grid as grids
 from ocp.schedule import stretch as stretches
 from ocp.schedule.passes import passes
 from ocp.schedule.profile import advanced, through
@@ -139,6 +140,20 @@ def test_a_random_arm_is_as_fast_as_the_optimal_control_problem(seed: int) -> No
     plan = schedule(arm.path, limits, joints=arm)
     best = plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=60, rounds=1)
     assert plan.duration <= 1.02 * best.duration
+    assert largest(plan, arm).max() <= 1.001
+
+
+@pytest.mark.parametrize("seed", [5, 15, 23, 29])
+def test_a_finer_grid_is_hardly_faster(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first two lose most of fifty."""
+    arm, limits = random_arm(seed)
+    plan = schedule(arm.path, limits, joints=arm)
+    for name in ("OF_BUILD_UP", "OF_RAMP", "OF_TURN", "UNEVEN", "UNEVEN_SPEED"):
+        monkeypatch.setattr(grids, name, getattr(grids, name) / 4)
+    monkeypatch.setattr(grids, "GROWTH", 1.05)
+    fine = schedule(arm.path, limits, joints=arm)
+    assert len(fine.profile.jerk) > 1.5 * len(plan.profile.jerk)
+    assert fine.duration * (1 - 2e-4) <= plan.duration <= fine.duration * 1.005
     assert largest(plan, arm).max() <= 1.001
 
 
