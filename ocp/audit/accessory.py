@@ -30,6 +30,8 @@ NOISE = 1e-14
 """Curvature along a control of its size, of the largest, below which it is rounding."""
 STILL = 10 * FLOOR
 """Share of the largest entry of a state or a control below which another one stands still."""
+LITTLE = 1e-3
+"""Share of the largest state of its unit below which another one might as well move as that does."""
 AT_BOUND = 1e-5
 """A value nearer to its bound than this share of its spread or range is held by it."""
 
@@ -70,7 +72,7 @@ class AccessoryProblem:
     def _units(self) -> None:
         """Units in which a sweep is well conditioned: they judge nothing.
 
-        Horizon and states by their sizes, those that stand still by that of the others of their unit. Controls so that
+        Horizon and states by their sizes, those that hardly move by that of the others of their unit. Controls so that
         the Hamiltonian curves alike along each, however little it moves; by their sizes where it does not curve, which
         for one that never moves is its value.
         """
@@ -226,14 +228,14 @@ class AccessoryProblem:
 
 
 def _as_others(size: np.ndarray, places: dict[str, slice], declared: dict[str, Variable]) -> None:
-    """What stands still among others of its unit might have moved as they do: it is given their size."""
+    """What hardly moves beside others of its unit might have moved as they do: it is given their size."""
     largest: dict[str, float] = {}
     for name, place in places.items():
         unit = declared[name].unit or name
         largest[unit] = max(largest.get(unit, 0.0), float(size[place].max()))
     for name, place in places.items():
         others = largest[declared[name].unit or name]
-        size[place] = np.where(size[place] <= STILL * others, others, size[place])
+        size[place] = np.where(size[place] <= LITTLE * others, others, size[place])
 
 
 def obstacle(form: Formulation) -> str:

@@ -21,12 +21,12 @@ from ocp.audit.principle import FLAT
 
 __all__ = ["Fit", "best_multipliers"]
 
-NEARNESS = 1e-6
-"""Weight of the mean square distance from the costates reported, among multipliers that lose as much."""
+NEARNESS = 1e-5
+"""Weight of the mean square distance from the costates reported, by their size, among multipliers that lose as much."""
 SOLVER = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
-    "ipopt.tol": 1e-7,
+    "ipopt.tol": 1e-9,
     "ipopt.max_iter": 200,
     "ipopt.mu_strategy": "adaptive",
     "ipopt.perturb_always_cd": "yes",  # multipliers of dependent limits are not unique
@@ -158,14 +158,19 @@ class _Dual:
         self.costate = self.program.variables(n * q * nx).reshape(n * q, nx)
         first, last = ends_of_intervals(along)
         self.told = np.vstack([first, last[-1:]]) * along.state_size
-        near = NEARNESS / (n + 1)
+        near = NEARNESS / (n + 1) / max(1.0, float(np.abs(self.told).max()) / cost)
         price = -near * self.told.ravel() / cost
         self.nodes = self.program.variables(self.told.size, price=price, weight=near).reshape(n + 1, nx)
 
+        # a step no shorter than the way between limits leaves it to their gaps to say what it costs
+        width = (along.high - along.low).max(axis=0, initial=0.0)
+        self.step = np.where(np.isfinite(width), np.maximum(width, along.sizes.control), along.sizes.control)
+        driven = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
+        self.far = max(1.0, float((driven / along.state_size).max(initial=0.0)))
         # what pushes along arcs of the states is among their own limits
         held = along.hold.near & (np.arange(along.hold_u.shape[1]) < nu + len(along.mixed))
         held[:, :nu] = True
-        self.hold = _Pushes.of(self.program, along.hold, held, along.hold_u, along.sizes.control, along.share)
+        self.hold = _Pushes.of(self.program, along.hold, held, along.hold_u, self.step, along.share)
         wide = np.append(along.state_size, 0.0)
         self.stand = _Pushes.of(self.program, along.stand, along.stand.near, along.stand_x, wide)
         inner = along.node_stand.near & (along.nodal | ~along.node_stand.equal)
@@ -202,9 +207,12 @@ class _Dual:
             program.add(mine[stand.point], stand.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """dH/du is what is left of it: paid by its square where the Hamiltonian curves, else for a step of one size."""
+        """dH/du is what is left of it: paid by its square where the Hamiltonian curves, else for a step.
+
+        A step is as large as the control is along the plan, or, where it has limits, as the way between them.
+        """
         along, program, hold = self.along, self.program, self.hold
-        nx, unit, share = along.form.nx, along.sizes.control, along.share[:, None]
+        nx, unit, share = along.form.nx, self.step, along.share[:, None]
         rows = program.equations(-along.cost_y[:, nx + 1 :] * unit / self.cost)
         rate = along.rate_y[:, :, nx + 1 :] * unit / along.state_size[:, None]
         program.add(rows[:, :, None], self.costate[:, None, :], rate.transpose(0, 2, 1))
@@ -220,7 +228,7 @@ class _Dual:
             self.left.append(part)
 
     def _ends(self) -> None:
-        """What is left of the conditions at the ends is paid for a step of one size."""
+        """What is left of the conditions at the ends is paid for a step as far as controls could drive the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share
@@ -248,7 +256,7 @@ class _Dual:
                 program.add(rows[-1], pushes.index, -horizon * pushes.slope[:, nx])
         self.missed = []
         for sign in (-1.0, 1.0):
-            self.missed.append(program.variables(int(self.free.sum()), 0.0, 1.0))
+            self.missed.append(program.variables(int(self.free.sum()), 0.0, self.far))
             program.add(rows[self.free], self.missed[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:

@@ -9,12 +9,13 @@ on the way asks for no more than conditions at both ends, which every method and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
@@ -22,8 +23,9 @@ from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
 from ocp.problem.problem import Problem
-from ocp.tasks.checks import check_closed
+from ocp.tasks.checks import check_closed, check_speed
 from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.geometry import is_holonomic
 from ocp.tasks.limits import JointBounds
 from ocp.tasks.tip_task import TipTask
 
@@ -31,8 +33,16 @@ __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names where the time is free: of the time as a state, of the derivatives of joints and time by the tasks' own."""
+SAMPLES = 3
+"""Configurations in which it is looked at what follows from what."""
 SAME_TIME = 1e-9
 """Share of the horizon: times nearer to each other are one."""
+PIECES = 8
+"""Of a stretch at least, as a mesh has intervals."""
+LEAST_GAP = 1e-6
+"""m and rad: a pose error at the start that is none."""
+STIFFEST = 4.0
+"""Powers of e by which the feedback may lower a pose error over a piece: more only makes the mesh finer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +102,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """The parts of a horizon (s) in which the same tasks are done.
+    """The parts of a horizon (s) with the same tasks each, their pose errors fed back no faster than a mesh can follow.
 
     Raises:
         ProblemError: A task that begins or ends outside the horizon.
@@ -113,11 +123,18 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         inside = [tasks[i].begin + np.asarray(tasks[i].breaks) for i in active]
         breaks = np.unique(np.concatenate([np.zeros(0), *inside]))
         breaks = breaks[(breaks > begin + slack) & (breaks < end - slack)]
-        equations = bind(machine, [tasks[i] for i in active]) if active else None
+        pieces = np.diff([begin, *breaks, end]) if len(breaks) >= PIECES else np.array([(end - begin) / PIECES])
+        most = STIFFEST / float(pieces.max())
+        equations = bind(machine, [_gentle(tasks[i], most) for i in active]) if active else None
         suffix = f" {len(found) + 1}" if len(bounds) > 2 else ""
         new = tuple(i not in before for i in active)
         found.append(Stretch(begin, end, active, equations, new, breaks, suffix))
     return tuple(found)
+
+
+def _gentle(task: TipTask, most: float) -> TipTask:
+    """A task whose feedback is no faster than so many 1/s, but where it has a gap to close as it is told."""
+    return task if task.gain <= most or task.start_gap > LEAST_GAP else replace(task, gain=most)
 
 
 def tool_motion_problem(
@@ -151,16 +168,20 @@ def tool_motion_problem(
             tasks' own time is kept.
 
     Raises:
-        ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last. Where
-            the time is free: several stretches, a base that drifts.
+        ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last; a task
+            faster than the rates allow in any posture. Where the time is free: several stretches, a base that drifts.
     """
     if time_cost is not None:
         return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost)
     horizon = stretches[-1].end
+    for stretch in stretches:
+        if stretch.equations is not None:
+            check_speed(stretch.equations, bounds.velocity, stretch.begin, stretch.end)
     problem = Problem("tool motion")
     problem.horizon(horizon)
     running: Any = 0
     moving: list[list[Any]] = []
+    passed: Array | None = None
     for stretch in stretches:
         begins, ends = stretch is stretches[0], stretch is stretches[-1]
         pace = stretch.duration / horizon
@@ -173,7 +194,14 @@ def tool_motion_problem(
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, lower=-most, upper=most, unit=unit)
         slack = _closure(problem, stretches, base, reference) if cyclic and ends else 0
         if stretch.equations is not None:
-            _declare_tasks(problem, stretch, place, joints, rates, pace, slack, free, (base, reference))
+            asked = np.ones(stretch.equations.size, dtype=bool)
+            slopes = _slopes(stretch, base, reference)
+            if passed is not None:
+                asked = ~_within(slopes, passed)
+            _declare_tasks(problem, stretch, place, joints, rates, pace, slack, free, (base, reference), asked)
+            passed = slopes[:, stretch.equations.posed | (_places(stretch.equations) & (begins | ~asked))]
+        else:
+            passed = None
         if machine.base_size:
             problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
         problem.dynamics(joints, pace * rates)
@@ -279,8 +307,12 @@ def _declare_tasks(
     closure: Any,
     free: bool,
     reference: tuple[Array, Array],
+    asked: NDArray[np.bool_] | None = None,
 ) -> None:
-    """The tasks of a stretch, over the time of the problem; `free`: what begins here has to be at its start."""
+    """The tasks of a stretch, over the time of the problem; `free`: what begins here has to be at its start.
+
+    But for rows that are not `asked`, (size,), because what came before leads there.
+    """
     equations, when = stretch.equations, stretch.suffix
     assert equations is not None
     targets_at = equations.target_function()
@@ -298,8 +330,44 @@ def _declare_tasks(
     if not free:
         return
     begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
+    begins &= True if asked is None else asked
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
     # a velocity says nothing of places: at the start of the motion its tip is where the reference has it
     held = [] if stretch.begin else [equations.holding(base, joints, *reference)]
     if (condition := ca.vertcat(error, *held)).numel():
         problem.start(f"start pose{when}", condition, 0, 0, unit=equations.unit("", ""))
+
+
+def _places(equations: TaskEquations) -> NDArray[np.bool_]:
+    """Which rows say where something is, or have an integral that does. Shape (size,), bool."""
+    return np.concatenate([is_holonomic(part) for part in equations.bound]).astype(bool)
+
+
+def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
+    """Derivatives in base and joints of where the rows of a stretch's tasks are, in random configurations.
+
+    Shape (SAMPLES, size, base_size + joint_size).
+    """
+    equations = stretch.equations
+    assert equations is not None
+    b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
+    error = equations.error(b, q, equations.target_function()(stretch.begin))
+    held, at, rows = equations.holding(b, q, base, reference), 0, []
+    for i, posed in enumerate(equations.posed):
+        rows.append(error[i] if posed else held[at])
+        at += not posed
+    slope = ca.Function("slope", [b, q], [ca.jacobian(ca.vertcat(*rows), ca.vertcat(b, q))])
+    rng = np.random.default_rng(0)
+    places = base + rng.normal(size=(SAMPLES, len(base)))
+    places[:, 3:] /= np.linalg.norm(places[:, 3:], axis=1, keepdims=True) if len(base) == 7 else 1.0
+    joints = reference + rng.normal(size=(SAMPLES, len(reference)))
+    return np.array([np.array(slope(place, at)) for place, at in zip(places, joints, strict=True)])
+
+
+def _within(slopes: Array, known: Array) -> NDArray[np.bool_]:
+    """Which rows are, in every sample, combinations of those that are known. Shapes (S, k, n), (S, m, n) to (k,)."""
+    found = np.ones(slopes.shape[1], dtype=bool)
+    for rows, others in zip(slopes, known, strict=True):
+        left = rows - rows @ np.linalg.pinv(others, rcond=1e-9) @ others
+        found &= np.linalg.norm(left, axis=1) <= 1e-9 * np.linalg.norm(rows, axis=1)
+    return found

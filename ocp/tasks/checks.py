@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Machine
+from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.tasks.equations import TaskEquations
@@ -19,6 +20,7 @@ __all__ = [
     "check_closed",
     "check_length",
     "check_rest",
+    "check_speed",
     "checked_configuration",
     "checked_horizon",
     "checked_numbers",
@@ -284,6 +286,64 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
             raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
+def check_speed(equations: TaskEquations, most: Array, begin: float, end: float) -> None:
+    """Raise ProblemError where a task is faster than its joints at their limits could move the tip in any posture.
+
+    A joint that turns moves the tip by its rate times the distance, at most the length of the links from its axis on.
+
+    Args:
+        equations: Of a fixed base; others are not looked at.
+        most: Limits of the joint rates, rad/s or m/s, shape (n,). begin, end: Of the tasks, s.
+    """
+    times = np.linspace(begin, end, TRACK_SAMPLES)[1:-1]
+    values = np.array(equations.target_function().map(len(times))(times[None, :]))
+    for part, mine in _parts(equations, values):
+        task, robot = part.task, part.tip.robot
+        chain = [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
+        if part.tip.base_size or part.reference or task.axes != "world" or any(j.mimic is not None for j in chain):
+            continue
+        rates = [float(most[robot.joint_names.index(joint.name)]) for joint in chain]
+        moved = zip(rates, chain, strict=True)
+        fastest = sum(
+            rate * (_length_from(part.tip, joint) if joint.kind != "prismatic" else 1) for rate, joint in moved
+        )
+        turning = sum(rate for rate, joint in zip(rates, chain, strict=True) if joint.kind != "prismatic")
+        turned = [row for row in task.chosen if row in ANGULAR]
+        if task.is_pose:
+            spins = mine[-3:] if task.tilts else mine[-3:][turned]
+            rows = [mine[3:6][task.linear], spins] if task.position is not None else [mine[:0], spins]
+        else:
+            at = {row: mine[i] for i, row in enumerate(task.chosen)}
+            rows = [np.array([at[row] for row in at if (row in ANGULAR) == angular]) for angular in (False, True)]
+        for asked, limit, unit in zip(rows, (fastest, turning), ("m/s", "rad/s"), strict=True):
+            if not len(asked) or task.start_gap > CLOSED:
+                continue
+            speed = np.linalg.norm(asked, axis=0)
+            worst = int(speed.argmax())
+            if speed[worst] > limit * (1 + CLOSED):
+                words = (
+                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {speed[worst]:.4g} {unit}, "
+                    f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
+                )
+                told: dict[str, Any] = {"value": float(speed[worst]), "limit": limit, "time": float(times[worst])}
+                raise ProblemError(words, name=_frame(part), **told)
+
+
+def _length_from(machine: Machine, joint: Joint) -> float:
+    """How far the tip can be from a joint's axis at most, m."""
+    robot = machine.robot
+    chain = robot.path_to(robot.tip_link)
+    after = chain[[other.name for other in chain].index(joint.name) + 1 :]
+    return _length(machine, after)
+
+
+def _length(machine: Machine, joints: Sequence[Joint]) -> float:
+    """Of the way along joints to the tip, m: links, and slides where they are longest."""
+    length = float(np.linalg.norm(machine.robot.tip_translation))
+    length += sum(float(np.linalg.norm(joint.translation)) for joint in joints)
+    return length + sum(max(abs(joint.lower), abs(joint.upper)) for joint in joints if joint.kind == "prismatic")
+
+
 def _reach(machine: Machine, base: Array) -> tuple[Array, float]:
     """Where the first moving joint stands in the world, (3,), and how far from there the tip can be at most."""
     robot = machine.robot
@@ -293,10 +353,9 @@ def _reach(machine: Machine, base: Array) -> tuple[Array, float]:
     turn, shoulder = np.array(ca.DM(frame.rotation)), np.array(ca.DM(frame.position)).ravel()
     for joint in chain[: first + 1]:
         shoulder, turn = shoulder + turn @ joint.translation, turn @ joint.rotation
-    reach = float(np.linalg.norm(robot.tip_translation))
-    reach += sum(float(np.linalg.norm(joint.translation)) for joint in chain[first + 1 :])
-    reach += sum(max(abs(joint.lower), abs(joint.upper)) for joint in chain if joint.kind == "prismatic")
-    return shoulder, reach
+    slides = [joint for joint in chain[: first + 1] if joint.kind == "prismatic"]
+    before = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
+    return shoulder, before + _length(machine, chain[first + 1 :])
 
 
 def _rate_rows(task: TipTask) -> list[int]:

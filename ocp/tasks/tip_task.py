@@ -57,8 +57,9 @@ class TipTask:
         point: Origin of the frame in the link's frame. Shape (3,), m. Only with `link`.
         relative_to: Name of the reference, a link relative to which the motion and the pose are meant; None for the
             world.
-        gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves. Where
-            accelerations are asked for it damps critically, and velocities decay to what a `velocity` asks.
+        gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves; `plan`
+            lowers it to that where there is no gap to close. Where accelerations are asked for it damps critically, and
+            velocities decay to what a `velocity` asks.
         start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
         begin: When the task begins, s; its tracks are functions of the time from there on.
         duration: How long it lasts, s; None: to the end of the motion.

@@ -17,7 +17,10 @@ RUNS = [(case, run) for case in CASES for run in case.runs]
 
 
 def of(pairs: list[tuple[Case, Run]]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize(("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c, r in pairs])
+    """One process for each, so that it is solved once."""
+    named = [(c, r, f"{c.name}: {r}") for c, r in pairs]
+    marked = [pytest.param(c, r, id=name, marks=pytest.mark.xdist_group(name)) for c, r, name in named]
+    return pytest.mark.parametrize(("case", "run"), marked)
 
 
 every_run = of(RUNS)

@@ -25,8 +25,10 @@ def is_supported(case: Case, run: Run) -> bool:
     )
 
 
+RUNS = [(c, r, f"{c.name}: {r}") for c in CASES for r in c.runs if is_supported(c, r)]
 every_run = pytest.mark.parametrize(
-    ("case", "run"), [pytest.param(c, r, id=f"{c.name}: {r}") for c in CASES for r in c.runs if is_supported(c, r)]
+    ("case", "run"),
+    [pytest.param(c, r, id=name, marks=pytest.mark.xdist_group(f"fatrop {name}")) for c, r, name in RUNS],
 )
 
 

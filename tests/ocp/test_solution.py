@@ -31,6 +31,8 @@ from ocp import (
 )
 from tests.ocp.problems import EVERY_METHOD, SWING, energy, swing, van_der_pol
 
+pytestmark = pytest.mark.xdist_group("solutions")  # one process, so that every plan is solved once
+
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 
 

@@ -19,6 +19,8 @@ from ocp.problem.formulation import Formulation
 from ocp.solution import drawn_in_at, in_order_of
 from tests.ocp.problems import double_integrator, plant, van_der_pol
 
+pytestmark = pytest.mark.xdist_group("tightening")  # one process, so that every plan is tightened once
+
 METHODS = [
     Collocation(10, degree=3),
     Collocation(10, degree=3, scheme="legendre"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
 from ocp.audit.accessory import AccessoryProblem
@@ -354,3 +356,30 @@ def test_near_a_conjugate_point_a_plan_loses_more_than_its_controls_alone_could_
     assert found.feasible
     assert found["cost lost, relative"].value * found.optimality.cost_size == pytest.approx(more, rel=0.02)
     assert found.optimal is (more < 1e-3 * found.optimality.cost_size)
+
+
+@pytest.mark.parametrize("intervals", [3, 5, 12])
+def test_on_few_intervals_too_what_is_lost_is_what_the_controls_cost_more(intervals: int) -> None:
+    """x' = u - x, min int (x^2 + u^2) / 2: the plan's controls integrated anew, beside the Riccati solution.
+
+    What polynomials miss between their own points is seen at points of other places only.
+    """
+    horizon, root = 4.0, np.sqrt(2.0)
+    least = np.sinh(root * horizon) / (root * np.cosh(root * horizon) + np.sinh(root * horizon)) / 2
+    problem = Problem("regulator")
+    x, u = problem.state("x", initial=1.0), problem.control("u")
+    problem.horizon(horizon)
+    problem.dynamics(x, u - x)
+    problem.minimize(running=(x**2 + u**2) / 2)
+    plan = solve(problem, Collocation(intervals, 3))
+    curve = plan.control_interpolant
+    spent = np.array([1.0, 0.0])
+    for k, (begin, end) in enumerate(pairwise(curve.breaks)):
+        power = np.polynomial.polynomial.polyfit(curve.nodes, curve.values[k, :, 0], len(curve.nodes) - 1)
+
+        def rate(s: float, y: Array, begin: float = begin, end: float = end, power: Array = power) -> Array:
+            push = np.polynomial.polynomial.polyval((s - begin) / (end - begin), power)
+            return horizon * np.array([push - y[0], (y[0] ** 2 + push**2) / 2])
+
+        spent = solve_ivp(rate, (begin, end), spent, rtol=1e-11, atol=1e-14).y[:, -1]
+    assert float(plan.audit().lost.sum()) == pytest.approx(spent[1] - least, rel=0.05)

@@ -61,7 +61,7 @@ def check(machine: Machine, asked: dict[str, Any], speed: Array, intervals: int)
     tips = numeric(tip(places, audit.states["joints"].T)).T
     assert np.abs(tips - tips[0] - audit.t[:, None] * speed).max() < 1e-6
     assert local.stopped is not None or plan.cost < local.cost[-1]
-    finer = Collocation(intervals=4 * plan.method["intervals"], degree=4)
+    finer = Collocation(intervals=2 * plan.method["intervals"], degree=4)
     again = solve(minimum_velocity_problem(machine, **asked), finer, guess=plan)
     assert plan.cost == pytest.approx(again.cost, rel=1e-4)
     fine = plan.at(np.linspace(0, plan.horizon, 2001))["joints"]

@@ -18,6 +18,8 @@ from tests.models.paths.test_paths import example
 from tests.ocp.schedule.test_schedule import line
 from tests.ocp.schedule.test_schedule_joints import SLOW, BrokenJoints
 
+pytestmark = pytest.mark.xdist_group("timing")  # one process, so that the example is solved once
+
 INTERVALS = 100
 HELD = 1e-2
 """What jerks held over so few intervals may cost; the schedule beside them is not bound to them."""

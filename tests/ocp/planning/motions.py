@@ -9,8 +9,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from models import Arc, FixedBase, Link, Machine, Path, SmoothPath, merged, smooth
+from models import Arc, FixedBase, Helix, Link, Machine, Path, SmoothPath, merged, smooth
 from models.spatial import quaternion_product
 from ocp import TipTask
 from ocp.planning import Plan, plan
@@ -90,6 +91,13 @@ def circle(center: Any, radius: float) -> SmoothPath:
     middle = np.asarray(center, dtype=float)
     ends = [middle + np.array([side, 0.0, 0.0]) for side in (radius, -radius)]
     return smooth(Path(tuple(Arc.about(end, middle, (0, 0, 1), np.pi) for end in ends)), deviation=0.001)
+
+
+def helix(center: Any, radius: float, rise: float, turns: float) -> SmoothPath:
+    """Up about the vertical through the centre, from the side along x."""
+    middle = np.asarray(center, dtype=float)
+    screw = Helix(middle + np.array([radius, 0.0, 0.0]), middle, (0, 0, 1), 2 * np.pi * turns, rise)
+    return smooth(Path((screw,)), deviation=0.001)
 
 
 @cache
@@ -230,3 +238,49 @@ def two_arms() -> Asked:
     move = replace(TipTask.along(path, 0.05, direction=(0, 1, 0)), link="right_panda_hand")
     arm = panda_peer(prefix="right_", place=(0.0, -0.3, 0.0))
     return Asked(pair(), [hold, move], arm, path, 0.05, (0, 1, 0))
+
+
+@asked
+def helix_ur5() -> Asked:
+    path = helix((0.5, 0.1, 0.2), 0.06, 0.08, 1.5)
+    return Asked(angled_ur5(), TipTask.along(path, 0.1, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN)
+
+
+@asked
+def helix_panda() -> Asked:
+    path = helix((0.45, 0.0, 0.3), 0.06, 0.08, 1.5)
+    return Asked(panda(), TipTask.along(path, 0.1, direction=DOWN), panda_peer(), path, 0.1, DOWN)
+
+
+def on_board(path: SmoothPath, speed: float, looks: str = "axis", **told: Any) -> Asked:
+    """The space arm along a path from where its tip is, its tool as it is then but for what is told."""
+    axis = space_tip()[1][:, 2]
+    direction = None if looks == "orientation" else axis
+    task = TipTask.along(path, speed, **({"roll": "given"} if direction is None else {"direction": axis}), **told)
+    start = {"start": SPACE_START}
+    return Asked(floating_manipulator(), task, space_peer(), path, speed, direction, looks=looks, options=start)
+
+
+@asked
+def helix_space_arm() -> Asked:
+    return on_board(helix(space_tip()[0] - [0.03, 0.0, 0.0], 0.03, 0.03, 1.0), 0.02)
+
+
+@asked
+def contour_space_arm() -> Asked:
+    """Closed, but for the joints: the base has turned when the tip is back."""
+    return on_board(circle(space_tip()[0] - [0.04, 0.0, 0.0], 0.04), 0.02)
+
+
+@asked
+def poses_space_arm() -> Asked:
+    position, rotation = space_tip()
+    here = numeric(ca.DM(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))).ravel()
+    turns = [here, turned_by(here, (0, 1, 0), 0.3), turned_by(here, (1, 0, 0), 0.3)]
+    places = position + np.array([[0, 0, 0], [0, 0.06, 0.02], [0.05, 0.06, 0.0]])
+    return on_board(smooth(Path.through(places, turns), deviation=0.005), 0.02, "orientation")
+
+
+@asked
+def finishing_space_arm() -> Asked:
+    return on_board(raster(3, space_tip()[0], (0.04, 0.06)), 0.02, "cone", within=CONE)

@@ -13,6 +13,8 @@ from ocp.planning import Plan, plan
 from tests.models.robot.trees import Array
 from tests.ocp.planning.motions import ASKED, planned
 
+pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
+
 APART = 0.3
 """rad: postures nearer to each other, but for full turns, slide to the same motion."""
 

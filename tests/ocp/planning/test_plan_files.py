@@ -24,6 +24,8 @@ from tests.ocp.planning.motions import planned
 from tests.ocp.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas
 from tests.ocp.test_faults import run
 
+pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
+
 Arrays = dict[str, np.ndarray]
 
 

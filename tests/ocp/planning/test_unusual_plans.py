@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from models import FixedBase, Machine, Path, Robot, SmoothPath, locked, planar_chain, smooth
-from ocp import TipTask
+from ocp import ProblemError, SolveError, TipTask
 from ocp.planning import Plan, plan
 from ocp.tasks.equations import bind, task_errors
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
@@ -161,3 +162,55 @@ def test_a_velocity_is_done_and_what_it_does_not_need_rests() -> None:
     places = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([0.0, 1.0, 2.0])["joints"]]
     np.testing.assert_allclose(np.diff(places, axis=0), [[0.05, 0.05, 0.0]] * 2, atol=1e-6)
     np.testing.assert_allclose(found["joints"][:, 6], PANDA_START[6], atol=1e-9)
+
+
+def moved_by_a_velocity() -> TipTask:
+    return TipTask(velocity=[0.05, 0.05, 0.0], rows=(3, 4, 5), duration=2.0)
+
+
+def moved_by_a_pose() -> TipTask:
+    _, at = pose(panda(), (), PANDA_START)
+    return TipTask(position=lambda t: ca.DM(at) + t * ca.DM([0.05, 0.05, 0.0]), duration=2.0)
+
+
+@pytest.mark.parametrize("first", [moved_by_a_velocity, moved_by_a_pose])
+@pytest.mark.parametrize("rows", [(3, 4, 5), (3,), ()], ids=["the place", "one coordinate", "nothing"])
+def test_to_hold_what_was_reached_costs_nothing_more(first: Callable[[], TipTask], rows: tuple[int, ...]) -> None:
+    """That the tip begins where it is held follows from what it did before: it is not asked twice."""
+    _, at = pose(panda(), (), PANDA_START)
+    still = [TipTask(position=at + np.array([0.1, 0.1, 0.0]), rows=rows, begin=2.0, duration=2.0)] if rows else []
+    found = plan(panda(), [first(), *still], 4.0, start=PANDA_START, search="start")
+    assert found.audit().passed
+    alone = plan(panda(), first(), start=PANDA_START, search="start")
+    assert found.cost == pytest.approx(alone.cost, rel=1e-6)
+    np.testing.assert_allclose(found.at(4.0)["joints"], alone["joints"][-1], atol=1e-5)
+
+
+def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_other() -> None:
+    """A place held, a velocity, and the place it leads to: the cost is that of the velocity alone, from its start."""
+    _, at = pose(panda(), (), PANDA_START)
+    shift = np.array([0.1, 0.1, 0.0])
+    before, after = (TipTask(position=p, duration=1.0) for p in (at, at + shift))
+    tasks = [before, replace(moved_by_a_velocity(), begin=1.0), replace(after, begin=3.0)]
+    found = plan(panda(), tasks, start=PANDA_START, search="start")
+    assert found.audit().passed
+    tips = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([1.0, 3.0, 4.0])["joints"]]
+    np.testing.assert_allclose(tips, [at, at + shift, at + shift], atol=1e-6)
+    assert found.cost < plan(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
+
+
+def test_a_place_that_what_came_before_does_not_lead_to_is_refused_by_name() -> None:
+    _, at = pose(panda(), (), PANDA_START)
+    off = TipTask(position=at + np.array([0.1, 0.12, 0.0]), begin=2.0, duration=2.0)
+    with pytest.raises(SolveError, match="task position 2") as caught:
+        plan(panda(), [moved_by_a_velocity(), off], start=PANDA_START, search="start")
+    assert caught.value.name
+
+
+@pytest.mark.parametrize(
+    "root", [TipTask(link="panda_link0", position=(0, 0, 0)), TipTask(link="panda_link0", velocity=[0.0], rows=(2,))]
+)
+def test_to_hold_a_root_that_nothing_moves_is_refused(root: TipTask) -> None:
+    with pytest.raises(ProblemError, match="no joint moves") as caught:
+        plan(panda(), [replace(moved_by_a_pose()), root], start=PANDA_START)
+    assert caught.value.name == "rows"

@@ -21,6 +21,7 @@ from tests.models.cts.cts_oracle import random_targets
 from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 
 PAPER = cts.PAPER
+pytestmark = pytest.mark.xdist_group("cts")  # one process, so that the script runs once
 EXAMPLE = Path(__file__).resolve().parents[3] / "scripts" / "c_export"
 PICTURES = (
     "fig06_rig.png",
