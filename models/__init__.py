@@ -11,6 +11,7 @@ from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
+from models.machines.surroundings import Moving, Surroundings
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
@@ -41,7 +42,7 @@ from models.robot.rebuild import (
     with_load,
 )
 from models.robot.robot import Robot, planar_chain
-from models.shapes.capsules import Box, Capsule
+from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
 from models.spatial import Frame
 
 __all__ = [
@@ -50,25 +51,31 @@ __all__ = [
     "Box",
     "Capsule",
     "CollisionShape",
+    "Cylinder",
     "FixedBase",
     "Footprint",
     "Frame",
     "FreeFloating",
+    "HalfSpace",
     "Helix",
     "Joint",
     "Line",
     "Link",
     "Machine",
+    "Mesh",
     "Mimic",
     "ModelError",
     "ModelWarning",
+    "Moving",
     "Path",
     "Rig",
     "Robot",
     "Scara",
     "SmoothPath",
+    "Sphere",
     "Standing",
     "Support",
+    "Surroundings",
     "Tunnel",
     "Wrench",
     "attached",

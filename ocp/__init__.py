@@ -2,6 +2,7 @@
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate
+from ocp.builders.clearance import Clear
 from ocp.builders.cts import roll_problem, spline_targets
 from ocp.builders.joint_spline import joint_path
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
@@ -33,6 +34,7 @@ __all__ = [
     "AuditError",
     "Candidate",
     "Certificate",
+    "Clear",
     "Collocation",
     "Finding",
     "Following",

@@ -144,6 +144,9 @@ def refine(
             hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
         words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
         warnings.warn(RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0), stacklevel=2)
+    elif touching := [each for each in audit.failures if each.name in form.apart]:
+        words = f"{stopped}; finer intervals keep no bodies apart, add constraints that do: {touching[0].note}"
+        warnings.warn(RefinementWarning(words, name=touching[0].name, value=touching[0].value, limit=1.0), stacklevel=2)
     elif not audit.passed:
         words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
         warnings.warn(RefinementWarning(words, name="undecided", value=audit.undecided), stacklevel=2)
@@ -218,7 +221,9 @@ class _Parts(NamedTuple):
         """Of a row that is so large, where an interval may have the same part of a sum as any other. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         whole = values.mean() if self.summed else values.max()
-        return np.where(values > 0, total * (values / (whole or 1.0)), 0.0)
+        found = np.zeros(len(values))
+        found[values > 0] = total * (values[values > 0] / (whole or 1.0))
+        return found
 
 
 def _rows(
@@ -238,7 +243,7 @@ def _rows(
         parts[name] = _Parts("equalities" if equal else "limits", misses, order)
     rows = []
     for finding in (asked, *audit.findings):
-        if finding.limit is None:
+        if finding.limit is None or finding.name in form.apart:  # no finer interval keeps bodies apart
             continue
         value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
         value = np.inf if np.isnan(value) else float(value)

@@ -12,13 +12,14 @@ from tests.models.machines.test_bad_machines import CASES as MACHINES
 from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
 from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
+from tests.models.shapes.test_bad_shapes import CASES as SHAPES
 from tests.ocp.builders.test_bad_tasks import CASES as TASKS
 from tests.ocp.files.test_bad_files import CASES as FILES
 from tests.ocp.planning.test_bad_plans import CASES as PLANS
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
 
-CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS]
+CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS]
 MADE_BY_THE_PACKAGE = {
     "Audit",
     "Candidate",

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 Rule: TypeAlias = Callable[["House"], list[str]]
 
 FLOORS = {
-    "models": [["errors"], ["arrays"], ["spatial"], ["robot", "paths", "shapes"], ["machines", "cts"], ["papers"]],
+    "models": [["errors"], ["arrays"], ["spatial"], ["robot", "paths"], ["shapes"], ["machines", "cts"], ["papers"]],
     "ocp": [
         ["errors", "curves", "console"],
         ["storage"],

@@ -16,12 +16,14 @@ import numpy as np
 
 from models.arrays import checked_count, checked_each, checked_instance, checked_nonnegative, checked_number
 from models.cts.best_roll import optimal_inverse
+from models.cts.gaps import LinkCapsule, capsule_in_box, capsule_to_box, capsule_to_capsule
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, dh_frames, joints_of, posture_at
 from models.cts.roll import ACTIVE, STATUS, index_harmonics, verdict
 from models.cts.roll_change import checked_gain, unrolled
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
-from models.shapes.capsules import Box, Capsule, capsule_in_box, capsule_to_box, capsule_to_capsule, soft_minimum
+from models.shapes.distance import soft_minimum
+from models.shapes.shapes import Box, Capsule
 from models.spatial import FULL_TURN, Expression
 
 PATTERN_STEPS, PATTERN_SHRINK = 44, 0.62
@@ -65,7 +67,7 @@ class Surroundings:
             object.__setattr__(self, what, checked_each(getattr(self, what), kind, "surroundings", what))
 
 
-def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, Capsule]:
+def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
     """Links of the rig as capsules, by name, from joint 2 to the store."""
     checked_instance(rig, Rig, "rig", "rig")
     radii = Radii() if radii is None else checked_instance(radii, Radii, "rig", "radii")
@@ -75,12 +77,12 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
     corner, tool = frames[4].position, frames[7]
     behind = tool.point((-rig.sting, 0, 0))
     return {
-        "yaw link 1": Capsule(radii.yaw, joint2, joint3),
-        "yaw link 2": Capsule(radii.yaw, joint3, joint4),
-        "yaw offset": Capsule(radii.yaw, joint4, side),
-        "pitch link": Capsule(radii.pitch, side, corner),
-        "goose-neck": Capsule(radii.sting, corner, behind),
-        "sting": Capsule(radii.sting, behind, tool.position),
+        "yaw link 1": LinkCapsule(radii.yaw, joint2, joint3),
+        "yaw link 2": LinkCapsule(radii.yaw, joint3, joint4),
+        "yaw offset": LinkCapsule(radii.yaw, joint4, side),
+        "pitch link": LinkCapsule(radii.pitch, side, corner),
+        "goose-neck": LinkCapsule(radii.sting, corner, behind),
+        "sting": LinkCapsule(radii.sting, behind, tool.position),
     }
 
 

@@ -51,6 +51,7 @@ class CollisionShape:
         file: Of a mesh, as it was given: nothing looks for it here.
         translation: Origin of the shape's frame, the middle of all but a mesh, in the link frame. Shape (3,), m.
         rotation: Axes of the shape's frame, as columns, in the link frame. Shape (3, 3).
+        folder: Of the description that names the file, where it is looked for first; "" where that is not known.
 
     Raises:
         ModelError: Unknown kind, wrong sizes, a size that is not positive, a mesh without a file or scaled to nothing.
@@ -61,10 +62,12 @@ class CollisionShape:
     file: str = ""
     translation: ArrayInput = (0.0, 0.0, 0.0)
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    folder: str = ""
 
     def __post_init__(self) -> None:
         numbers = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
-        checked_text(self.file, "collision shape", "file")
+        for what in ("file", "folder"):
+            checked_text(getattr(self, what), "collision shape", what)
         owner, mesh = f"collision {self.kind}", self.kind == "mesh"
         size = checked_array(self.size, (numbers,), owner, "size", positive=not mesh)
         if mesh and not self.file:

@@ -1,9 +1,9 @@
 """Robot descriptions in URDF, the XML format of ROS, read into links and joints, and written.
 
 Kinematics, inertias, limits, mimicry and collision shapes are read; <visual>, <transmission>, <gazebo>,
-<safety_controller>, <dynamics> and unknown elements are passed over. Meshes are named, and no file of theirs is ever
-looked for. The standard library's parser is enough: the libraries that read URDF bring mesh and XML packages along,
-which a core without meshes spares.
+<safety_controller>, <dynamics> and unknown elements are passed over. Meshes are named, with the folder of the file that
+names them, and no file of theirs is looked for here (`models.shapes.bodies` does). The standard library's parser is
+enough: the libraries that read URDF bring mesh and XML packages along, which a core without meshes spares.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ InertiaRule: TypeAlias = Literal["warn", "as_given"]
 
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
+BLANK = "\ufeff \t\r\n"
+"""What may stand before a text's first character."""
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "limit": ("lower", "upper", "velocity", "effort"),
@@ -86,9 +88,11 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     """
     checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
     tree = parsed(source)
+    own = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
+    folder = str(Path(source).resolve().parent) if own else ""
     if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
         warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unread)}", ModelWarning, 3)
-    links = _links(tree, inertia)
+    links = _links(tree, inertia, folder)
     floating = {name_of(each) for each in tree.findall("joint") if each.get("type") == "floating"}
     pairs = [(name_of(each), _joint(each)) for each in tree.findall("joint")]
     for name in floating:
@@ -190,7 +194,7 @@ def parsed(source: Source) -> ElementTree.Element:
     """The <robot> element of a URDF text or file, namespaces removed; ModelError where there is none to read."""
     text, above = "", 0
     if isinstance(source, str):
-        text = source.lstrip("\ufeff \t\r\n")
+        text = source.lstrip(BLANK)
         above = source[: len(source) - len(text)].count("\n")
     try:
         if isinstance(source, str) and not text:
@@ -236,9 +240,9 @@ def _contents(source: Source) -> str:
     return Path(source).read_bytes().decode(errors="replace")
 
 
-def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
+def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[Link, ...]:
     links, refused = [], []
-    for said in map(_said_of_link, tree.findall("link")):
+    for said in (_said_of_link(each, folder) for each in tree.findall("link")):
         try:
             links.append(Link(**said))
             continue
@@ -257,11 +261,11 @@ def _links(tree: ElementTree.Element, rule: InertiaRule) -> tuple[Link, ...]:
     return tuple(links)
 
 
-def _said_of_link(element: ElementTree.Element) -> dict[str, Any]:
+def _said_of_link(element: ElementTree.Element, folder: str) -> dict[str, Any]:
     """Attributes of Link, by name."""
     name = name_of(element)
     owner = f"link {name!r}"
-    shapes = tuple(_shape(each, owner) for each in element.findall("collision"))
+    shapes = tuple(_shape(each, owner, folder) for each in element.findall("collision"))
     body = _only(element, "inertial", owner)
     if body is None:
         return {"name": name, "collisions": shapes}
@@ -273,7 +277,7 @@ def _said_of_link(element: ElementTree.Element) -> dict[str, Any]:
     return {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia, "collisions": shapes}
 
 
-def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
+def _shape(element: ElementTree.Element, owner: str, folder: str) -> CollisionShape:
     found: list[Any] = list(child_of(element, "geometry", owner))
     if len(found) != 1:
         message = f"{owner}: <geometry> has {len(found)} shapes, not one"
@@ -287,7 +291,7 @@ def _shape(element: ElementTree.Element, owner: str) -> CollisionShape:
     else:
         size = np.array([number_of(shape, key, owner) for key in ("radius", "length")[: SHAPES[kind]]])
     try:
-        return CollisionShape(kind, size, file, *origin_of(element, owner))
+        return CollisionShape(kind, size, file, *origin_of(element, owner), folder if file else "")
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ocp.audit.clearance import Clearance, clearance
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
 from ocp.audit.principle import FLAT
@@ -28,6 +29,7 @@ __all__ = ["Audit", "Finding", "audit"]
 
 COSTATES = 1e-2  # share of the cost that errors of costates may be
 UNFIT = 0.1  # share of the cost that costates may be beside the best where controls enter linearly: many fit a plan
+TOUCHING = 1e-6  # m, by which bodies may be nearer than they are asked to stay
 HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
@@ -71,6 +73,7 @@ class Audit:
             each state, over the whole horizon. local_errors: the same of each interval alone, from its own start. (N,)
         t, states, controls: The re-integrated plan: times, s (M,), and values by name, each (M, n). Interior mesh
             times stand twice, with the controls of both sides.
+        clearances: How near bodies that have to stay apart come, proven between the samples, by separation.
         optimality: Costates, multipliers, curvature, and what the plan loses. lost: of the cost in each interval. (N,)
     """
 
@@ -83,6 +86,7 @@ class Audit:
     t: np.ndarray
     states: dict[str, np.ndarray]
     controls: dict[str, np.ndarray]
+    clearances: dict[str, Clearance]
     optimality: Optimality
 
     @property
@@ -195,7 +199,7 @@ def audit(
         stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts; None: it is told, and judged
             by the cost that it loses.
         drift: Largest change of the Hamiltonian where time does not enter, relative to its parts; None: it is told.
-        tolerances: Largest violation by name of a state, control or constraint, in its own unit.
+        tolerances: Largest violation by name of a state, control, constraint or separation, in its own unit.
 
     Raises:
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
@@ -233,7 +237,7 @@ def audit(
     findings.append(horizon_finding(form, solution, bounds))
 
     rows = (form.path, form.start, form.end, form.watch)
-    names = [*form.states, *form.controls, *[name for kind in rows for name in kind.names]]
+    names = [*form.states, *form.controls, *form.apart, *[name for kind in rows for name in kind.names]]
     for name in limits:
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
@@ -243,6 +247,8 @@ def audit(
         findings.append(replace(finding, unit=form.units.get(check.name, "")))
         total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))
 
+    clearances = {name: clearance(form, each, solution, p) for name, each in problem.declared.apart.items()}
+    findings += [clearance_finding(each, limits.get(name, TOUCHING)) for name, each in clearances.items()]
     findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     sound = all(finding.passed for finding in findings)
@@ -263,6 +269,7 @@ def audit(
         again.t,
         unstack(solution.states, again.states),
         unstack(solution.controls, again.controls),
+        clearances,
         found,
     )
 
@@ -315,6 +322,13 @@ def optimality_findings(
     note = f"{change:.2e} in cost per second" + ("" if form.autonomous else "; time enters the problem")
     rows.append(Finding(name, change / found.hamiltonian.scale, limit, None, note))
     return [replace(row, verdict="optimal") for row in rows]
+
+
+def clearance_finding(found: Clearance, limit: float) -> Finding:
+    """How much nearer than they are asked to stay bodies may come, by what is proven."""
+    worst = found.worst
+    missed, time = (0.0, None) if worst is None else (worst.missed, worst.time)
+    return Finding(found.name, missed, limit, time, str(found), unit="m")
 
 
 def integration_finding(again: Reintegration, limit: float, carried_off: bool) -> Finding:

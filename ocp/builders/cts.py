@@ -25,7 +25,7 @@ from models.cts.clearance import Radii, Surroundings, checked_clearance, clearan
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
-from models.shapes.capsules import soft_minimum
+from models.shapes.distance import soft_minimum
 from models.spatial import FULL_TURN, expression
 from ocp.console import interruptible
 from ocp.direct.guess import Samples

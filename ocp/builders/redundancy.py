@@ -20,6 +20,7 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from ocp.audit.audit import Audit
+from ocp.builders.clearance import Clear, keeping_clear, touching_error
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
@@ -86,6 +87,7 @@ def minimum_velocity_problem(
     formulation: Form = "rates",
     limits: bool = True,
     guess_damping: float = 0.005,
+    clear: Clear | None = None,
     symbols: Any = ca.SX,
 ) -> Problem:
     """Move the tip as told while the integral of half the squared joint rates, 1/2 |x2'|^2, is least (27).
@@ -120,6 +122,7 @@ def minimum_velocity_problem(
             the local motion stops early. Small values start near the pseudo-inverse; large ones avoid its singular
             passages and may lead to another extremal: on the paper's example 0.001 to 0.02 lead to J = 1.7351, 0.03
             to J = 1.7467.
+        clear: What the motion has to stay clear of, see `ocp.builders.clearance`.
         symbols: casadi.SX; or casadi.MX for the indirect method where a track or velocity calls an interpolant, which
             else becomes a signal (`Problem.signal`).
 
@@ -205,6 +208,9 @@ def minimum_velocity_problem(
     if machine.base_size:
         problem.dynamics(base, base_rate)
     problem.dynamics(joints, rates)
+    if clear is not None:
+        name = "base" if machine.base_size else ""
+        checked_instance("clear", clear, Clear).declare(problem, base, joints, base_name=name, horizon=duration)
     if free_start:
         _start_conditions(problem, equations, place, start, base, joints)
         if cyclic:
@@ -283,6 +289,7 @@ class _Outcome:
         failure: What is wrong with it, which is not raised; None where the plan passes.
         flaw: What a finer mesh may mend; None where nothing.
         excess: The audit's worst value over its limit; infinite where there is none.
+        touching: That bodies touch, where this alone is wrong with it.
     """
 
     attempt: _Attempt
@@ -290,6 +297,7 @@ class _Outcome:
     failure: SolveError | None = None
     flaw: str | None = None
     excess: float = np.inf
+    touching: SolveError | None = None
 
     @property
     def plan(self) -> Solution | None:
@@ -311,6 +319,7 @@ def plan_minimum_velocity(
     weights: Any = None,
     formulation: Form = "rates",
     limits: bool = True,
+    clear: Clear | None = None,
     symbols: Any = ca.SX,
     method: Collocation | None = None,
     dampings: Sequence[float] = (0.005, 0.05, 0.3),
@@ -327,6 +336,7 @@ def plan_minimum_velocity(
         machine, ..., symbols: As of `minimum_velocity_problem`.
         method: Collocation; 50 Radau intervals of degree 4 if None, with nodes where the pieces of the tasks meet.
         dampings: Of the guesses (`guess_damping`), in the order in which they are tried.
+        clear: What the motion has to stay clear of; bodies that touch are held apart, and it is planned anew.
         options: Of IPOPT, besides at most 150 iterations.
 
     Raises:
@@ -359,13 +369,36 @@ def plan_minimum_velocity(
         if not (local.stopped or free_start or cyclic):
             target = float(local.cost[-1])
     asked |= {"free_start": free_start, "cyclic": cyclic, "formulation": formulation, "limits": limits}
-    declare = partial(minimum_velocity_problem, machine, **asked, symbols=symbols)
     mesh, settings = method or _default_mesh(tasks, checked_horizon(horizon)), {**IPOPT, **options}
+
+    def run(clear: Clear | None) -> Solution:
+        declare = partial(minimum_velocity_problem, machine, **asked, clear=clear, symbols=symbols)
+        return _cheapest(machine, tasks, declare, mesh, dampings, target, settings)
+
+    return keeping_clear(clear, run)
+
+
+def _cheapest(
+    machine: Machine,
+    tasks: list[TipTask],
+    declare: Callable[..., Problem],
+    mesh: Collocation,
+    dampings: Sequence[float],
+    target: float,
+    settings: Mapping[str, Any],
+) -> Solution:
+    """The plan that `plan_minimum_velocity` returns.
+
+    Raises:
+        SolveError: As it does; at once where a plan is sound but for bodies that touch.
+    """
     tried: list[_Outcome] = []
     for attempt in _attempts(declare, mesh, dampings, target, tried):
         # what conflicts is looked for once: it takes long
         explain = attempt.damping == dampings[-1] and not any(one.plan for one in tried)
         tried.append(_outcome(machine, tasks, attempt, settings, explain))
+        if tried[-1].touching:
+            raise tried[-1].touching
     standing = {one.attempt.damping: one.plan for one in tried if one.plan}  # of each guess the plan on its finest mesh
     if not standing:
         reasons = "\n".join(f"{one.attempt}: {one.failure}" for one in tried)
@@ -420,11 +453,12 @@ def _outcome(
         return _Outcome(attempt, solution, ended)
     audit = solution.audit()
     if not audit.passed and audit.failures:  # what is not decided to be a minimum may be run; its audit says so
+        touching = touching_error(audit, solution)
         worst = audit.failures[0]
         details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
         failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
         excess = worst.value / worst.limit if worst.limit else np.inf
-        return _Outcome(attempt, solution, failure, "whose audit fails", excess)
+        return _Outcome(attempt, solution, failure, "whose audit fails", excess, touching)
     gap = float(np.abs(solution["closure"]).max()) * solution.horizon if "closure" in solution.states else 0.0
     if gap > LARGEST_CLOSURE:
         failure = SolveError(f"the task gives way by {gap:.2g}", name="task", value=gap, limit=LARGEST_CLOSURE)

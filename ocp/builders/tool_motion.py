@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
+from ocp.builders.clearance import Clear
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
@@ -148,6 +149,7 @@ def tool_motion_problem(
     weights: Array,
     bounds: JointBounds,
     time_cost: float | None = None,
+    clear: Clear | None = None,
 ) -> ToolMotion:
     """Do tasks while the integral of half the weighted squared joint rates is least.
 
@@ -172,7 +174,7 @@ def tool_motion_problem(
             faster than the rates allow in any posture. Where the time is free: several stretches, a base that drifts.
     """
     if time_cost is not None:
-        return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost)
+        return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost, clear)
     horizon = stretches[-1].end
     for stretch in stretches:
         if stretch.equations is not None:
@@ -205,6 +207,8 @@ def tool_motion_problem(
         if machine.base_size:
             problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
         problem.dynamics(joints, pace * rates)
+        if clear is not None:
+            _declare_clearance(clear, problem, machine, place, joints, stretch, pace, horizon)
         running += pace * ca.dot(rates, ca.DM(weights) * rates) / 2
         states = [*([place] if machine.base_size else []), joints]
         if moving:
@@ -241,6 +245,7 @@ def _in_free_time(
     weights: Array,
     bounds: JointBounds,
     time_cost: float,
+    clear: Clear | None,
 ) -> ToolMotion:
     """As `tool_motion_problem`, the time being a state over the tasks' own.
 
@@ -274,10 +279,36 @@ def _in_free_time(
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
     problem.dynamics(joints, slopes)
+    if clear is not None:
+        _declare_clearance(clear, problem, machine, place, joints, stretch, 1.0, None)
     problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(weights) * slopes) / (2 * pace))
     if cyclic and free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
     return ToolMotion(problem, tuple(stretches), stretch.end, stretch.breaks / stretch.end)
+
+
+def _declare_clearance(
+    clear: Clear,
+    problem: Problem,
+    machine: Machine,
+    base: Any,
+    joints: Any,
+    stretch: Stretch,
+    pace: float,
+    horizon: float | None,
+) -> None:
+    when = stretch.suffix
+    clear.declare(
+        problem,
+        base,
+        joints,
+        base_name=f"base{when}" if machine.base_size else "",
+        joints_name=f"joints{when}",
+        suffix=when,
+        begin=stretch.begin,
+        pace=pace,
+        horizon=horizon,
+    )
 
 
 def _closure(problem: Problem, stretches: Sequence[Stretch], base: Array, reference: Array) -> Any:

@@ -13,10 +13,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Machine
+from models import Machine, Surroundings
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
+from ocp.local.touching import checked_surroundings, touches
 from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
@@ -86,6 +87,7 @@ def inverse_kinematics(
     tolerance: float = 1e-10,
     apart: float = 1e-3,
     iterations: int = 100,
+    surroundings: Surroundings | None = None,
 ) -> list[Posture]:
     """Different joint positions at which the machine is where its pose tasks want it, the best first.
 
@@ -103,12 +105,15 @@ def inverse_kinematics(
         tolerance: Largest misfit of a solution, m and rad.
         apart: Least distance between two solutions, in the greatest joint, angles modulo full turns.
         iterations: Of each start, at most.
+        surroundings: Of the machine; postures in which its bodies come nearer to each other or to obstacles than the
+            clearance are left out.
 
     Returns:
         The solutions, at least one, by falling quality.
 
     Raises:
-        Unreachable: No start leads to the pose; with the nearest miss.
+        Unreachable: No start leads to the pose, with the nearest miss; or none to a posture that is clear, with the
+            pair that touches least.
         ProblemError: No pose among the tasks, wrong sizes or numbers.
     """
     equations = bind(machine, task)
@@ -123,6 +128,8 @@ def inverse_kinematics(
         checked_positive(what, value)
     checked_count("seed", seed, 0, LARGEST_SEED)
     checked_flag("limits", limits)
+    if surroundings is not None:
+        checked_surroundings(surroundings, machine)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
@@ -152,7 +159,8 @@ def inverse_kinematics(
         margin = float(np.min(share[np.isfinite(upper - lower) & (upper > lower)], initial=1.0))
         found.append(Posture(joints, float(values.prod()) * max(margin, 0.0), float(off)))
     found.sort(key=lambda posture: -posture.quality)
-    return _distinct(found, turns, apart)
+    distinct = _distinct(found, turns, apart)
+    return distinct if surroundings is None else _clear(distinct, surroundings, place, float(time))
 
 
 def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: float, limits: bool, near: Any) -> None:
@@ -282,6 +290,33 @@ def _distinct(found: list[Posture], turns: Array, apart: float) -> list[Posture]
         else:
             kept.append(posture)
     return kept
+
+
+def _clear(found: list[Posture], surroundings: Surroundings, base: Array, time: float) -> list[Posture]:
+    """The postures in which nothing comes nearer than the clearance.
+
+    Raises:
+        Unreachable: There are none.
+    """
+    nearest = []
+    for posture in found:
+        touching = touches(surroundings, base[None], posture.joints[None], np.array([time]))
+        nearest.append(touching[0] if touching else None)
+    clear = [posture for posture, touch in zip(found, nearest, strict=True) if touch is None]
+    if clear:
+        return clear
+    best = max(range(len(found)), key=lambda k: nearest[k].distance if nearest[k] else 0.0)  # type: ignore[union-attr]
+    touch = nearest[best]
+    assert touch is not None
+    raise Unreachable(
+        f"each of the {len(found)} postures found touches; the one that does least: {touch}",
+        found[best].joints,
+        found[best].misfit,
+        name=touch.bodies[0],
+        value=touch.distance,
+        limit=surroundings.clearance,
+        time=time,
+    )
 
 
 def _unreachable(

@@ -6,14 +6,14 @@ The classical method that optimal plans are compared with, and the source of the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models import Machine
+from models import Machine, Surroundings
 from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.console import interruptible
@@ -28,6 +28,7 @@ from ocp.errors import (
     floats,
     real,
 )
+from ocp.local.touching import checked_surroundings, distances_along
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.tip_task import TipTask, Velocity, one_of
@@ -53,6 +54,8 @@ class LocalSolution:
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
         tolerance: Absolute and relative tolerance of the integration.
         stopped: Why the motion ends before the horizon; None when it does not.
+        clearance: Least distance of two bodies, m, nan where no surroundings were given. Shape (M,).
+        nearest: The names of these two at each time, or nothing.
         task_error: Pose wanted less pose found in the rows of the tasks, m and rad; zero for velocities.
             Shape (M, rows of all tasks).
     """
@@ -68,6 +71,8 @@ class LocalSolution:
     tolerance: float
     stopped: str | None = None
     task_error: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    clearance: Array = field(default_factory=lambda: np.zeros(0))
+    nearest: tuple[tuple[str, str], ...] = ()
 
     def at(self, time: float) -> dict[str, Array]:
         """Cubic interpolation of "base" and "joints", linear of "joint_rates"; beyond the ends the end values."""
@@ -103,6 +108,7 @@ def resolve(
     tolerance: float = 1e-10,
     samples: Any = 501,
     check_start: bool = True,
+    surroundings: Surroundings | None = None,
 ) -> LocalSolution:
     """Simulate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the base that follows.
 
@@ -124,6 +130,8 @@ def resolve(
         samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
             horizon.
         check_start: Whether a start away from the pose of its task (see TipTask.start_gap) is refused.
+        surroundings: Of the machine; how near its bodies come to each other and to obstacles is reported, at the
+            samples, and changes nothing.
 
     Returns:
         The motion up to the horizon, or up to the last sample before it breaks down, with the reason in
@@ -151,7 +159,15 @@ def resolve(
     except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
         model = _Model(equations, heavy, damping, ca.MX)
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
-    return _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
+    report = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
+    if surroundings is None:
+        return replace(report, clearance=np.full(len(report.t), np.nan))
+    apart = distances_along(checked_surroundings(surroundings, machine), report.base, report.joints, report.t)
+    if not apart.shape[1]:
+        return replace(report, clearance=np.full(len(report.t), np.inf))
+    labels = surroundings.labels
+    near = tuple(labels[k] for k in apart.argmin(axis=1).tolist())
+    return replace(report, clearance=apart.min(axis=1), nearest=near)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:

@@ -9,22 +9,32 @@ from typing import Any
 import numpy as np
 
 from models.arrays import Array
-from ocp.audit.audit import Audit
+from ocp.audit.audit import Audit, Finding
+from ocp.builders.clearance import LOOKS, Clear
 from ocp.builders.tool_motion import CLOCK, ToolMotion, tool_motion_problem
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.local.following import Followed
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.touching import Touch
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
 from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, misfits_of
 from ocp.refinement import refine
 from ocp.solution import Solution
 
-__all__ = ["Maker", "coarse_motions", "fine_motions"]
+__all__ = ["TOUCHES", "Maker", "coarse_motions", "fine_motions"]
 
-COARSE, FINE = 2, 7
-"""Degrees of collocation: smooth pieces are met to rounding by one interval of the high one."""
+COARSE, FINE, FINE_APART = 2, 7, 4
+"""Degrees of collocation: smooth pieces are met to rounding by one interval of the high one. A motion along which
+bodies are held apart is less smooth where they come to it and leave it."""
+APART = 24
+"""Intervals of such a motion, where its pieces are fewer."""
+NEAR_ENOUGH = 1e-6
+"""m and rad: of a posture that is looked at."""
+FAILURES = 8
+"""Motions that touch and cannot be kept clear, after which others that touch are left as they are."""
 SAME, NEAR = 1e-5, 0.1
 """Share of the cost, and rad or m: of motions nearer to each other than either one is looked at."""
 NOTHING = 1e-12
@@ -43,22 +53,31 @@ SOLVER = {"max_iter": 150}
 ROUGH = {"max_iter": 60, "tol": 1e-4, "mu_init": 1e-3}
 """On the coarse mesh, from a guess that does its tasks."""
 
+TOUCHES = "touches"
+"""How the reason begins why a motion is not the plan whose bodies come too near."""
 ALIKE = "the same as another one, or of the same cost"
 
 
-def _mesh(motion: ToolMotion, degree: int) -> Collocation:
-    return Collocation(LEAST_INTERVALS if len(motion.breaks) < LEAST_INTERVALS else 1, degree).with_nodes_at(
-        motion.breaks
-    )
+def _mesh(motion: ToolMotion, degree: int, least: int) -> Collocation:
+    return Collocation(least if len(motion.breaks) < least else 1, degree).with_nodes_at(motion.breaks)
 
 
-def coarse_motions(motion: ToolMotion, followed: list[Followed], postures: Array) -> list[Candidate]:
+def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:
+    return mesh.with_mesh(solution.state_interpolant.breaks)
+
+
+def _failing(audit: Audit) -> list[Finding]:
+    """What a finer mesh may mend: all that fails but bodies that touch."""
+    return [finding for finding in audit.failures if finding.name not in audit.clearances]
+
+
+def coarse_motions(maker: Maker, followed: list[Followed], postures: Array) -> list[Candidate]:
     """The motions that the postures lead to on a coarse mesh, the cheapest first; of those of one cost the first.
 
     The start being free, postures of one family lead to one motion. Those that the tasks cannot be followed from are
     tried where they can be followed from none.
     """
-    prepared = _mesh(motion, COARSE).prepare(motion.problem, options=ROUGH)
+    motion, _, prepared = maker.made(maker.asked.clear, fine=False)
     misfits, costs = np.array(misfits_of(followed)), np.sum([part.cost for part in followed], axis=0)
     follows = misfits <= max(OUT_OF_REACH, misfits.min())
     found: list[Candidate] = []
@@ -105,18 +124,39 @@ def _near(path: Array, other: Array) -> bool:
 
 
 def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Candidate]:
-    """What becomes on the fine mesh of the motions found on a coarse one; of the `first` that passes, or of all."""
+    """What becomes on the fine mesh of the motions found on a coarse one; of the `first` that passes, or of all.
+
+    Of one that touches something, the bodies that touch are held apart on the coarse mesh first: that may cost more
+    than another motion does.
+    """
     told = [one for one in coarse if one.why and one.why != ALIKE]
     alike = [one for one in coarse if one.why == ALIKE]
     least, beyond = np.inf, 0.0  # cost of the best, and how much the coarse mesh was wrong, as a share of it
-    for candidate in (one for one in coarse if not one.why):
+    queue = [(one, maker.asked.clear) for one in coarse if not one.why]
+    failures, barred = 0, ""
+    while queue:
+        candidate, clear = queue.pop(0)
         if candidate.cost > least * (1 + beyond) or (first and np.isfinite(least)):
             told.append(replace(candidate, why="dearer on a coarse mesh", solution=None))
             continue
+        touching = maker.touches(candidate.solution)
+        if touching and clear is not None:
+            if failures == FAILURES or (barred := maker.barred(touching[0].time)):
+                why = f"{TOUCHES}: {touching[0]}{barred and f'; {barred}'}"
+                told.append(replace(candidate, why=why, solution=None))
+                continue
+            bent, clear = maker.bent(candidate, clear, touching)
+            failures += bool(bent.why)
+            if bent.why:
+                told.append(bent)
+            else:
+                place = sum(one.cost <= bent.cost for one, _ in queue)
+                queue.insert(place, (bent, clear))
+            continue
         # where the first one of its cost does not hold, another one may
-        others = [one for one in alike if one.cost >= candidate.cost][:RESERVES]
+        others = [one for one in alike if one.cost >= candidate.cost and not maker.touches(one.solution)][:RESERVES]
         for one in (candidate, *others):
-            solved = maker.solved(one.start, one.solution)
+            solved = maker.solved(one.start, one.solution, clear=clear)
             told.append(solved)
             if not solved.why:
                 beyond = max(beyond, 2 * abs(solved.cost - one.cost) / max(solved.cost, np.finfo(float).tiny))
@@ -127,17 +167,18 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Can
 
 
 class Maker:
-    """Makes motions on the fine mesh, all of one prepared problem."""
+    """Makes motions, all of one problem, but for the bodies that are held apart in it."""
 
     def __init__(self, asked: Asked, start: Array, reference: Array) -> None:
-        self.asked, self.reference = asked, reference
+        self.asked, self.start, self.reference = asked, start, reference
         self.free = bool(np.isnan(start).any())
-        self.motion = self._declared(start)
-        self.mesh = _mesh(self.motion, FINE)
-        self._prepared: Prepared | None = None
+        self._barred: dict[float, str] = {}
+        self._made: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
+        self.motion = self.declared(start, asked.clear)
         self.why: SolveError | None = None  # what the last solve failed of
 
-    def _declared(self, start: Array) -> ToolMotion:
+    def declared(self, start: Array, clear: Clear | None) -> ToolMotion:
+        """The problem from a start, nan where it is free."""
         asked = self.asked
         return tool_motion_problem(
             asked.machine,
@@ -149,48 +190,128 @@ class Maker:
             weights=asked.weights,
             bounds=asked.bounds,
             time_cost=asked.time_cost,
+            clear=clear,
         )
 
-    def solved(self, start: Array, guess: Any, thorough: bool = False) -> Candidate:
+    def made(self, clear: Clear | None, fine: bool) -> tuple[ToolMotion, Collocation, Prepared]:
+        """The problem with some bodies held apart, a mesh for it, and both prepared."""
+        held = () if clear is None else tuple(sorted(clear.margins.items()))
+        if (held, fine) not in self._made:
+            motion = self.declared(self.start, clear) if held else self.motion
+            mesh = _mesh(motion, (FINE_APART if held else FINE) if fine else COARSE, APART if held else LEAST_INTERVALS)
+            prepared = mesh.prepare(motion.problem, options=SOLVER if fine else ROUGH)
+            self._made[held, fine] = motion, mesh, prepared
+        return self._made[held, fine]
+
+    def touches(self, solution: Solution | None) -> list[Touch]:
+        """The bodies that come too near in a motion, at the places where that is looked for."""
+        clear = self.asked.clear
+        if clear is None or solution is None:
+            return []
+        at = self._places(solution)
+        sample, found = solution.at_fraction(at), []
+        for stretch in self.motion.stretches:
+            base = sample[f"base{stretch.suffix}"] if self.asked.machine.base_size else np.zeros((len(at), 0))
+            times = stretch.begin + at * stretch.duration
+            found += clear.touches(base, sample[f"joints{stretch.suffix}"], times)
+        worst: dict[int, Touch] = {}
+        for touch in sorted(found, key=lambda touch: touch.distance):
+            worst.setdefault(touch.pair, touch)
+        return list(worst.values())
+
+    def barred(self, time: float) -> str:
+        """That no posture which does the tasks at a time is clear; "" where one is, or where that is not known."""
+        asked = self.asked
+        if time not in self._barred:
+            tasks = [task for task in asked.tasks if task.is_pose and task.begin <= time <= task.end]
+            self._barred[time] = ""
+            if asked.clear is not None and tasks and not asked.machine.base_size:
+                around: dict[str, Any] = {
+                    "surroundings": asked.clear.surroundings,
+                    "limits": asked.limits.joints,
+                    "seed": asked.seed,
+                }
+                try:
+                    inverse_kinematics(asked.machine, tasks, time=time, **around)
+                except Unreachable as error:
+                    self._barred[time] = f"at {time:.4g} s {error}"
+        return self._barred[time]
+
+    def bent(self, candidate: Candidate, clear: Clear, touching: list[Touch]) -> tuple[Candidate, Clear]:
+        """A motion on the coarse mesh with what touches held apart, one pair after the other, or why there is none."""
+        solution = candidate.solution
+        for _ in range(LOOKS):
+            clear = clear.holding([touch.pair for touch in touching])
+            solution = self.made(clear, fine=False)[2].solve(guess=solution, check=False)
+            if not solution.success:
+                why = f"{TOUCHES}: {touching[0]}; held apart, no motion was found"
+                return replace(candidate, why=why, solution=None), clear
+            again = [touch for touch in self.touches(solution) if touch.pair not in clear.margins]
+            if not again:
+                return replace(candidate, cost=solution.cost, solution=solution), clear
+            touching = again
+        return replace(candidate, why=f"{TOUCHES}: {touching[0]}", solution=None), clear
+
+    def solved(self, start: Array, guess: Any, thorough: bool = False, clear: Clear | None = None) -> Candidate:
         """A motion from a guess, and what is wrong with it; with `thorough` from other starts, too, and why if none.
+
+        Bodies that come too near are held apart, farther each time, and it is solved again.
+        """
+        clear = clear or self.asked.clear
+        touch = ""
+        for _ in range(LOOKS):
+            candidate, audit = self._solved(start, guess, thorough, clear)
+            proofs = [] if audit is None else [proof for proof in audit.clearances.values() if proof.pairs]
+            missed = [proof.worst for proof in proofs if proof.worst is not None and proof.worst.missed > 0]
+            if clear is None or audit is None or candidate.solution is None or not missed:
+                break
+            worst = max(missed, key=lambda near: near.missed)
+            touch = f"{TOUCHES}: {worst}"
+            clear, guess = clear.widened(proofs), candidate.solution
+            candidate = replace(candidate, why=touch)
+        if touch and candidate.why and not candidate.why.startswith(touch):
+            candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}")
+        return candidate
+
+    def _solved(self, start: Array, guess: Any, thorough: bool, clear: Clear | None) -> tuple[Candidate, Audit | None]:
+        """As `solved`, what touches left as it is, and the audit.
 
         Where many starts do equally well, no one of them is decided to be the best; then the motion is judged from the
         start that was found.
         """
-        if self._prepared is None:
-            self._prepared = self.mesh.prepare(self.motion.problem, options=SOLVER)
+        motion, mesh, prepared = self.made(clear, fine=True)
         try:
-            solution = self._prepared.solve(guess=guess, check=thorough)
+            solution = prepared.solve(guess=guess, check=thorough)
             if not solution.success:
-                return Candidate(start, np.nan, f"no motion was found: {solution.status.split(':')[0]}")
-            solution, audit = self._audited(self.motion, solution)
+                return Candidate(start, np.nan, f"no motion was found: {solution.status.split(':')[0]}"), None
+            solution, audit = self._audited(motion, mesh, solution)
             if self.free and audit.feasible and audit.optimal is None:
-                first = solution[f"joints{self.motion.stretches[0].suffix}"][0]
-                held = self._declared(first)
-                again, other = self._audited(held, solve(held.problem, self._mesh_of(solution), guess=solution))
-                if other.passed and again.cost <= solution.cost * (1 + SAME) + NOTHING * self.motion.horizon:
+                first = solution[f"joints{motion.stretches[0].suffix}"][0]
+                held = self.declared(first, clear)
+                again, other = self._audited(held, mesh, solve(held.problem, _mesh_of(mesh, solution), guess=solution))
+                if other.passed and again.cost <= solution.cost * (1 + SAME) + NOTHING * motion.horizon:
                     solution, audit = again, other
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             self.why = error
-            return Candidate(start, np.nan, str(error).split("\n")[0], error.solution)
+            return Candidate(start, np.nan, str(error).split("\n")[0], error.solution), None
         if audit.passed:
-            return Candidate(start, solution.cost, "", solution)
+            return Candidate(start, solution.cost, "", solution), audit
         worst = audit.failures[0] if audit.failures else None
         why = f"not decided: {audit.undecided}" if worst is None else f"the audit fails, {worst.name} {worst.value:.2g}"
-        return Candidate(start, solution.cost, why, solution)
+        return Candidate(start, solution.cost, why, solution), audit
 
-    def _audited(self, motion: ToolMotion, solution: Solution) -> tuple[Solution, Audit]:
+    def _audited(self, motion: ToolMotion, mesh: Collocation, solution: Solution) -> tuple[Solution, Audit]:
         """A motion, refined where its audit or the way of its tips asks for it, and its audit."""
         audit: Audit = solution.audit()
         for _ in range(MESHES):
-            if audit.failures:
+            if _failing(audit):
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", RefinementWarning)
-                    solution = refine(motion.problem, self._mesh_of(solution), guess=solution, options=SOLVER)
+                    solution = refine(motion.problem, _mesh_of(mesh, solution), guess=solution, options=SOLVER)
                 audit = solution.audit()
-                if audit.failures:
+                if _failing(audit):
                     break
             strays = self._strays(motion, solution)
             if strays.max() <= TIP:
@@ -198,14 +319,13 @@ class Maker:
             nodes = solution.state_interpolant.breaks
             cut = np.flatnonzero(strays > TIP / len(strays))
             nodes = np.union1d(nodes, (nodes[cut] + nodes[cut + 1]) / 2)
-            solution = solve(motion.problem, self.mesh.with_mesh(nodes), guess=solution, options=SOLVER)
+            solution = solve(motion.problem, mesh.with_mesh(nodes), guess=solution, options=SOLVER)
             audit = solution.audit()
         return solution, audit
 
     def _strays(self, motion: ToolMotion, solution: Solution) -> Array:
         """How far the tips are from their poses in each interval of the mesh, m and rad. Shape (N,)."""
-        nodes = solution.state_interpolant.breaks
-        at = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(PLACES) / PLACES).ravel(), 1.0)
+        at = self._places(solution)
         sample, worst = solution.at_fraction(at), np.zeros(len(at))
         for stretch in motion.stretches:
             if stretch.equations is not None:
@@ -219,8 +339,11 @@ class Maker:
                 worst = np.maximum(worst, stretch.equations.overhangs(times, base, joints).max(axis=1, initial=0))
         return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, PLACES).max(axis=1))
 
-    def _mesh_of(self, solution: Solution) -> Collocation:
-        return self.mesh.with_mesh(solution.state_interpolant.breaks)
+    @staticmethod
+    def _places(solution: Solution) -> Array:
+        """Fractions of the horizon at which a motion is looked at, PLACES in each interval, and the end."""
+        nodes = solution.state_interpolant.breaks
+        return np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(PLACES) / PLACES).ravel(), 1.0)
 
     def plan(self, told: list[Candidate]) -> Plan:
         """The plan of the cheapest motion that passes, with the others and why they are not the plan.

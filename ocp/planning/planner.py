@@ -9,12 +9,14 @@ with nodes where the tasks' pieces meet, the cheapest first, until none is left 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models import Machine, Standing
+from models import Machine, ModelError, Standing, Surroundings
 from models.arrays import Array
+from ocp.builders.clearance import Clear
 from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.errors import (
@@ -27,9 +29,9 @@ from ocp.errors import (
     checked_positive,
 )
 from ocp.local.inverse_kinematics import LARGEST_SEED
-from ocp.planning.candidates import Maker, coarse_motions, fine_motions
+from ocp.planning.candidates import TOUCHES, Maker, coarse_motions, fine_motions
 from ocp.planning.motion import Candidate, Plan
-from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled
+from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled, touches_at_the_start
 from ocp.planning.standing import plan_to_stand
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights
 from ocp.tasks.equations import bind
@@ -58,6 +60,12 @@ def plan(
     search: Search = "postures",
     seed: int = 0,
     time_cost: float = 1.0,
+    obstacles: Any = (),
+    clearance: float | None = 0.0,
+    ignored: Any = (),
+    srdf: Any = None,
+    folders: Any = (),
+    missing: str = "raise",
 ) -> Plan:
     """Plan the cheapest motion that does the tasks: the least integral of half the squared joint rates.
 
@@ -75,6 +83,10 @@ def plan(
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion.
         seed: Of inverse kinematics.
+        obstacles: Shapes in world, or `Moving` ones, that the machine's bodies stay clear of.
+        clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
+        ignored, srdf, folders, missing: As of `models.Surroundings`: pairs that are not looked at, and what becomes of
+            meshes that are not found.
         time_cost: Of each second where the horizon is free, in units of the cost, (rad/s)^2; the larger, the nearer the
             motion is to that of least time.
 
@@ -97,9 +109,15 @@ def plan(
             limits=limits,
             search=search,
             seed=seed,
+            clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing),
         )
     asked = _checked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
+    asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing))
     postures = postures_at_the_start(asked)
+    if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
+        words = f"start: {touch}; start clear of everything, or name what may touch: ignored=[{touch.bodies}]"
+        limit = asked.clear.surroundings.clearance if asked.clear else 0.0
+        raise ProblemError(words, name=touch.bodies[0], value=touch.distance, limit=limit, time=touch.time)
     given = asked.start
     if given is None:
         given, postures = settled(asked, postures)
@@ -112,10 +130,35 @@ def plan(
             if not told[-1].why or len(postures) == 1:
                 return maker.plan(told)
     followed = followed_from(asked, postures)
-    told += fine_motions(maker, coarse_motions(maker.motion, followed, postures), first=search == "start")
-    if all(one.why for one in told):  # whatever helps a solver, and what conflicts if nothing does
+    told += fine_motions(maker, coarse_motions(maker, followed, postures), first=search == "start")
+    if all(one.why and not one.why.startswith(TOUCHES) for one in told):  # whatever helps a solver, and what conflicts
         told.append(maker.solved(postures[0], maker.motion.guess(followed, 0), thorough=True))
     return maker.plan(told)
+
+
+def clear_of(
+    machine: Machine, obstacles: Any, clearance: Any, ignored: Any, srdf: Any, folders: Any, missing: Any
+) -> Clear | None:
+    """What a motion has to stay clear of; None where there is nothing.
+
+    Raises:
+        ProblemError: What is given is not what `plan` takes, or given where nothing is looked at.
+    """
+    if clearance is None:
+        for what, value in (("obstacles", obstacles), ("ignored", ignored), ("srdf", srdf)):
+            if not _empty(value):
+                words = f"{what} are of no use where nothing is looked at; give a clearance in m, 0 to touch nothing"
+                raise ProblemError(words, name=what, value=value)
+        return None
+    try:
+        around = Surroundings(machine, obstacles, clearance, ignored, srdf, folders, missing)
+    except ModelError as error:
+        raise ProblemError(str(error), **vars(error)) from error
+    return Clear(around) if len(around.pairs) else None
+
+
+def _empty(value: Any) -> bool:
+    return value is None or (isinstance(value, tuple | list) and not len(value))
 
 
 def _checked(

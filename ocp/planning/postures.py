@@ -10,16 +10,18 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
+from ocp.builders.clearance import Clear
 from ocp.builders.tool_motion import Stretch
 from ocp.errors import ProblemError
 from ocp.local.following import Followed, follow
 from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.touching import Touch, distances_along
 from ocp.tasks.checks import ignorable_joints
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Asked", "followed_from", "misfits_of", "postures_at_the_start", "settled"]
+__all__ = ["Asked", "followed_from", "misfits_of", "postures_at_the_start", "settled", "touches_at_the_start"]
 
 LEAST_INTERVALS = 8
 """Of a motion, where its pieces are fewer."""
@@ -41,6 +43,7 @@ class Asked:
         machine, tasks, horizon: As of `plan`.
         start: Joints at the start, or None. base: Base there. weights: Of the joint rates.
         limits: Of the joints.
+        clear: What the motion has to stay clear of, or None.
     """
 
     machine: Machine
@@ -54,6 +57,7 @@ class Asked:
     cyclic: bool
     seed: int
     time_cost: float | None
+    clear: Clear | None = None
 
     @cached_property
     def bounds(self) -> JointBounds:
@@ -62,7 +66,7 @@ class Asked:
 
 
 def postures_at_the_start(asked: Asked) -> Array:
-    """Joints at the start, the best conditioned first. Shape (K, n)."""
+    """Joints at the start, those that are clear before those that touch, the best conditioned first. Shape (K, n)."""
     if asked.start is not None:
         return asked.start[None]
     first = [asked.tasks[i] for i in asked.stretches[0].tasks if asked.tasks[i].is_pose]
@@ -75,7 +79,19 @@ def postures_at_the_start(asked: Asked) -> Array:
     except Unreachable as error:
         raise _placed(asked, error, 0.0) from error
     joints = np.array([posture.joints for posture in found])
-    return joints
+    touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
+    return joints[np.argsort(touching, kind="stable")]
+
+
+def touches_at_the_start(asked: Asked, postures: Array) -> list[Touch | None]:
+    """Of each posture (K, n) the pair of bodies that comes nearest, where it comes too near."""
+    if asked.clear is None:
+        return [None] * len(postures)
+    around = asked.clear.surroundings
+    apart = distances_along(around, asked.base, postures, np.zeros(len(postures)))
+    nearest, labels = apart.argmin(axis=1).tolist(), around.labels
+    found = [Touch(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
+    return [touch if touch.distance < around.clearance else None for touch in found]
 
 
 def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:

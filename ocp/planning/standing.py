@@ -10,6 +10,7 @@ import numpy as np
 
 from models import Standing
 from models.arrays import Array
+from ocp.builders.clearance import Clear
 from ocp.builders.standing.plan import Asked, plan_standing
 from ocp.builders.standing.problem import Weights
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance, checked_positive
@@ -34,6 +35,7 @@ def plan_to_stand(
     limits: Limits | None,
     search: str,
     seed: int,
+    clear: Clear | None,
 ) -> Plan:
     """Do the tasks with the zero moment point inside the foot, at the least cost of `plan_standing`.
 
@@ -45,7 +47,7 @@ def plan_to_stand(
         machine: What stands.
         tasks, horizon, start, limits, search, seed: As of `ocp.planning.plan`.
         cyclic: False: a standing motion is not closed by this.
-        weights: Of the parts of the cost.
+        weights: Of the parts of the cost. clear: What the motion has to stay clear of, or None.
 
     Raises:
         ProblemError: A cyclic motion, tasks in intervals of time, a horizon that is no number, or as plan_standing.
@@ -75,7 +77,7 @@ def plan_to_stand(
     told: list[Candidate] = []
     for joints in _postures(machine, given, start, limits, seed):
         try:
-            solution = plan_standing(machine, given, joints, duration, **asked)
+            solution = plan_standing(machine, given, joints, duration, clear=clear, **asked)
         except (ProblemError, SolveError) as error:
             if start is not None:
                 raise

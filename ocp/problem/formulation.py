@@ -104,6 +104,7 @@ class Formulation:
         f: State derivative. Shape (nx, 1).
         running, terminal: Cost densities, scalars.
         path, start, end: Constraint rows. watch: Rows that the audit judges and no method holds.
+        apart: Placements of the bodies that have to stay apart, by the name of the separation. Shape (12 F, 1) each.
         watch_integral: Which of these mean the integral over time. Shape (rows,), bool.
         watch_way: Rates of the ways that they are judged against, zero where none is. Shape (rows, 1).
         states, controls, parameters: Slices of the vectors by name. state_labels,
@@ -154,6 +155,7 @@ class Formulation:
         self.start = self._rows("start", declared.start, 0.0)
         self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)
+        self.apart = {name: self._flat(each.placements) for name, each in declared.apart.items()}
         watched = declared.watch.values()
         self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
         ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]

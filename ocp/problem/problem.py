@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import wraps
@@ -15,6 +15,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
+from ocp.problem.hulls import Hull
+from ocp.problem.separation import Separation
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
     check_finite,
@@ -26,6 +28,7 @@ from ocp.problem.values import (
     is_symbolic,
     numeric,
     stacked,
+    table,
 )
 
 __all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Signal", "Variable", "checked_problem"]
@@ -162,6 +165,7 @@ class Declarations:
     start: dict[str, Constraint] = field(default_factory=dict)
     end: dict[str, Constraint] = field(default_factory=dict)
     watch: dict[str, Constraint] = field(default_factory=dict)
+    apart: dict[str, Separation] = field(default_factory=dict)
     at_start: dict[str, Any] = field(default_factory=dict)
     horizon: Horizon | None = None
     running: Any = None
@@ -208,7 +212,7 @@ class Problem:
         Raises:
             ProblemError: It is something else.
         """
-        kinds = (Variable, Signal, Constraint, Horizon, Declarations)
+        kinds = (Variable, Signal, Constraint, Horizon, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = restored(state, kinds)
         self.formulated = None
 
@@ -395,6 +399,52 @@ class Problem:
             raise ProblemError(words, value=rate.numel(), limit=found.size)
         self.declared.watch[name] = replace(found, integral=integral, way=rate)
 
+    @_about_its_name
+    def separate(
+        self,
+        name: str,
+        placements: Value,
+        hulls: Mapping[str, Hull],
+        pairs: Any,
+        least: Any,
+        *,
+        levers: Mapping[str, Any],
+        turns: Mapping[str, Any],
+        speed: Any = 0.0,
+        acceleration: Any = 0.0,
+    ) -> None:
+        """Declare bodies that have to stay apart at every time, which the audit proves and no method holds.
+
+        Args:
+            name: Unique among the constraints.
+            placements: Of F frames in world: rotation column by column, then position, one below the other. Of states,
+                parameters and time. Shape (12 F, 1).
+            hulls: The bodies by name, on these frames or in world.
+            pairs: Of each pair the two bodies, by their places in ``hulls``, and the frame from which one is seen from
+                the other, -1 for the world. Shape (n, 3).
+            least: Least distance. Shape (n,) or a number, m.
+            levers, turns: By the name of a state: how far, and by what angle, it moves and turns one body seen from the
+                other at most, by its unit; see :mod:`ocp.problem.separation`. Shape (n, size) each.
+            speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,) or a number.
+        """
+        self._unused_constraint("separation", name)
+        movers = {}
+        for each in (*levers, *turns):
+            movers[each] = self._find(self.declared.states, each, "separation").size
+        parts = {}
+        count = len(table(f"separation {name!r}: pairs", pairs).reshape(-1, 3))
+        for label, given in (("levers", levers), ("turns", turns)):
+            what = f"separation {name!r}: {label}"
+            columns = [table(what, given.get(each, np.zeros((count, size)))) for each, size in movers.items()]
+            parts[label] = (
+                np.hstack([np.reshape(column, (count, -1)) for column in columns]) if columns else np.zeros((count, 0))
+            )
+        known = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
+        frames = self._expression(f"separation {name!r}: placements", placements, [*known, self.time])
+        self.declared.apart[name] = Separation(
+            name, frames, dict(hulls), pairs, least, movers, speed=speed, acceleration=acceleration, **parts
+        )
+
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
         if self.declared.running is not None:
@@ -437,6 +487,7 @@ class Problem:
         lines += [f"  d{state}/dt = {_short(rate)}" for state, rate in d.dynamics.items()]
         for kind in ("path", "start", "end", "watch"):
             lines += [f"  {kind:<12} {constraint}" for constraint in getattr(d, kind).values()]
+        lines += [f"  apart        {apart}" for apart in d.apart.values()]
         if d.running is not None:
             lines.append(f"  minimize     integral of {_short(d.running)} dt + {_short(d.terminal)}")
         return "\n".join(lines)
@@ -599,14 +650,8 @@ class Problem:
         self, kind: str, name: str, expression: Value, lower: Value, upper: Value, unit: str, known: Sequence[Any] = ()
     ) -> None:
         """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""
-        what = f"{kind} constraint {name!r}"
-        if not isinstance(name, str) or not name:
-            raise ProblemError(f"{kind} constraint: its name must be a non-empty string, not {name!r}")
+        what = self._unused_constraint(f"{kind} constraint", name)
         checked_text(f"{what}: unit", unit)
-        d = self.declared
-        for other in (d.path, d.start, d.end, d.watch):
-            if name in other:
-                raise ProblemError(f"{what}: a constraint of this name exists already")
         vector = self._expression(what, expression, [*self._inner(), *known])
         if vector.numel() == 0:
             raise ProblemError(f"{what} is empty")
@@ -614,6 +659,15 @@ class Problem:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
         getattr(self.declared, kind)[name] = Constraint(name, vector, low, high, unit)
+
+    def _unused_constraint(self, kind: str, name: Any) -> str:
+        """``kind 'name'``; ProblemError where it is no name of a constraint that can be new."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
+        d = self.declared
+        if any(name in pool for pool in (d.path, d.start, d.end, d.watch, d.apart)):
+            raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
+        return f"{kind} {name!r}"
 
 
 def _column_text(value: Any) -> str:

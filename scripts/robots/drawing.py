@@ -41,6 +41,7 @@ class Scene:
         view: Elevation and azimuth, deg.
         outline: Points of a closed line that is drawn too. Shape (k, 3), m.
         mark: A point that moves. Shape (M, 3), m.
+        nearest_points: Of two bodies, where they come nearest to each other along the motion. Shape (2, 3), m.
         tool: Length of the tip's z axis drawn, m.
     """
 
@@ -55,6 +56,7 @@ class Scene:
     tool: float = 0.0
     outline: Array | None = None
     mark: Array | None = None
+    nearest_points: Array | None = None
     points: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -173,6 +175,8 @@ def animate(path: Path, scenes: Sequence[Scene], *, frames: int, seconds: float,
         for ax, scene in zip(axes[0], scenes, strict=True):
             frame_up(ax, scenes)
             _surface(ax, scene)
+            if scene.nearest_points is not None:
+                ax.plot(*scene.nearest_points.T, "-o", color=COLORS["purple"], lw=2.0, ms=4.0)
             ax.plot(*scene.frames.tip.T, color=COLORS["green"], ls=":", lw=1.2)
             ax.set_title(scene.title, y=1.0, pad=0)
             (arm,) = ax.plot([], [], [], "-o", color=COLORS[scene.color], lw=2.2, ms=3.2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from models import Robot
 from models.arrays import Array
 from ocp import Audit, TipTask
+from ocp.audit.clearance import Nearest
 from ocp.tasks.equations import task_errors
 from scripts.robots import standing
 from scripts.robots.drawing import Scene, animate
@@ -39,10 +40,16 @@ class StandingExample:
     audit: Audit
     tolerances: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def nearest(self) -> Nearest:
+        """The two bodies of the robot that come nearest to each other along the plan."""
+        return min(self.audit.clearances["clearance"].pairs, key=lambda pair: pair.distance)
+
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
         found = self.results
         motion = found.motion
+        nearest = self.nearest
         errors = task_errors(found.machine, self.task, motion.t, None, motion.joints)
         return {
             "robot": self.name,
@@ -56,6 +63,8 @@ class StandingExample:
             "joint_return_rad": joint_return(found.solution),
             "audit_passed": self.audit.passed,
             "audit_tolerances": dict(self.tolerances),
+            "clearance_m": nearest.distance,
+            "clearance_pair": list(nearest.bodies),
             "zmp_margin_local_m": float(found.local.foot_margin.min()),
             "zmp_margin_optimal_m": float(motion.foot_margin.min()),
         }
@@ -95,18 +104,32 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
         f"Grey: footprint; diamond: zero moment point; the arm from the wheels to the hand. A rope pulls the hand "
         f"forward with {standing.PULL:g} N."
     )
-    animated(folder / "mobile_manipulator.gif", found, ground, note=note)
+    animated(folder / "mobile_manipulator.gif", found, ground, note=note, nearest=example.nearest)
 
 
 def animated(
-    path: Path, found: standing.Results, outline: Array, *, note: str, view: tuple[float, float] = (16.0, -50.0)
+    path: Path,
+    found: standing.Results,
+    outline: Array,
+    *,
+    note: str,
+    nearest: Nearest,
+    view: tuple[float, float] = (16.0, -50.0),
 ) -> None:
-    """A GIF of the local motion beside the plan, with their zero moment points; arguments as of Scene and animate."""
+    """A GIF of the local motion beside the plan, with their zero moment points; arguments as of Scene and animate.
+
+    The bodies that come nearest to each other along the plan are joined by a line.
+    """
+    note += (
+        f" Purple: where {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, {1000 * nearest.distance:.1f} mm."
+    )
     robot, machine, scenes = found.robot, found.machine, []
     for title, motion, color in (("instant by instant", found.local, "orange"), ("planned", found.motion, "blue")):
         frames = frames_along(robot, motion.joints, None, machine.translation, machine.rotation)
         zmp = np.column_stack([motion.zero_moment_point, np.zeros(len(motion.t))])
         scenes.append(Scene(title, robot, frames, motion.t, color, outline=outline, mark=zmp, view=view))
+        if motion is found.motion:
+            scenes[-1] = replace(scenes[-1], nearest_points=nearest.points)
     animate(path, scenes, frames=50, seconds=0.1, note=note)
 
 

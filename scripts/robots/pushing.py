@@ -15,10 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Footprint, Robot, Standing, Wrench, footprint, with_load
+from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, with_load
 from models.arrays import Array
 from models.machines.standing import External
-from ocp import Collocation, Problem, TipTask, resolve_accelerations, solve
+from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
 from scripts.robots.frames import frames_along
@@ -90,6 +90,7 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
         "limits": Limits(friction=FRICTION),
         "external": reaction(machine),
         "tip_level": "acceleration",
+        "clear": Clear(Surroundings(machine)),
         **changes,
     }
     hand = task(machine) if along == "time" else reach(machine)
@@ -143,7 +144,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
             f"with {force:g} N and gives way to the left."
         )
         outline = _legs(machine, robot)
-        animated(folder / "pushing.gif", found, outline, note=note, view=(24.0, -38.0))
+        animated(folder / "pushing.gif", found, outline, note=note, nearest=example.nearest, view=(24.0, -38.0))
 
 
 def _legs(machine: Standing, robot: Robot) -> Array:

@@ -16,12 +16,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Footprint, Robot, Standing, Wrench, footprint, locked, with_load
+from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, locked, with_load
 from models.arrays import Array
 from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from models.paths import rest_to_rest
-from ocp import Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
+from ocp import Clear, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
 from ocp.tasks.tip_task import timed
 from scripts.drawing import COLORS, DASHES, sheet
@@ -137,6 +137,7 @@ def problem(machine: Standing, *, along: Any = "time") -> Problem:
         limits=Limits(velocity=SHARE * robot.velocity, torque=SHARE * robot.effort, friction=0.6),
         along=along,
         tip_level="acceleration",
+        clear=Clear(Surroundings(machine)),
     )
 
 

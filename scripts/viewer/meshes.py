@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlparse
 
 import numpy as np
 
 from models.arrays import Array
+from models.shapes.mesh_files import find_mesh
 
 GREY = (0.72, 0.74, 0.78, 1.0)
 
@@ -41,31 +41,12 @@ class Shapes:
     missing: dict[str, str]
 
 
-def find_mesh(name: str, urdf: Path, folders: Sequence[Path] = ()) -> Path | None:
-    """The file that a URDF calls by a relative or absolute path, file:// or package://; None where there is none.
-
-    package://NAME/REST is DIR/NAME/REST, or DIR/REST where DIR is the package itself, for DIR of the folders and then
-    of the folders above the URDF file.
-    """
-    places = [*map(Path, folders), *urdf.resolve().parents]
-    address = urlparse(name)
-    if address.scheme in ("package", "model"):
-        rest = unquote(address.path).lstrip("/")
-        own = [folder / rest for folder in places if folder in folders or folder.name == address.netloc]
-        candidates = [folder / address.netloc / rest for folder in places] + own
-    elif address.scheme == "file":
-        candidates = [Path(unquote(address.path))]
-    else:
-        candidates = [folder / name for folder in [urdf.resolve().parent, *places]]
-    return next((path for path in candidates if path.is_file()), None)
-
-
 def read_shapes(urdf: Path, folders: Sequence[Path] = ()) -> Shapes:
     """Visual shapes of all links: meshes whose files are found, boxes, cylinders and spheres.
 
     Args:
         urdf: The file.
-        folders: Where to look for packages and meshes, see find_mesh.
+        folders: Where to look for packages and meshes, see models.shapes.mesh_files.find_mesh.
 
     Returns:
         The shapes; nothing but a reason for a file that yourdfpy cannot read.
@@ -110,7 +91,7 @@ def _meshes(geometry: Any, urdf: Path, folders: Sequence[Path]) -> list[Any]:
         return [trimesh.creation.icosphere(subdivisions=3, radius=float(geometry.sphere.radius))]
     if geometry.mesh is None:
         return []
-    path = find_mesh(geometry.mesh.filename, urdf, folders)
+    path = find_mesh(geometry.mesh.filename, urdf.resolve().parent, folders)
     if path is None:
         raise FileNotFoundError("not found; say where with --mesh-dir")
     scene = trimesh.load_scene(path)

@@ -16,11 +16,12 @@ import trimesh
 
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, link_frames
 from models.arrays import Array
+from models.shapes.mesh_files import find_mesh
 from ocp import Collocation, ProblemError, Solution, minimum_velocity_problem, solve
 from scripts import view
 from scripts.robots.frames import TIP, frames_along, inertia_box
 from scripts.viewer.command import parser, read
-from scripts.viewer.meshes import find_mesh, read_shapes
+from scripts.viewer.meshes import read_shapes
 from scripts.viewer.plan import Played, play, read_record, save_plan
 from scripts.viewer.scene import View
 
@@ -235,18 +236,18 @@ def test_meshes_are_found_in_the_folders_given_and_missing_ones_leave_boxes_and_
 ) -> None:
     urdf = folder / "arm.urdf"
     name = "package://arm_description/meshes/upper.stl"
-    assert find_mesh(name, urdf) is None
+    assert find_mesh(name, folder) is None
     bare = read_shapes(urdf)
     assert list(bare.missing) == [name]
     assert set(bare.by_link) == {"hull", "fore"}
     file = tmp_path / "share" / "arm_description" / "meshes" / "upper.stl"
     file.parent.mkdir(parents=True)
     trimesh.creation.box(extents=(0.2, 0.1, 0.1)).export(file)
-    assert find_mesh(name, urdf, [tmp_path / "share"]) == file
-    assert find_mesh(name, urdf, [tmp_path / "share" / "arm_description"]) == file
-    assert find_mesh(file.as_uri(), urdf) == file
-    assert find_mesh("meshes/upper.stl", file.parents[1] / "arm.urdf") == file
-    assert find_mesh(name, file.parents[1] / "urdf" / "arm.urdf") == file  # beside the package's own URDF
+    assert find_mesh(name, folder, [tmp_path / "share"]) == file
+    assert find_mesh(name, folder, [tmp_path / "share" / "arm_description"]) == file
+    assert find_mesh(file.as_uri(), folder) == file
+    assert find_mesh("meshes/upper.stl", file.parents[1]) == file
+    assert find_mesh(name, file.parents[1] / "urdf") == file  # beside the package's own URDF
     found = read_shapes(urdf, [tmp_path / "share"])
     assert not found.missing
     np.testing.assert_allclose(found.by_link["upper/arm"][0].mesh.extents, [0.4, 0.1, 0.1])  # scaled

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models.machines.standing import External, Standing
+from ocp.builders.clearance import Clear, keeping_clear, touching_error
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
@@ -65,12 +66,14 @@ class Attempt:
         solution: The plan, or the last iterate; None where there is none.
         failure: Why it is no plan, which is not raised; None where it is one.
         exceeded: Whether nothing is wrong with it but inequalities exceeded between the points of the grid.
+        touching: That bodies touch, where this alone is wrong with it.
     """
 
     name: str
     solution: Solution | None
     failure: SolveError | None = None
     exceeded: bool = False
+    touching: SolveError | None = None
 
 
 @interruptible
@@ -83,6 +86,7 @@ def plan_standing(
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
+    clear: Clear | None = None,
     **asked: Unpack[Asked],
 ) -> Solution:
     """Solve `standing_problem` and audit the plan, by the formulation that works for it.
@@ -97,6 +101,7 @@ def plan_standing(
         method: The first mesh, and by its `control` the only formulation that is tried.
         options: Of IPOPT.
         tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
+        clear: What the motion has to stay clear of; bodies that touch are held apart, and it is planned anew.
 
     Raises:
         SolveError: No attempt leads to a plan that passes; says what became of each, and carries what the last one
@@ -113,13 +118,34 @@ def plan_standing(
         (level, mesh.with_nodes_at(breaks))
         for level, mesh in _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
     ]
+
+    def run(clear: Clear | None) -> Solution:
+        def declare(level: Literal["position", "acceleration"]) -> Problem:
+            return standing_problem(machine, tasks, start_joints, horizon, tip_level=level, clear=clear, **asked)
+
+        return _first_that_holds(declare, trials, settings, judge)
+
+    return keeping_clear(clear, run)
+
+
+def _first_that_holds(
+    declare: Callable[[Literal["position", "acceleration"]], Problem],
+    trials: Sequence[Formulation],
+    settings: Mapping[str, Any],
+    judge: _Judge,
+) -> Solution:
+    """The plan that `plan_standing` returns, of the formulations that are tried.
+
+    Raises:
+        SolveError, ProblemError: As it does; at once where a plan is sound but for bodies that touch.
+    """
     reasons: list[str] = []
     why = SolveError()
     refused: list[ProblemError] = []
     last: Solution | None = None
     for level, mesh in trials:
         try:
-            problem = standing_problem(machine, tasks, start_joints, horizon, tip_level=level, **asked)
+            problem = declare(level)
         except ProblemError as error:  # one formulation may leave freedom where the other has none
             refused.append(error)
             reasons.append(f"tip {level}: {error}")
@@ -129,6 +155,8 @@ def plan_standing(
         for attempt in _attempts(problem, level, mesh, settings, judge, diagnosed=level == trials[-1][0]):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
+            if attempt.touching:
+                raise attempt.touching
             last = attempt.solution or last
             reasons.append(f"{attempt.name}: {attempt.failure}")
             why = attempt.failure or why
@@ -210,7 +238,7 @@ class _Judge:
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
             details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
             failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
-            return Attempt(name, solution, failure, exceeded)
+            return Attempt(name, solution, failure, exceeded, touching_error(audit, solution))
         progress = audit.states["path"][:, 0] if self.along_parameter else audit.t
         errors = np.abs(task_errors(self.machine, self.tasks, progress, None, audit.states["joints"])).max(axis=0)
         parts = bind(self.machine, self.tasks).bound

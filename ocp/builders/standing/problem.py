@@ -41,6 +41,7 @@ from models.machines.standing_motion import StandingMotion
 from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
 from models.robot.robot import Robot
+from ocp.builders.clearance import Clear
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
@@ -119,6 +120,7 @@ def standing_problem(
     start: Literal["rest", "free"] = "rest",
     end: Literal["rest", "free"] = "rest",
     end_joints: Any = None,
+    clear: Clear | None = None,
     symbols: Any = ca.SX,
 ) -> Problem:
     """Do the tasks while the machine stands, at the least cost.
@@ -146,6 +148,7 @@ def standing_problem(
             gap at the start can be closed; what is left of it at the end still moves the joints.
         start, end: Whether the joints are at rest there, or free to move.
         end_joints: Joint positions at the end, nan where free; all free if None. Shape (n,).
+        clear: What the motion has to stay clear of, see `ocp.builders.clearance`.
         symbols: casadi.SX, or casadi.MX when a task, external or a reference calls an interpolant.
 
     Returns:
@@ -222,6 +225,9 @@ def standing_problem(
         torques = machine.joint_torques(*motion, wrenches)[limited]
         problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
 
+    if clear is not None:
+        known = None if isinstance(horizon, FreeTime) else duration
+        checked_instance("standing_problem: clear", clear, Clear).declare(problem, none, joints, horizon=known)
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
         running += weights.joint_limits * joint_limit_index(machine.robot, joints)

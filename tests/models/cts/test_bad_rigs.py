@@ -1,4 +1,4 @@
-"""Whatever is wrong with a rig, its tunnel or its targets is refused by name; so are shapes."""
+"""Whatever is wrong with a rig, its tunnel or its targets is refused by name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Box, Capsule, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
+from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.cts.clearance import Radii, Surroundings, clear_inverse, clearances
 from models.cts.rig import INCH, Branch
 from models.cts.table import all_joint_sets, reachable_rolls
@@ -27,7 +27,6 @@ from tests.bad_values import (
     but,
     good_calls,
     panel,
-    rotation,
 )
 
 LENGTHS = dict.fromkeys(("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck"), 0.5)
@@ -139,22 +138,6 @@ CASES = [
         all_joint_sets,
         {"rig": RIG, "target": TARGET, "roll": 0.1},
         {"rig": INSTANCE, "target": array(5), "roll": FINITE | NOTHING},
-    ),
-    Case(
-        "Box",
-        Box,
-        {"size": (1, 1, 1)},
-        {
-            "size": but(array(3), "inf") | {"zero": (0, 1, 1), "negative": (-1, 1, 1), "endless": (INF, INF, INF)},
-            "position": array(3),
-            "rotation": rotation(),
-        },
-    ),
-    Case(
-        "Capsule",
-        Capsule,
-        {"radius": 0.1, "start": (0, 0, 0), "end": (0, 0, 1)},
-        {"radius": but(NONNEGATIVE, "symbol") | NOTHING, "start": array(3), "end": array(3)},
     ),
 ]
 

@@ -12,7 +12,7 @@ from models import Box, ModelError, optimal_inverse, reference_rig, reference_tu
 from models.cts.clearance import Surroundings, clear_inverse, clearances
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
-from models.shapes.capsules import soft_minimum
+from models.shapes.distance import soft_minimum
 from tests.models.cts.cts_oracle import Array, index_by_geometry, joints_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Link, ModelError, reference_rig
 from models.cts.clearance import Surroundings, clearances, rig_capsules
+from models.cts.gaps import LinkCapsule, box_distance, capsule_in_box, capsule_to_box, capsule_to_capsule
 from models.cts.rig import dh_frames
-from models.shapes.capsules import box_distance, capsule_in_box, capsule_to_box, capsule_to_capsule, soft_minimum
+from models.shapes.distance import soft_minimum
 from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
 
 seeds = st.integers(0, 2**32 - 1)
@@ -144,7 +145,9 @@ def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
     box, shift = Box((0.8, 0.6, 0.4)), ca.SX.sym("shift", 3)
     for _ in range(20):
         capsule = random_capsule(rng)
-        moved = capsule_to_box(Capsule(capsule.radius, ca.DM(capsule.start) + shift, ca.DM(capsule.end) + shift), box)
+        moved = capsule_to_box(
+            LinkCapsule(capsule.radius, ca.DM(capsule.start) + shift, ca.DM(capsule.end) + shift), box
+        )
         value = ca.Function("d", [shift], [moved, ca.gradient(moved, shift)])
         slope = np.array(value(np.zeros(3))[1]).ravel()
         if number(value(np.zeros(3))[0]) < 0.02:

@@ -12,10 +12,13 @@ from models import (
     FixedBase,
     FreeFloating,
     Link,
+    Moving,
     Path,
     Scara,
+    Sphere,
     Standing,
     Support,
+    Surroundings,
     footprint,
     planar_chain,
     rectangle,
@@ -25,6 +28,7 @@ from models import (
 from models.machines.machine import with_tip
 from models.machines.standing import tip_spring
 from tests.bad_values import (
+    CALLABLE,
     CHOICE,
     FINITE,
     INF,
@@ -44,7 +48,9 @@ from tests.bad_values import (
     panel,
     rotation,
 )
+from tests.models.machines.armoured import armoured_arm
 
+ARMOURED = FixedBase(armoured_arm())
 CHAIN = planar_chain([1.0, 0.8], [2.0, 1.0], base=Link("hull", 20.0, inertia=np.eye(3)))
 BOLTED = FixedBase(CHAIN)
 FLOATING = FreeFloating(CHAIN, "planar")
@@ -92,6 +98,29 @@ def arm() -> Scara:
 
 
 BOLTED_CASES = [
+    Case(
+        "Surroundings",
+        lambda **given: Surroundings(**given),
+        {"machine": ARMOURED, "obstacles": [Sphere(0.1, (2.0, 0.0, 0.0))], "clearance": 0.01},
+        {
+            "obstacles": SEQUENCE | {"array": np.ones(3), "two": [Sphere(0.1, (2.0, 0.0, 0.0)), 1.0]},
+            "clearance": NONNEGATIVE,
+            "ignored": SEQUENCE | {"unknown": [("link2", "nobody")], "three": [("link2", "link4", "link6")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+            "folders": {"number": 3, "word": "a", "numbers": [1, 2], "object": object()},
+            "missing": CHOICE,
+        },
+    ),
+    Case(
+        "Moving",
+        Moving,
+        {"shape": Sphere(0.1, (0.0, 0.0, 0.0)), "position": lambda time: (time, 0.0, 0.0)},
+        {
+            "shape": INSTANCE,
+            "position": CALLABLE | {"two": lambda time: (time, 0.0), "breaks": lambda time: 1 / 0},
+            "rotation": but(CALLABLE, "None") | {"two": lambda time: np.eye(2), "words": lambda time: "a"},
+        },
+    ),
     Case(
         "FixedBase", FixedBase, {"robot": CHAIN}, {"robot": INSTANCE, "translation": array(3), "rotation": rotation()}
     ),

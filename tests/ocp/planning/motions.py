@@ -23,7 +23,7 @@ from tests.ocp.tasks.space_tasks import floating_manipulator, panda, panda_arm, 
 DOWN = (0.0, 0.0, -1.0)
 CONE = float(np.radians(15.0))
 SPACE_START = np.array([0.3, -0.5, 0.4, 0.9, 0.2, 0.7, 0.1])
-HELD = np.array([0.45, 0.2, 0.4])
+HELD = np.array([0.45, 0.35, 0.4])
 """Where the left hand of the two holds, m."""
 
 
@@ -55,6 +55,11 @@ ASKED: dict[str, Callable[[], Asked]] = {}
 def asked(what: Callable[[], Asked]) -> Callable[[], Asked]:
     ASKED[what.__name__] = cache(what)
     return ASKED[what.__name__]
+
+
+def plan_bare(*asked: Any, **options: Any) -> Plan:
+    """As `plan`, for laws of motions whatever the links may touch."""
+    return plan(*asked, clearance=None, **options)
 
 
 @cache

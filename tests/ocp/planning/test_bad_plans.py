@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Path, SmoothPath, planar_chain, smooth
-from ocp import Limits, ProblemError, SolveError, TipTask, Unreachable
+from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
+from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.files import write_mcap
 from ocp.planning import Plan, plan
 from ocp.schedule import LineLimits, schedule
@@ -23,6 +23,7 @@ from tests.bad_values import (
     FINITE,
     FLAG,
     INSTANCE,
+    MAPPING,
     NAN,
     NONNEGATIVE,
     POSITIVE,
@@ -37,6 +38,7 @@ from tests.bad_values import (
     method,
     panel,
 )
+from tests.models.machines.armoured import armoured_arm
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.planning.motions import DOWN, angled_ur5
 from tests.ocp.tasks.space_tasks import ur5
@@ -49,6 +51,7 @@ LINE = smooth(Path.through([REACHED, REACHED + np.array([0.1, -0.2, 0.0])]), dev
 GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
 assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
+AROUND = Surroundings(FixedBase(armoured_arm()))
 ENDLESS = replace(GOOD, duration=None, breaks=())
 
 
@@ -86,7 +89,26 @@ CASES = [
             "search": CHOICE,
             "seed": WHOLE,
             "time_cost": POSITIVE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
         },
+    ),
+    Case(
+        "Clear",
+        Clear,
+        {"surroundings": AROUND, "margins": {0: 0.01}},
+        {
+            "surroundings": INSTANCE,
+            "margins": MAPPING | {"unknown": {99: 0.01}, "negative": {0: -1.0}, "nan": {0: NAN}, "word": {"a": 0.1}},
+        },
+    ),
+    Case(
+        "inverse_kinematics around",
+        inverse_kinematics,
+        {"machine": AROUND.machine, "task": TipTask(position=(0.5, 0.2, 0.6)), "surroundings": AROUND},
+        {"surroundings": but(INSTANCE, "None") | {"another's": Surroundings(FixedBase(armoured_arm()))}},
     ),
     Case(
         "TipTask.along",

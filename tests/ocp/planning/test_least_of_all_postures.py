@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, inverse_kinematics, minimum_velocity_problem, solve
-from ocp.planning import Plan, plan
+from ocp.planning import Plan
 from tests.models.robot.trees import Array
-from tests.ocp.planning.motions import ASKED, planned
+from tests.ocp.planning.motions import ASKED, plan_bare, planned
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
 
@@ -22,7 +22,7 @@ APART = 0.3
 @cache
 def cheapest() -> Plan:
     what = ASKED["seam_ur5"]()
-    return plan(what.machine, what.tasks, search="postures")
+    return plan_bare(what.machine, what.tasks, search="postures")
 
 
 def other_postures() -> list[Array]:

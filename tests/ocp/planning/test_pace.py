@@ -12,10 +12,10 @@ import pytest
 
 from models import Path, smooth
 from ocp import Limits, TipTask
-from ocp.planning import Plan, plan
+from ocp.planning import Plan
 from ocp.tasks.tip_task import timed
 from tests.models.robot.trees import Array
-from tests.ocp.planning.motions import DOWN, angled_ur5, angled_ur5_arm
+from tests.ocp.planning.motions import DOWN, angled_ur5, angled_ur5_arm, plan_bare
 from tests.ocp.planning.replay import stray
 
 pytestmark = pytest.mark.xdist_group("pace")  # one process, so that every motion is planned once
@@ -33,19 +33,19 @@ def asked(speed: float, **given: Any) -> TipTask:
 @cache
 def first() -> Array:
     """Where all these motions start: where the best of a free start does."""
-    return np.asarray(plan(angled_ur5(), asked(0.05), search="start")["joints"][0])
+    return np.asarray(plan_bare(angled_ur5(), asked(0.05), search="start")["joints"][0])
 
 
 @cache
 def fixed(speed: float) -> Plan:
-    return plan(angled_ur5(), asked(speed), start=first(), search="start")
+    return plan_bare(angled_ur5(), asked(speed), start=first(), search="start")
 
 
 @cache
 def free(time_cost: float, speed: float = FAST, limited: bool = False) -> Plan:
     limits = None if limited else UNLIMITED
     options: dict[str, Any] = {"search": "start", "time_cost": time_cost, "start": first(), "limits": limits}
-    return plan(angled_ur5(), asked(speed), "free", **options)
+    return plan_bare(angled_ur5(), asked(speed), "free", **options)
 
 
 def effort(found: Plan, time_cost: float) -> float:
@@ -89,7 +89,7 @@ def test_a_gap_is_closed_as_fast_as_the_task_says_however_long_it_lasts() -> Non
     """e' = -gain e of a tip that begins a millimetre beside its place."""
     place = np.array([0.45, -0.1, 0.251])
     task = TipTask(position=place, rows=(5,), gain=2.0, start_gap=0.01, duration=40.0)
-    found = plan(angled_ur5(), task, start=first(), search="start")
+    found = plan_bare(angled_ur5(), task, start=first(), search="start")
     times = np.array([0.0, 0.5, 1.0, 2.0])
     height = angled_ur5_arm().tips(found, times)[0][:, 2]
     np.testing.assert_allclose(height - place[2], -1e-3 * np.exp(-2.0 * times), atol=1e-6)
@@ -145,7 +145,7 @@ def test_at_the_pace_that_was_found_the_plan_of_a_fixed_horizon_costs_as_much() 
     run = ca.interpolant("run", "bspline", [clock], share * found.solution.horizon)
     task = asked(FAST)
     kinks = found.solution.at_fraction(task.breaks / task.duration)["clock"][:, 0]
-    again = plan(
+    again = plan_bare(
         angled_ur5(),
         timed(TipTask(position=task.position, direction=task.direction, duration=found.horizon, breaks=kinks), run),
         start=first(),
@@ -158,7 +158,7 @@ def test_at_the_pace_that_was_found_the_plan_of_a_fixed_horizon_costs_as_much() 
 def test_at_constant_speed_the_same_time_costs_more() -> None:
     """The pace is worth something: the task run evenly in the time that was found."""
     found = free(0.1)
-    even = plan(angled_ur5(), asked(BENT.length / found.horizon), start=first(), search="start", limits=UNLIMITED)
+    even = plan_bare(angled_ur5(), asked(BENT.length / found.horizon), start=first(), search="start", limits=UNLIMITED)
     assert even.horizon == pytest.approx(found.horizon)
     assert even.cost > 1.01 * effort(found, 0.1)
 

@@ -12,10 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Path, smooth
 from ocp import Limits, TipTask
-from ocp.planning import Plan, plan
+from ocp.planning import Plan
 from ocp.schedule import LineLimits, schedule
 from tests.models.robot.trees import Array
-from tests.ocp.planning.motions import ASKED, CONE, DOWN, HELD, angled_ur5, bent_seam, panda_peer, planned, raster
+from tests.ocp.planning.motions import (
+    ASKED,
+    CONE,
+    DOWN,
+    HELD,
+    angled_ur5,
+    bent_seam,
+    panda_peer,
+    plan_bare,
+    planned,
+    raster,
+)
 from tests.ocp.planning.replay import stray
 from tests.ocp.tasks.space_tasks import panda
 
@@ -122,7 +133,7 @@ START: dict[str, Any] = {"search": "start"}
 def short_motion(machine: Any = None, path: Any = SHORT, speed: Any = 0.05, **given: Any) -> Plan:
     options = {key: given.pop(key) for key in ("weights", "limits", "start") if key in given}
     task = TipTask.along(path, speed, **{"direction": DOWN, **given})
-    return plan(angled_ur5() if machine is None else machine, task, search="start", **options)
+    return plan_bare(angled_ur5() if machine is None else machine, task, search="start", **options)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +193,7 @@ def test_what_leaves_more_freedom_is_never_dearer() -> None:
     for given in ({"within": np.radians(2)}, {"within": np.radians(5)}, {}):
         asked: dict[str, Any] = {"direction": DOWN, **given} if given else {}
         task = TipTask.along(raster(3), 0.05, **asked)
-        costs.append(plan(panda(), task, start=start, search="start").cost)
+        costs.append(plan_bare(panda(), task, start=start, search="start").cost)
     assert (np.diff(costs) < 0).all()
 
 
@@ -191,7 +202,11 @@ def test_what_leaves_more_freedom_is_never_dearer() -> None:
 )
 def test_a_cone_is_cheaper_than_the_axis_held_and_is_used_to_its_edge(robot: str) -> None:
     cone, name = planned(f"finishing_{robot}"), {"panda": "three_lanes_panda"}.get(robot)
-    held = planned(name) if name else plan(angled_ur5(), TipTask.along(raster(3), 0.05, direction=DOWN), search="start")
+    held = (
+        planned(name)
+        if name
+        else plan_bare(angled_ur5(), TipTask.along(raster(3), 0.05, direction=DOWN), search="start")
+    )
     assert cone.cost < 0.9 * held.cost
     what = ASKED[f"finishing_{robot}"]()
     axis = what.arm.tips(cone, between(cone))[1][:, :, 2]
@@ -233,7 +248,7 @@ def run_since(begin: float, times: Array) -> Array:
 def test_between_two_tasks_joints_go_straight_at_constant_rate() -> None:
     """Each task is kept in its own interval; where nothing is asked the least velocity is the straight line."""
     tasks, paths = two_lines()
-    found = plan(panda(), tasks, search="start")
+    found = plan_bare(panda(), tasks, search="start")
     assert found.audit().passed
     assert found.horizon == pytest.approx(tasks[1].end)
     for task, path, direction in zip(tasks, paths, (DOWN, (1, 0, -1)), strict=True):
@@ -260,7 +275,7 @@ def test_a_task_in_two_pieces_is_the_same_motion() -> None:
 
     first = replace(whole, duration=half, breaks=())
     second = replace(whole, position=later(whole.position), begin=half, duration=half, breaks=())
-    one, two = (plan(angled_ur5(), tasks, search="start") for tasks in (whole, [first, second]))
+    one, two = (plan_bare(angled_ur5(), tasks, search="start") for tasks in (whole, [first, second]))
     assert two.audit().passed
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     times = between(one)

@@ -12,11 +12,11 @@ import pytest
 
 from models import FixedBase, Machine, Path, Robot, SmoothPath, locked, planar_chain, smooth
 from ocp import ProblemError, SolveError, TipTask
-from ocp.planning import Plan, plan
+from ocp.planning import Plan
 from ocp.tasks.equations import bind, task_errors
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import numeric
-from tests.ocp.planning.motions import DOWN, angled_ur5
+from tests.ocp.planning.motions import DOWN, angled_ur5, plan_bare
 from tests.ocp.tasks.space_tasks import PANDA_START, floating_panda, panda, pose
 
 Asked = tuple[Machine, Any, dict[str, Any]]
@@ -112,7 +112,7 @@ MOTIONS: list[Callable[[], Asked]] = [
 @pytest.mark.parametrize("make", MOTIONS)
 def test_the_motion_passes_and_does_its_tasks(make: Callable[[], Asked]) -> None:
     machine, tasks, options = make()
-    found = plan(machine, tasks, search="start", **options)
+    found = plan_bare(machine, tasks, search="start", **options)
     assert found.audit().passed
     for task in [tasks] if isinstance(tasks, TipTask) else tasks:
         times = np.linspace(task.begin, task.end, 401)[1:-1]
@@ -128,9 +128,9 @@ def test_a_plan_does_not_know_how_large_its_machine_is(scale: float) -> None:
     def moved(size: float) -> Plan:
         corners = size * np.array([(0.9, 0.1, 0), (0.6, 0.7, 0)])
         task = in_the_plane(*corners, speed=0.1 * size, deviation=0.005 * size)
-        return plan(chain(3, 0.5 * size), task, start=start, search="start")
+        return plan_bare(chain(3, 0.5 * size), task, start=start, search="start")
 
-    start = plan(chain(3), in_the_plane((0.9, 0.1, 0), (0.6, 0.7, 0)), search="start")["joints"][0]
+    start = plan_bare(chain(3), in_the_plane((0.9, 0.1, 0), (0.6, 0.7, 0)), search="start")["joints"][0]
     one, other = moved(1.0), moved(scale)
     assert other.cost == pytest.approx(one.cost, rel=1e-6)
     np.testing.assert_allclose(other["joints"], one["joints"], atol=1e-6)
@@ -146,7 +146,7 @@ def test_a_plan_does_not_know_how_large_its_machine_is(scale: float) -> None:
     ids=["a place", "an axis", "a lean"],
 )
 def test_what_stands_still_costs_nothing(task: TipTask) -> None:
-    found = plan(panda(), task, search="start")
+    found = plan_bare(panda(), task, search="start")
     assert found.audit().passed
     assert found.cost < 1e-12
     np.testing.assert_allclose(found["joints"], found["joints"][:1].repeat(len(found.t), axis=0), atol=1e-6)
@@ -157,7 +157,7 @@ def test_what_stands_still_costs_nothing(task: TipTask) -> None:
 def test_a_velocity_is_done_and_what_it_does_not_need_rests() -> None:
     """The last joint turns about the axis that the tip lies on: no velocity of the tip needs it."""
     asked = TipTask(velocity=[0.05, 0.05, 0.0], rows=(3, 4, 5), duration=2.0)
-    found = plan(panda(), asked, start=PANDA_START, search="start")
+    found = plan_bare(panda(), asked, start=PANDA_START, search="start")
     assert found.audit().passed
     places = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([0.0, 1.0, 2.0])["joints"]]
     np.testing.assert_allclose(np.diff(places, axis=0), [[0.05, 0.05, 0.0]] * 2, atol=1e-6)
@@ -179,9 +179,9 @@ def test_to_hold_what_was_reached_costs_nothing_more(first: Callable[[], TipTask
     """That the tip begins where it is held follows from what it did before: it is not asked twice."""
     _, at = pose(panda(), (), PANDA_START)
     still = [TipTask(position=at + np.array([0.1, 0.1, 0.0]), rows=rows, begin=2.0, duration=2.0)] if rows else []
-    found = plan(panda(), [first(), *still], 4.0, start=PANDA_START, search="start")
+    found = plan_bare(panda(), [first(), *still], 4.0, start=PANDA_START, search="start")
     assert found.audit().passed
-    alone = plan(panda(), first(), start=PANDA_START, search="start")
+    alone = plan_bare(panda(), first(), start=PANDA_START, search="start")
     assert found.cost == pytest.approx(alone.cost, rel=1e-6)
     np.testing.assert_allclose(found.at(4.0)["joints"], alone["joints"][-1], atol=1e-5)
 
@@ -192,18 +192,18 @@ def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_o
     shift = np.array([0.1, 0.1, 0.0])
     before, after = (TipTask(position=p, duration=1.0) for p in (at, at + shift))
     tasks = [before, replace(moved_by_a_velocity(), begin=1.0), replace(after, begin=3.0)]
-    found = plan(panda(), tasks, start=PANDA_START, search="start")
+    found = plan_bare(panda(), tasks, start=PANDA_START, search="start")
     assert found.audit().passed
     tips = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([1.0, 3.0, 4.0])["joints"]]
     np.testing.assert_allclose(tips, [at, at + shift, at + shift], atol=1e-6)
-    assert found.cost < plan(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
+    assert found.cost < plan_bare(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
 
 
 def test_a_place_that_what_came_before_does_not_lead_to_is_refused_by_name() -> None:
     _, at = pose(panda(), (), PANDA_START)
     off = TipTask(position=at + np.array([0.1, 0.12, 0.0]), begin=2.0, duration=2.0)
     with pytest.raises(SolveError, match="task position 2") as caught:
-        plan(panda(), [moved_by_a_velocity(), off], start=PANDA_START, search="start")
+        plan_bare(panda(), [moved_by_a_velocity(), off], start=PANDA_START, search="start")
     assert caught.value.name
 
 
@@ -212,5 +212,5 @@ def test_a_place_that_what_came_before_does_not_lead_to_is_refused_by_name() -> 
 )
 def test_to_hold_a_root_that_nothing_moves_is_refused(root: TipTask) -> None:
     with pytest.raises(ProblemError, match="no joint moves") as caught:
-        plan(panda(), [replace(moved_by_a_pose()), root], start=PANDA_START)
+        plan_bare(panda(), [replace(moved_by_a_pose()), root], start=PANDA_START)
     assert caught.value.name == "rows"

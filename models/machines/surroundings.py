@@ -1,0 +1,431 @@
+"""What a machine may touch: its own links, and obstacles around it, at rest or moving; how its joints move the pairs.
+
+A pair of bodies is seen from where both hang: the last link that carries them both, or the world. Only what lies
+between the two moves them towards each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import Array, checked_nonnegative
+from models.errors import ModelError
+from models.machines.machine import Machine
+from models.robot.kinematics import link_frames
+from models.robot.parts import Joint
+from models.robot.robot import Robot
+from models.shapes.bodies import Body, MissingRule, bodies_of
+from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
+from models.shapes.intervals import bounds
+from models.shapes.pairs import checked_pairs
+from models.shapes.shapes import KINDS, HalfSpace, Mesh, Shape, checked_shape
+from models.spatial import Expression, Frame, expression
+
+WORLD = -1
+"""In the place of a frame: the world."""
+PIECES = 512
+"""Of a time, in which the motion of an obstacle is bounded one after the other."""
+CLOSE = 3
+"""Joints between links whose meshes are looked at as they are."""
+FINEST = 1e-6
+"""m: of the least of several distances."""
+TURN_OF_QUATERNION = 2.0
+"""rad: a unit quaternion that changes by dq turns by 2 |dq|."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """An obstacle that moves: a part on a conveyor, a target that tumbles.
+
+    Attributes:
+        shape: In a frame of its own; no half-space.
+        position: Time (s), a casadi symbol -> origin of that frame in world, shape (3,), m.
+        rotation: The same of its axes, as columns. Shape (3, 3). None: those of the world.
+
+    Raises:
+        ModelError: No shape, a half-space, functions that give something else, or that change with anything but time.
+    """
+
+    shape: Shape
+    position: Callable[[Any], Any]
+    rotation: Callable[[Any], Any] | None = None
+    _at: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(checked_shape(self.shape, "moving", "shape"), HalfSpace):
+            message = "moving: a half-space cannot move; give a box that is large enough"
+            raise ModelError(message, name="shape", value=self.shape)
+        time = ca.SX.sym("time")
+        parts = []
+        for what, given, shape in (("position", self.position, (3, 1)), ("rotation", self.rotation, (3, 3))):
+            if given is None and what == "rotation":
+                parts.append(ca.SX.eye(3))
+                continue
+            if not callable(given):
+                message = f"moving: {what} must be a function of time, not {given!r}"
+                raise ModelError(message, name=what, value=given)
+            try:
+                value = ca.densify(ca.SX(expression(given(time))))
+            except Exception as error:  # of the function's own, too
+                message = f"moving: {what} is no function of a casadi symbol, the time: {error}"
+                raise ModelError(message, name=what, value=given) from error
+            if value.shape != shape or any(not ca.is_equal(symbol, time) for symbol in ca.symvar(value)):
+                message = (
+                    f"moving: {what} gives {value.shape} of {ca.symvar(value)}; {shape} of the time alone expected"
+                )
+                raise ModelError(message, name=what, value=value.shape, limit=shape)
+            parts.append(value)
+        object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
+
+    def frame(self, time: Expression) -> Frame:
+        """Of its shape in world, at a time (s)."""
+        return Frame(*self._at(time))
+
+    def fastest(self, begin: float, end: float) -> tuple[float, float]:
+        """Bounds of speed and acceleration of its points between two times, m/s and m/s^2.
+
+        Raises:
+            ModelError: They are not bounded, as far as interval arithmetic can tell.
+        """
+        time = ca.SX.sym("time")
+        turn, place = self._at(time)
+        points = ca.densify(ca.mtimes(turn, ca.SX(self.shape.core.T)) + ca.repmat(place, 1, len(self.shape.core)))
+        cuts = np.linspace(begin, end, PIECES + 1)
+        found, value = [], ca.vec(points)
+        for what in ("speed", "acceleration"):
+            value = ca.jacobian(value, time)
+            low, high = bounds(ca.densify(value), time, cuts[:-1], cuts[1:])
+            most = np.maximum(np.abs(low), np.abs(high)).reshape(PIECES, -1, 3)
+            largest = float(np.linalg.norm(most, axis=2).max())
+            if not np.isfinite(largest):
+                message = f"moving: the {what} of the obstacle has no bound from {begin:g} to {end:g} s"
+                raise ModelError(message, name="position", value=largest)
+            found.append(largest)
+        return found[0], found[1]
+
+
+class Placed(NamedTuple):
+    """A body that is looked at.
+
+    Attributes:
+        name: Of its link, with a number where it has several; or of an obstacle.
+        shape: In the frame that it rides on.
+        frame: Index of that frame among those of `Surroundings.placements`; -1: the world.
+    """
+
+    name: str
+    shape: Shape
+    frame: int
+
+
+class Levers(NamedTuple):
+    """How the configuration moves each of n pairs, one body seen from the other.
+
+    A coordinate of rate r moves no point faster than its lever times |r|, and turns no faster than its turn times |r|.
+
+    Attributes:
+        base, base_turns: Of the base's configuration. Shape (n, base_size).
+        joints, joint_turns: Of the joints. Shape (n, joint_size).
+    """
+
+    base: Array
+    base_turns: Array
+    joints: Array
+    joint_turns: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The bodies of a machine and the obstacles around it, and which of them are looked at, pair by pair.
+
+    Attributes:
+        machine: Any machine; the <collision> shapes of its robot are its bodies, see `models.shapes.bodies`.
+        obstacles: Shapes in world, and moving ones.
+        clearance: How far bodies and obstacles have to be apart, m.
+        ignored: Pairs of names of links that are not looked at, beside neighbours and what never or always touches; or
+            of a link and an obstacle, "obstacle 0".
+        srdf: File whose pairs are not looked at either, or None.
+        folders: Where meshes are looked for.
+        missing: "raise" where a mesh is missing; "skip" goes on without it, and warns.
+        bodies: All that is looked at, obstacles last.
+        pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
+        left: Pairs of names that are not looked at, and why.
+
+    Raises:
+        ModelError: A clearance below zero, an obstacle that is no shape, a name that there is none of, a mesh that is
+            missing.
+    """
+
+    machine: Machine
+    obstacles: Sequence[Shape | Moving] = ()
+    clearance: float = 0.0
+    ignored: Sequence[tuple[str, str]] = ()
+    srdf: str | Path | None = None
+    folders: Sequence[str | Path] = ()
+    missing: MissingRule = "raise"
+    bodies: tuple[Placed, ...] = field(init=False, repr=False)
+    pairs: Array = field(init=False, repr=False)
+    left: dict[tuple[str, str], str] = field(init=False, repr=False)
+    _carriers: tuple[str, ...] = field(init=False, repr=False)
+    _covers: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, Moving)) else self.obstacles
+        found = _listed(given, "obstacles")
+        for number, one in enumerate(found):
+            if not isinstance(one, Moving):
+                checked_shape(one, "surroundings", f"obstacles[{number}]")
+        object.__setattr__(self, "obstacles", found)
+        near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
+        object.__setattr__(self, "clearance", near)
+        robot = self.machine.robot
+        own = bodies_of(robot, folders=self.folders, missing=self.missing)
+        names = [f"obstacle {number}" for number in range(len(found))]
+        ignored = [_pair(each, number) for number, each in enumerate(_listed(self.ignored, "ignored"))]
+        around = {pair for pair in ignored if names and any(name in names for name in pair)}
+        for pair in around:
+            for name in pair:
+                if name not in names:
+                    robot.link(name)
+        links = [pair for pair in ignored if pair not in around]
+        known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near)
+        paths = {body.link: _way(robot, body.link) for body in own}
+        close = self._close_meshes(own, known.checked)
+        covered = {pair for pairs in close.values() for pair in pairs}
+        seen = [
+            (one, other, _last_common(paths[own[one].link], paths[own[other].link]))
+            for one, other in known.checked
+            if (one, other) not in covered
+        ]
+        left = dict(known.left)
+        touching: list[tuple[int, int, str]] = []
+        for number, name in enumerate(names):
+            for i, body in enumerate(own):
+                if {(body.link, name), (name, body.link)} & around:
+                    left[body.link, name] = "told"
+                elif not self._moves(body.link) and not isinstance(found[number], Moving):
+                    left[body.link, name] = "neither moves"
+                else:
+                    touching.append((i, len(own) + number, ""))
+        meeting = [_last_common(paths[own[i].link], paths[own[j].link]) for i, j in known.checked]
+        carriers = dict.fromkeys([body.link for body in own] + meeting)
+        object.__setattr__(self, "_carriers", tuple(carriers))
+        places = {link: k for k, link in enumerate(carriers)}
+        bodies = [Placed(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
+        movers = [one for one in found if isinstance(one, Moving)]
+        for name, one in zip(names, found, strict=True):
+            frame = len(carriers) + movers.index(one) if isinstance(one, Moving) else WORLD
+            bodies.append(Placed(name, one.shape if isinstance(one, Moving) else one, frame))
+        hulls: dict[int, int] = {}
+        covers: dict[int, tuple[tuple[int, int], ...]] = {}
+        for stand_ins in close.values():
+            for k in stand_ins[0]:
+                mesh = own[k].mesh
+                if id(mesh) not in hulls:
+                    hulls[id(mesh)] = len(bodies)
+                    bodies.append(Placed(f"{own[k].link} hull {len(hulls)}", Mesh(mesh), places[own[k].link]))
+            one, other = (own[k] for k in stand_ins[0])
+            covers[len(seen)] = tuple(stand_ins)
+            seen.append((hulls[id(one.mesh)], hulls[id(other.mesh)], _last_common(paths[one.link], paths[other.link])))
+        object.__setattr__(self, "bodies", tuple(bodies))
+        object.__setattr__(self, "_covers", covers)
+        pairs = [(*pair, places[link]) for *pair, link in seen] + [(*pair, WORLD) for *pair, _ in touching]
+        object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
+        object.__setattr__(self, "left", left)
+
+    @property
+    def labels(self) -> tuple[tuple[str, str], ...]:
+        """Names of the two bodies of each pair."""
+        return tuple((self.bodies[one].name, self.bodies[other].name) for one, other, _ in self.pairs)
+
+    @property
+    def moves_by_itself(self) -> bool:
+        """Whether an obstacle moves."""
+        return any(isinstance(one, Moving) for one in self.obstacles)
+
+    def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
+        """Frames of bodies: rotation column by column, then position, one below the other. Shape (12 F, 1)."""
+        frames = self._frames(base, q, time)
+        columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
+        return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
+
+    def distances(
+        self,
+        base: Expression,
+        q: Expression,
+        time: Expression = 0.0,
+        *,
+        pairs: Sequence[int] | None = None,
+        rounding: float = 0.0,
+    ) -> Expression:
+        """Signed distances of pairs, m, exact or from below; see `models.shapes.distance`. Shape (n, 1).
+
+        Where hulls of meshes are looked at it is that of their covers.
+
+        Args:
+            base, q: Configuration of the machine. time: s.
+            pairs: Which; all if None. rounding: As of `distance`, m.
+        """
+        frames = [*self._frames(base, q, time), None]
+        columns: dict[int, Expression] = {}
+
+        def side(body: int) -> Expression:
+            if body not in columns:
+                placed = self.bodies[body]
+                columns[body] = column(placed.shape, frames[placed.frame])
+            return columns[body]
+
+        def between(one: int, other: int) -> Expression:
+            a, b = self.bodies[one], self.bodies[other]
+            kinds = type(a.shape), type(b.shape)
+            if set(kinds) <= COLUMNS.keys():
+                return pair_function(*kinds, rounding)(side(one), side(other))
+            return distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding)
+
+        found = []
+        for pair in range(len(self.pairs)) if pairs is None else pairs:
+            each = [between(*both) for both in self._covers.get(int(pair), (self.pairs[pair, :2].tolist(),))]
+            found.append(each[0] if len(each) == 1 else soft_minimum(each, rounding / 4 + FINEST))
+        return ca.vertcat(*found) if found else expression(q)[:0]
+
+    @cached_property
+    def levers(self) -> Levers:
+        """How the configuration moves each pair.
+
+        Raises:
+            ModelError: A slide without limits.
+        """
+        robot, machine = self.machine.robot, self.machine
+        n, dof, size = len(self.pairs), robot.dof, machine.base_size
+        joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
+        base, base_turns = np.zeros((n, size)), np.zeros((n, size))
+        for row, (one, other, seen) in enumerate(self.pairs):
+            for placed in (self.bodies[one], self.bodies[other]):
+                if not 0 <= placed.frame < len(self._carriers):
+                    continue  # an obstacle
+                way = robot.path_to(self._carriers[placed.frame])
+                above = len(robot.path_to(self._carriers[seen])) if seen != WORLD else 0
+                reach = self._sum_levers(placed, way[above:], joints[row], turns[row])
+                if seen == WORLD and size == 3:
+                    base[row] += (1.0, 1.0, reach)
+                    base_turns[row] += (0.0, 0.0, 1.0)
+                elif seen == WORLD and size:
+                    base[row] += np.r_[np.ones(3), np.full(4, TURN_OF_QUATERNION * reach)]
+                    base_turns[row] += np.r_[np.zeros(3), np.full(4, TURN_OF_QUATERNION)]
+        return Levers(base, base_turns, joints, turns)
+
+    def fastest(self, begin: float, end: float) -> tuple[Array, Array]:
+        """Bounds of speed and acceleration of each pair by time alone, m/s and m/s^2. Shape (n,) each.
+
+        Raises:
+            ModelError: Those of a moving obstacle are not bounded.
+        """
+        known = {
+            f"obstacle {k}": one.fastest(begin, end) for k, one in enumerate(self.obstacles) if isinstance(one, Moving)
+        }
+        still = (0.0, 0.0)
+        moving = [known.get(self.bodies[one].name, still) for one, _, _ in self.pairs]
+        moved = [known.get(self.bodies[other].name, still) for _, other, _ in self.pairs]
+        both = (np.array(moving) + np.array(moved)).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    # ---- inside ------------------------------------------------------------------------------------------------
+
+    def _frames(self, base: Expression, q: Expression, time: Expression) -> list[Frame]:
+        machine = self.machine
+        frames = link_frames(machine.robot, q, machine.world_from_base(base))
+        moving = [one.frame(time) for one in self.obstacles if isinstance(one, Moving)]
+        return [*(frames[link] for link in self._carriers), *moving]
+
+    def _close_meshes(
+        self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
+    ) -> dict[tuple[int, int], list[tuple[int, int]]]:
+        """Pairs of bodies, by the two meshes that they cover, of links two or three joints apart.
+
+        These may be a few millimetres from each other by design, less than covers stand out: their hulls are looked at.
+        """
+        robot = self.machine.robot
+        found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        for i, j in checked:
+            one, other = own[i], own[j]
+            apart = set(_moving(robot, one.link)) ^ set(_moving(robot, other.link))
+            if one.mesh is not None and other.mesh is not None and len(apart) <= CLOSE:
+                found.setdefault((id(one.mesh), id(other.mesh)), []).append((i, j))
+        return found
+
+    def _moves(self, link: str) -> bool:
+        """Whether a link ever moves in world."""
+        return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
+
+    def _sum_levers(self, placed: Placed, way: Sequence[Joint], levers: Array, turns: Array) -> float:
+        """Add the levers (dof,) and turns (dof,) of the joints on the way to a body from the tip of the way on; the
+        farthest that any of its points comes from where the way begins, m."""
+        robot = self.machine.robot
+        points, swelling = placed.shape.core, placed.shape.swelling
+        reach = float(np.linalg.norm(points, axis=1).max()) + swelling
+        exact = True  # as long as nothing moved between the joint and the points
+        for joint in reversed(way):
+            drive = robot.drives.get(joint.name)
+            if joint.moves and drive is not None:
+                share = abs(drive.multiplier)
+                if joint.kind == "prismatic":
+                    levers[drive.column] += share
+                    most = max(abs(joint.lower), abs(joint.upper))
+                    if not np.isfinite(most):
+                        message = f"surroundings: joint {joint.name!r} slides without limits; give it some"
+                        raise ModelError(message, name=joint.name, value=most)
+                    reach, exact = reach + most, False
+                else:
+                    across = points - np.outer(points @ joint.axis, joint.axis)
+                    lever = float(np.linalg.norm(across, axis=1).max()) + swelling if exact else reach
+                    levers[drive.column] += share * lever
+                    turns[drive.column] += share
+                    exact = False
+            if exact:
+                points = points @ joint.rotation.T + joint.translation
+                reach = float(np.linalg.norm(points, axis=1).max()) + swelling
+            else:
+                reach += float(np.linalg.norm(joint.translation))
+        return reach
+
+
+def _way(robot: Robot, link: str) -> tuple[str, ...]:
+    """Links from the root to a link."""
+    return robot.root, *(joint.child for joint in robot.path_to(link))
+
+
+def _moving(robot: Robot, link: str) -> list[str]:
+    """Joints that move and carry a link."""
+    return [joint.name for joint in robot.path_to(link) if joint.moves]
+
+
+def _last_common(one: tuple[str, ...], other: tuple[str, ...]) -> str:
+    """The last link that two ways have in common."""
+    return [a for a, b in zip(one, other, strict=False) if a == b][-1]
+
+
+def _named(bodies: Sequence[Body]) -> list[str]:
+    """Names of bodies: of their links, with a number where a link has several."""
+    links = [body.link for body in bodies]
+    return [link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}" for k, link in enumerate(links)]
+
+
+def _listed(values: Any, what: str) -> tuple[Any, ...]:
+    if isinstance(values, str | bytes | dict) or not hasattr(values, "__iter__"):
+        message = f"surroundings: {what} must be a list, not {values!r}"
+        raise ModelError(message, name=what, value=values)
+    return tuple(values)
+
+
+def _pair(value: Any, number: int) -> tuple[str, str]:
+    if isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(name, str) for name in value):
+        return value[0], value[1]
+    message = f"surroundings: ignored[{number}] must be two names, not {value!r}"
+    raise ModelError(message, name="ignored", value=value)

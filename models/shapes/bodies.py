@@ -1,0 +1,168 @@
+"""The shapes of a robot: what its links' collision elements are, each in the frame of its link."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+from warnings import warn
+
+import numpy as np
+
+from models.arrays import Array, checked_choice, checked_instance, checked_name, checked_nonnegative
+from models.errors import ModelError, ModelWarning
+from models.robot.parts import CollisionShape, Link
+from models.robot.robot import Robot
+from models.shapes.covering import Cover, cover
+from models.shapes.mesh_files import find_mesh, read_mesh
+from models.shapes.shapes import SIDES, Box, Capsule, Cylinder, Shape, Sphere, checked_shape
+
+MissingRule: TypeAlias = Literal["raise", "skip"]
+Folders: TypeAlias = Sequence[str | os.PathLike[str]]
+
+FLAT = 1.25
+"""A capsule of this many times the volume of the cylinder that it stands for is too much: the cylinder is kept."""
+RADII = np.linspace(0.0, 1.0, 400) ** 3
+"""Where the radius of a capsule is tried: shares of the way from the cylinder's own to that of the ball around it. They
+are closest at the first, where a little more lets the caps begin much earlier."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A shape of a link.
+
+    Attributes:
+        link: Name of the link that carries it.
+        shape: In the frame of the link.
+        overhang: How far it stands out of what the description says at most, m: of a mesh out of its convex hull, as
+            `models.shapes.covering` measures it.
+        mesh: Points of the mesh that it covers, or a part of, in the frame of the link; None of other shapes. Shape
+            (n, 3), m.
+
+    Raises:
+        ModelError: A name that is none, something that is no shape or has no end, a negative overhang.
+    """
+
+    link: str
+    shape: Shape
+    overhang: float = 0.0
+    mesh: Array | None = None
+
+    def __post_init__(self) -> None:
+        owner = f"body of link {checked_name(self.link, 'body', 'link')!r}"
+        reach = checked_shape(self.shape, owner, "shape").reach(np.zeros(3))
+        if not np.isfinite(reach):
+            raise ModelError(f"{owner}: shape {self.shape!r} has no end", name="shape", value=self.shape)
+        object.__setattr__(self, "overhang", checked_nonnegative(self.overhang, owner, "overhang", "m"))
+
+
+def bodies_of(robot: Robot, *, folders: Folders = (), missing: MissingRule = "raise") -> tuple[Body, ...]:
+    """The bodies of a robot's links, from their collision shapes, in the order of the links.
+
+    Boxes, spheres and capsules stay what they are. A cylinder becomes a capsule around it, of which distances are exact
+    and cheap, or stays one where that would be of more than FLAT times its volume. A mesh is covered by a few capsules
+    or a box: see `models.shapes.covering.cover`.
+
+    Args:
+        folders: Where meshes are looked for before the folder of the URDF file and those above it; see
+            `models.shapes.mesh_files.find_mesh`.
+        missing: What to do about a mesh that is not found or not read: "raise", or "skip" it with a warning.
+
+    Raises:
+        ModelError: A mesh that is missing or broken, named with its link; a robot, folder or rule that is none.
+
+    Warns:
+        ModelWarning: Meshes that are skipped, each with its link and why.
+    """
+    checked_instance(robot, Robot, "bodies_of", "robot")
+    checked_choice(missing, get_args(MissingRule), "bodies_of", "missing")
+    if isinstance(folders, str | os.PathLike) or not isinstance(folders, Sequence):
+        message = f"bodies_of: folders must be a list of paths, not {folders!r}"
+        raise ModelError(message, name="folders", value=folders)
+    find_mesh("", None, folders)  # says which of them is no path
+    found: list[Body] = []
+    skipped: dict[str, str] = {}
+    for link in robot.links:
+        for shape in link.collisions:
+            if shape.kind != "mesh":
+                found.append(_simple(link, shape))
+                continue
+            try:
+                covers, points = _covers(link, shape, folders)
+            except ModelError as error:
+                if missing == "raise":
+                    raise
+                skipped[f"{link.name}: {shape.file}"] = str(error)
+                continue
+            found += [
+                Body(link.name, each.shape.placed(shape.rotation, shape.translation), each.overhang, points)
+                for each in covers
+            ]
+    if skipped:
+        message = f"links that touch nothing with these meshes: {'; '.join(skipped.values())}"
+        warn(ModelWarning(message, name=next(iter(skipped)), value=tuple(skipped)), stacklevel=2)
+    return tuple(found)
+
+
+def _simple(link: Link, shape: CollisionShape) -> Body:
+    place, turn, size = np.asarray(shape.translation), np.asarray(shape.rotation), np.asarray(shape.size)
+    if shape.kind == "box":
+        return Body(link.name, Box(size, place, turn))
+    radius = float(size[0])
+    if shape.kind == "sphere":
+        return Body(link.name, Sphere(radius, place))
+    length = float(size[1])
+    half = length / 2 * turn[:, 2]
+    if shape.kind == "capsule":
+        return Body(link.name, Capsule(radius, place - half, place + half))
+    around, wide, overhang = capsule_around(radius, length)
+    if around <= FLAT * np.pi * radius**2 * length:
+        half = (wide[1] / 2) * turn[:, 2]
+        return Body(link.name, Capsule(wide[0], place - half, place + half), overhang)
+    return Body(link.name, Cylinder(radius, length, place, turn), radius * (1 / np.cos(np.pi / SIDES) - 1))
+
+
+def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
+    """The capsule of least volume around a cylinder.
+
+    With the radius R the rims of the cylinder lie on the caps where these begin sqrt(R^2 - r^2) before its ends.
+
+    Args:
+        radius, length: Of the cylinder, m.
+
+    Returns:
+        Volume, m^3; radius R and length without the caps, m; how far its poles stand out, m.
+    """
+    most = float(np.hypot(radius, length / 2))
+    tried = radius + (most - radius) * RADII
+    lengths = np.maximum(length - 2 * np.sqrt(np.maximum(tried**2 - radius**2, 0)), 0)
+    volumes = np.pi * tried**2 * (lengths + 4 / 3 * tried)
+    k = int(volumes.argmin())
+    wide = float(tried[k]) * (1 + 1e-12)  # the rims inside whatever rounding does
+    return float(volumes[k]), (wide, float(lengths[k])), wide + float(lengths[k]) / 2 - length / 2
+
+
+def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[Cover, ...], Array]:
+    """Of a mesh, scaled, in the axes of the shape; and its points in the frame of the link."""
+    path = find_mesh(shape.file, shape.folder or None, folders)
+    if path is None:
+        message = (
+            f"link {link.name!r}: the mesh {shape.file!r} is not found: say in which folder its package or the file "
+            "lies, folders=[FOLDER], or go on without it, missing='skip'"
+        )
+        raise ModelError(message, name=shape.file, value=link.name)
+    try:
+        vertices, faces = read_mesh(path)
+        scaled = _scaled(vertices, shape)
+        points = scaled[np.unique(faces)] @ shape.rotation.T + shape.translation
+        return cover(scaled, faces), np.asarray(points)
+    except ModelError as error:
+        raise ModelError(
+            f"link {link.name!r}: {error}", name=error.name, value=error.value, limit=error.limit
+        ) from error
+
+
+def _scaled(vertices: Array, shape: CollisionShape) -> Array:
+    with np.errstate(over="ignore"):  # what is not finite is refused by the cover
+        return np.asarray(vertices * shape.size)

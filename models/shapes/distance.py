@@ -1,0 +1,563 @@
+"""Signed distance of two shapes as an expression, for constraints, indices, proofs and reports.
+
+Between spheres, capsules, boxes and half-spaces it is exact: the way between the nearest points, and where the shapes
+overlap minus the least way that parts them. With meshes and cylinders it is a bound from below, the largest gap along
+the normals of their faces.
+
+A shape is a core of points, swelled. Where cores are apart by d their distance is d; where they overlap it is the
+largest of the gaps along the directions that may separate them (faces, edge by edge), which is then negative and the
+depth of polytopes. That gap is never more than d, and positive exactly where the cores are apart, so d + min(gap, 0) is
+both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cache, reduce
+from itertools import product
+from math import log
+from typing import Any, NamedTuple, TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
+from models.errors import ModelError
+from models.shapes.hull import Hull
+from models.shapes.shapes import Box, Capsule, HalfSpace, Shape, Sphere, checked_shape
+from models.spatial import Expression, Frame, expression, on_scalars
+
+Triple: TypeAlias = tuple[Expression, Expression, Expression]
+"""A vector as three scalars, floats where they are known: products with their zeros and ones vanish from the graph."""
+
+KINK = 1e-12
+"""m: what rounds off the kink of an exact distance at zero."""
+PARALLEL = 1e-13
+"""Squared sine of an angle: segments at less are parallel, which costs at most 3e-7 of their length."""
+NO_EDGE = 1e-18
+"""Squared sine of an angle: edges at less span no direction that could separate."""
+BARRED = 1e9
+"""m: taken from the gap along a direction that is none."""
+GRAIN = 2.0**40
+"""Steps in 0..1 of where along a segment its piece is looked up."""
+
+
+class Rod(NamedTuple):
+    """Core of a sphere or a capsule: one point or two."""
+
+    points: tuple[Triple, ...]
+
+
+class Block(NamedTuple):
+    """Core of a box: its centre, its axes, half of its edges."""
+
+    centre: Triple
+    axes: tuple[Triple, Triple, Triple]
+    half: Triple
+
+
+class Solid(NamedTuple):
+    """Core of a mesh or a cylinder: a hull in axes of its own."""
+
+    centre: Triple
+    axes: tuple[Triple, Triple, Triple]
+    hull: Hull
+
+
+class Plane(NamedTuple):
+    """A half-space."""
+
+    point: Triple
+    normal: Triple
+
+
+Core: TypeAlias = Rod | Block | Solid | Plane
+
+COLUMNS: dict[type[Shape], int] = {Sphere: 4, Capsule: 7, Box: 15, HalfSpace: 6}
+"""Entries of the column of a shape of each kind that has one."""
+
+
+def distance(
+    one: Shape, other: Shape, one_frame: Frame | None = None, other_frame: Frame | None = None, *, rounding: float = 0.0
+) -> Expression:
+    """Signed distance of two shapes, m. Shape (1, 1). Negative where they overlap; its gradient leads apart.
+
+    Without rounding it is exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its
+    prism) beside a half-space; other pairs with a mesh or a cylinder get the largest gap along the normals of their
+    faces, which is never more than the distance.
+
+    The exact distance of capsules and boxes has a gradient with kinks: where segments are parallel the nearest points
+    jump from end to end, and a method that builds on second derivatives goes back and forth there. With rounding e > 0
+    it is a bound from below that such a method, an interior-point one, converges on: the form that planners use. The
+    squared distance is minimised over places s, t in 0..1 along the segments with e^2 ((s - 1/2)^2 + (t - 1/2)^2) added
+    to it. That is strictly convex, so places and gradient are Lipschitz. The added term is at most c = e^2/2, or e^2/4
+    with one segment: the minimum M lies in d^2..d^2 + c, and (M - c)/sqrt(M + c) is at most d, smooth, and without the
+    infinite slope of sqrt(M - c). For capsules the bound is short of the distance by at most 0.84 e, and by at most
+    e^2/d where their cores, segments and boxes, are d apart; for two boxes by at most 4 e; beside a mesh, a cylinder or
+    a half-space it is at most 3 e lower than without. Kinks are rounded off over heights of about e^2/d, so an e of a
+    fifth of the radii is good and a hundredth is none. Where d is less than 2 e directions swap as without rounding.
+    Spheres beside spheres, capsules and boxes need none and get none.
+
+    Args:
+        one, other: In world, or in the frames.
+        one_frame, other_frame: Where the frames of the two are. Numbers, SX or MX; None for world. Many pairs of the
+            same frames share much: ca.cse takes it out of the graph.
+        rounding: e, m.
+
+    Raises:
+        ModelError: Something that is no shape, two half-spaces, a box without ends, a frame that is none, a rounding
+            that is negative.
+    """
+    checked_shape(one, "distance", "one")
+    checked_shape(other, "distance", "other")
+    checked_nonnegative(rounding, "distance", "rounding", "m")
+    if isinstance(one, HalfSpace) and isinstance(other, HalfSpace):
+        raise ModelError("distance: two half-spaces have none", name="other", value=other)
+    places = [*_placement(one_frame, "one_frame"), *_placement(other_frame, "other_frame")]
+    if any(isinstance(part, ca.MX) for part in places) and {type(one), type(other)} <= COLUMNS.keys():
+        columns = column(one, Frame(*places[:2])), column(other, Frame(*places[2:]))
+        return pair_function(type(one), type(other), float(rounding))(*columns)
+    return expression(_written_out(*places, one=one, other=other, rounding=float(rounding)))
+
+
+def column(shape: Shape, frame: Frame | None = None) -> Expression:
+    """A sphere, capsule, box or half-space in world as a column of numbers or expressions, for `pair_function`.
+
+    Sphere: position, radius. Capsule: start, end, radius. Box: position, its three axes, half of its edges. Half-space:
+    point, normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
+
+    Raises:
+        ModelError: A mesh or a cylinder, which have none; what distance does not take.
+    """
+    checked_shape(shape, "column", "shape")
+    _checked_simple(type(shape), "shape")
+    turn, place = _placement(frame, "frame")
+    if isinstance(shape, Sphere | Capsule):
+        return ca.vertcat(*(place + ca.mtimes(turn, ca.DM(point)) for point in shape.core), shape.radius)
+    if isinstance(shape, HalfSpace):
+        return ca.vertcat(place + ca.mtimes(turn, ca.DM(shape.point)), ca.mtimes(turn, ca.DM(shape.normal)))
+    assert isinstance(shape, Box)
+    centre, axes = place + ca.mtimes(turn, ca.DM(shape.position)), ca.mtimes(turn, ca.DM(shape.rotation))
+    return ca.vertcat(centre, ca.vec(axes), _half(shape))
+
+
+def pair_function(one: type[Shape], other: type[Shape], rounding: float = 0.0) -> Any:
+    """Function (column of one, column of other) -> `distance` of two shapes of these kinds.
+
+    Many pairs are many columns side by side: `pair_function(Capsule, Box).map(n)`. One small function that is called
+    often is several times faster, compiled and to compile, than all pairs written out in one graph.
+
+    Raises:
+        ModelError: A mesh or a cylinder, two half-spaces, a rounding that is negative.
+    """
+    for what, kind in (("one", one), ("other", other)):
+        _checked_simple(kind, what)
+    checked_nonnegative(rounding, "distance", "rounding", "m")
+    if one is HalfSpace and other is HalfSpace:
+        raise ModelError("distance: two half-spaces have none", name="other", value=other)
+    return _pair_function((one, other), float(rounding))
+
+
+@cache
+def _pair_function(kinds: tuple[Any, Any], rounding: float) -> Any:
+    columns = [ca.SX.sym(kind.__name__, COLUMNS[kind]) for kind in kinds]
+    one, other = (_core_of(kind, entries) for kind, entries in zip(kinds, columns, strict=True))
+    gap = _between(one, other, rounding)
+    for kind, entries in zip(kinds, columns, strict=True):
+        gap -= entries[-1] if kind in (Sphere, Capsule) else 0
+    return ca.Function("_".join(kind.__name__ for kind in kinds), columns, [ca.cse(gap)])
+
+
+def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
+    """A smooth lower bound of the least of n values, at most width log(n) below it. Shape (1, 1).
+
+    Raises:
+        ModelError: No value, or a width that is not positive.
+    """
+    if not values:
+        raise ModelError("soft_minimum of no values", name="values", value=values)
+    checked_number(width, "soft_minimum", "width", positive=True)
+    stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
+    return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
+
+
+def _placement(frame: Frame | None, what: str) -> tuple[Expression, Expression]:
+    if frame is None:
+        return ca.DM.eye(3), ca.DM(3, 1)
+    checked_instance(frame, tuple, "distance", what)
+    parts = tuple(map(expression, frame))
+    shapes = [part.shape for part in parts]
+    if shapes != [(3, 3), (3, 1)]:
+        message = f"distance: {what} has parts of shapes {shapes}, expected (3, 3) and (3, 1)"
+        raise ModelError(message, name=what, value=shapes, limit=[(3, 3), (3, 1)])
+    if any(isinstance(part, ca.DM) and not part.is_regular() for part in parts):
+        raise ModelError(f"distance: {what} is not finite", name=what, value=frame)
+    return parts
+
+
+def _checked_simple(kind: Any, what: str) -> None:
+    if not isinstance(kind, type) or kind not in COLUMNS:
+        names = ", ".join(known.__name__ for known in COLUMNS)
+        raise ModelError(f"distance: {what} must be one of {names}, not {kind!r}", name=what, value=kind, limit=names)
+
+
+@on_scalars
+def _written_out(
+    one_turn: Expression,
+    one_place: Expression,
+    other_turn: Expression,
+    other_place: Expression,
+    *,
+    one: Shape,
+    other: Shape,
+    rounding: float,
+) -> Expression:
+    first, second = _core(one, one_turn, one_place), _core(other, other_turn, other_place)
+    return _between(first, second, rounding) - (one.swelling + other.swelling)
+
+
+def _between(one: Core, other: Core, rounding: float) -> Expression:
+    """Signed distance of two cores."""
+    if isinstance(one, Plane):
+        return _lowest(other, one.normal, one.point, rounding)
+    if isinstance(other, Plane):
+        return _lowest(one, other.normal, other.point, rounding)
+    if isinstance(one, Solid) or isinstance(other, Solid):
+        gaps = [*_gaps(one, other, rounding), *_gaps(other, one, rounding)]
+        return _highest(gaps, rounding)
+    if isinstance(one, Rod) and isinstance(other, Rod):
+        return _rods(one, other, rounding)
+    if isinstance(one, Block) and isinstance(other, Block):
+        return _blocks(one, other, rounding)
+    return _rod_block(one, other, rounding) if isinstance(other, Block) else _rod_block(other, one, rounding)
+
+
+# ---- cores in world -----------------------------------------------------------------------------------------------
+
+
+def _core(shape: Shape, turn: Expression, place: Expression) -> Core:
+    rows, shift = [_scalars(turn[k, :]) for k in range(3)], _scalars(place)
+
+    def turned(vector: Array) -> Triple:
+        return _triple(_dot(row, _scalars(vector)) for row in rows)
+
+    def moved(point: Array) -> Triple:
+        return _add(turned(point), shift)
+
+    if isinstance(shape, Sphere | Capsule):
+        return Rod(tuple(moved(point) for point in np.unique(shape.core, axis=0)))
+    if isinstance(shape, HalfSpace):
+        return Plane(moved(shape.point), turned(shape.normal))
+    centre, axes = moved(shape.position), _triple(turned(axis) for axis in shape.rotation.T)
+    if isinstance(shape, Box):
+        return Block(centre, axes, _scalars(_half(shape)))
+    return Solid(centre, axes, shape.hull)
+
+
+def _core_of(kind: type[Shape], entries: Expression) -> Core:
+    """The core of a shape of this kind that is written as a column."""
+    parts = [_scalars(entries[3 * k : 3 * k + 3]) for k in range(entries.shape[0] // 3)]
+    if kind is Box:
+        return Block(parts[0], (parts[1], parts[2], parts[3]), parts[4])
+    return Plane(parts[0], parts[1]) if kind is HalfSpace else Rod(tuple(parts))
+
+
+def _half(box: Box) -> Array:
+    """Half of its edges, m; ModelError where one is infinite."""
+    return np.asarray(checked_array(box.size, (3,), "distance", "size", unit="m") / 2)
+
+
+def _scalars(vector: Expression) -> Triple:
+    """Three scalars, as floats where they are numbers."""
+    entries = (expression(vector)[k] for k in range(3))
+    return _triple(float(entry) if entry.is_constant() else entry for entry in entries)
+
+
+def _triple(entries: Iterable[Expression]) -> Triple:
+    x, y, z = entries
+    return x, y, z
+
+
+def _add(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _subtract(a: Triple, b: Triple) -> Triple:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _dot(a: Triple, b: Triple) -> Expression:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _along(a: Triple, step: Expression, direction: Triple) -> Triple:
+    return _triple(a[k] + step * direction[k] for k in range(3))
+
+
+def _into(vector: Triple, axes: tuple[Triple, Triple, Triple]) -> Triple:
+    """A vector of world by its shares along three axes."""
+    return _dot(axes[0], vector), _dot(axes[1], vector), _dot(axes[2], vector)
+
+
+def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expression:
+    return ca.fmin(ca.fmax(x, low), high)
+
+
+# ---- apart: from squares to distances -----------------------------------------------------------------------------
+
+
+def _root(square: Expression, excess: float) -> Expression:
+    """A lower bound of d where d^2 <= square <= d^2 + excess; for no excess d itself."""
+    if excess == 0:
+        return ca.sqrt(square + KINK**2) - KINK
+    return (square - excess) / ca.sqrt(square + excess)
+
+
+def _negative_part(gap: Expression, rounding: float) -> Expression:
+    """min(gap, 0), or a smooth lower bound of it, at most rounding/4 below; from a gap of `rounding` on it is zero."""
+    if rounding == 0:
+        return ca.fmin(gap, 0)
+    return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 / (4 * rounding)
+
+
+def _highest(gaps: Sequence[Expression], rounding: float) -> Expression:
+    """The largest of gaps, or a smooth lower bound of it, at most `rounding` below."""
+    most = reduce(ca.fmax, gaps)
+    if rounding == 0 or len(gaps) == 1:
+        return most
+    width = rounding / log(len(gaps))
+    return most + width * ca.log(sum(ca.exp((gap - most) / width) for gap in gaps)) - rounding
+
+
+def _least(values: Sequence[Expression], rounding: float) -> Expression:
+    """The least of values, or a smooth lower bound of it, at most `rounding` below."""
+    if rounding == 0 or len(values) == 1:
+        return reduce(ca.fmin, values)
+    return soft_minimum(values, rounding / log(len(values)))
+
+
+# ---- rods ---------------------------------------------------------------------------------------------------------
+
+
+def _rods(one: Rod, other: Rod, rounding: float) -> Expression:
+    """Distance of points and segments; that of crossing segments is 0, which is their depth."""
+    if len(one.points) < len(other.points):
+        one, other = other, one
+    p, q = one.points[0], other.points[0]
+    gap = _subtract(p, q)
+    if len(one.points) == 1:
+        return _root(_dot(gap, gap), 0.0)
+    u = _subtract(one.points[1], p)
+    if len(other.points) == 1:
+        s = _clip(-_dot(u, gap) / (_dot(u, u) + KINK**2))
+        apart = _along(gap, s, u)
+        return _root(_dot(apart, apart), 0.0)
+    v = _subtract(other.points[1], q)
+    weight = rounding**2
+    square = _segments(gap, u, v, weight)
+    return _root(square, weight / 2)
+
+
+def _segments(gap: Triple, u: Triple, v: Triple, weight: float) -> Expression:
+    """Least over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
+
+    s of the whole plane, cut to 0..1; then the best t for it, cut; then the best s for that (Ericson, Real-Time
+    Collision Detection, 2005, 5.1.9).
+    """
+    a, e, b = _dot(u, u) + weight + KINK**2, _dot(v, v) + weight + KINK**2, _dot(u, v)
+    c, f = _dot(u, gap) - weight / 2, _dot(v, gap) + weight / 2
+    s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, PARALLEL * a * e))
+    t = _clip((b * s + f) / e)
+    s = _clip((b * t - c) / a)
+    apart = _along(_along(gap, s, u), -t, v)
+    square = _dot(apart, apart)
+    return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
+
+
+# ---- rods and boxes -----------------------------------------------------------------------------------------------
+
+
+def _rod_block(rod: Core, block: Core, rounding: float) -> Expression:
+    assert isinstance(rod, Rod)
+    assert isinstance(block, Block)
+    ends = [_into(_subtract(point, block.centre), block.axes) for point in rod.points]
+    p = ends[0]
+    if len(ends) == 1:
+        over = _triple(ca.fabs(p[k]) - block.half[k] for k in range(3))
+        outside = _triple(ca.fmax(entry, 0) for entry in over)
+        return _root(_dot(outside, outside), 0.0) + ca.fmin(reduce(ca.fmax, over), 0)
+    u = _subtract(ends[1], p)
+    weight = rounding**2
+    away = _root(_segment_box(p, u, block.half, weight), weight / 4)
+    return away + _negative_part(_segment_box_gap(p, u, block.half), rounding)
+
+
+def _segment_box(p: Triple, u: Triple, half: Triple, weight: float) -> Expression:
+    """Least over s in 0..1 of the squared distance of p + s u to a box plus weight (s - 1/2)^2, in the box's axes.
+
+    Half of its derivative, sum u_k^2 (s - what s is cut to, from entry to exit of slab k) + weight (s - 1/2), rises
+    with s and is straight between the 6 places where a slab is entered or left. These are sorted; three values of the
+    derivative find the straight piece with the zero; from its middle one step of Newton's method is exact. The search
+    is kept from differentiation by a floor, which has none: the step alone gives both derivatives.
+    """
+    squares = _triple(part * part for part in u)
+    slabs = []
+    for k in range(3):
+        inverse = u[k] / (squares[k] + KINK**2)
+        centre, width = -p[k] * inverse, half[k] * ca.fabs(inverse)
+        slabs.append((centre - width, centre + width))
+
+    def slope(s: Expression) -> Expression:
+        found = sum(square * (s - _clip(s, *slab)) for square, slab in zip(squares, slabs, strict=True))
+        return found + weight * (s - 0.5)
+
+    places = [_clip(place) for place in _sorted_slabs(slabs)]
+    low, high = 0.0, 1.0
+    tests: list[Expression] = []
+    for pick in ((2,), (0, 4), (0, 1, 3, 5)):  # by the tests before, the first of which halves the choice
+        left = [places[k] for k in pick]
+        for test in tests:
+            left = _halved(left, test)
+        at = left[0]
+        tests.append(slope(at) < 0)
+        low, high = ca.fmax(low, tests[-1] * at), ca.fmin(high, at + tests[-1])
+    middle = ca.floor((low + high) * (GRAIN / 2)) / GRAIN
+    value, rise = weight * (middle - 0.5), weight + KINK**2
+    for k in range(3):
+        x = p[k] + middle * u[k]
+        over = x - _clip(x, -half[k], half[k])
+        value, rise = value + u[k] * over, rise + squares[k] * (over != 0)
+    s = _clip(middle - value / rise)
+    apart = [x - _clip(x, -h, h) for x, h in zip(_along(p, s, u), half, strict=True)]
+    square = sum(x * x for x in apart)
+    return square + weight * (s - 0.5) ** 2 if weight else square
+
+
+def _halved(values: list[Expression], test: Expression) -> list[Expression]:
+    """The upper half of values where a test holds, else the lower."""
+    middle = len(values) // 2
+    return [no + test * (yes - no) for no, yes in zip(values[:middle], values[middle:], strict=True)]
+
+
+def _sorted_slabs(slabs: Sequence[tuple[Expression, Expression]]) -> list[Expression]:
+    """The six ends of three slabs in order; of each the first is not above the second (a network of 9 exchanges)."""
+    (a, b), (c, d), (e, f) = slabs
+    x = [a, c, e, b, d, f]
+    for i, j in ((0, 1), (1, 2), (0, 1), (3, 4), (4, 5), (3, 4), (1, 3), (2, 4), (2, 3)):
+        x[i], x[j] = ca.fmin(x[i], x[j]), ca.fmax(x[i], x[j])
+    return x
+
+
+def _segment_box_gap(p: Triple, u: Triple, half: Triple) -> Expression:
+    """Largest gap between a segment p + s u and a box along the faces' normals and those to the segment and an edge."""
+    size = _triple(ca.fabs(part) for part in u)
+    middle = _along(p, 0.5, u)
+    gaps = [ca.fabs(middle[k]) - size[k] / 2 - half[k] for k in range(3)]
+    squares = _triple(part * part for part in u)
+    whole = sum(squares)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        reach = half[i] * size[j] + half[j] * size[i]
+        gap = ca.fabs(p[i] * u[j] - p[j] * u[i]) - reach
+        gaps.append(_per_length(gap, squares[i] + squares[j], NO_EDGE * whole))
+    return reduce(ca.fmax, gaps)
+
+
+def _per_length(gap: Expression, square: Expression, least: Expression) -> Expression:
+    """The gap along a vector of this squared length, where that is more than the least; else far below all others."""
+    return gap / ca.sqrt(square + 1e-60) - BARRED * (square <= least)
+
+
+# ---- two boxes ----------------------------------------------------------------------------------------------------
+
+
+def _blocks(one: Block, other: Block, rounding: float) -> Expression:
+    """The least of the distances of the 24 edges to the other box, and the largest gap along 15 directions."""
+    weight = rounding**2
+    squares = [*_edges_to(one, other, weight), *_edges_to(other, one, weight)]
+    if rounding == 0:
+        return _root(reduce(ca.fmin, squares), 0.0) + ca.fmin(reduce(ca.fmax, _block_gaps(one, other)), 0)
+    away = _least([_root(square, weight / 4) for square in squares], rounding)
+    slack = rounding / sum((*one.half, *other.half))
+    return away + _negative_part(_highest(_block_gaps(one, other, slack), rounding), rounding)
+
+
+def _edges_to(one: Block, other: Block, weight: float) -> list[Expression]:
+    """Squares of the distances of the edges of one box to another, weighted."""
+    centre = _into(_subtract(one.centre, other.centre), other.axes)
+    reaches = [_triple(h * part for part in _into(a, other.axes)) for a, h in zip(one.axes, one.half, strict=True)]
+    found = []
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        direction = _triple(2 * part for part in reaches[k])
+        for side, back in product((-1.0, 1.0), repeat=2):
+            start = _along(_along(_subtract(centre, reaches[k]), side, reaches[i]), back, reaches[j])
+            found.append(_segment_box(start, direction, other.half, weight))
+    return found
+
+
+def _block_gaps(one: Block, other: Block, slack: Expression = 0.0) -> list[Expression]:
+    """Gaps of two boxes along their 6 axes and the 9 across an edge of each (Gottschalk, Lin & Manocha 1996).
+
+    With slack the sizes of cosines, which have kinks where boxes are aligned, are rounded up by as much at most.
+    """
+    gap = _into(_subtract(other.centre, one.centre), one.axes)
+    shares = [_into(axis, one.axes) for axis in other.axes]  # shares[j][i]: of axis j of the other along axis i
+    sizes = [_triple(_size(share, slack) for share in row) for row in shares]
+    found = [ca.fabs(gap[i]) - one.half[i] - sum(other.half[j] * sizes[j][i] for j in range(3)) for i in range(3)]
+    found += [ca.fabs(_dot(gap, shares[j])) - other.half[j] - _dot(one.half, sizes[j]) for j in range(3)]
+    for i, j in product(range(3), repeat=2):
+        i1, i2, j1, j2 = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+        reach = one.half[i1] * sizes[j][i2] + one.half[i2] * sizes[j][i1]
+        reach += other.half[j1] * sizes[j2][i] + other.half[j2] * sizes[j1][i]
+        across = ca.fabs(gap[i2] * shares[j][i1] - gap[i1] * shares[j][i2]) - reach
+        found.append(_per_length(across, shares[j][i1] ** 2 + shares[j][i2] ** 2, NO_EDGE))
+    return found
+
+
+def _size(x: Expression, slack: Expression) -> Expression:
+    """|x|, or a smooth upper bound of it, at most the slack above."""
+    return ca.fabs(x) if isinstance(slack, float) and slack == 0 else ca.sqrt(x * x + slack * slack)
+
+
+# ---- planes -------------------------------------------------------------------------------------------------------
+
+
+def _gaps(one: Core, other: Core, rounding: float) -> list[Expression]:
+    """Gaps along the outward normals of one's faces, from one to the other; none of a rod."""
+    if isinstance(one, Block):
+        signed = [(axis, side, h) for axis, h in zip(one.axes, one.half, strict=True) for side in (-1.0, 1.0)]
+        normals = [(_triple(side * part for part in axis), h) for axis, side, h in signed]
+        return [_lowest(other, normal, one.centre, rounding) - h for normal, h in normals]
+    if not isinstance(one, Solid):
+        return []
+    seen = _seen(other, one.centre, one.axes)
+    centre = (0.0, 0.0, 0.0)
+    faces = zip(one.hull.normals, one.hull.offsets, strict=True)
+    return [_lowest(seen, _scalars(normal), centre, rounding) - float(offset) for normal, offset in faces]
+
+
+def _seen(core: Core, centre: Triple, axes: tuple[Triple, Triple, Triple]) -> Core:
+    """The core in these axes from this centre."""
+    if isinstance(core, Rod):
+        return Rod(tuple(_into(_subtract(point, centre), axes) for point in core.points))
+    assert not isinstance(core, Plane)
+    place = _into(_subtract(core.centre, centre), axes)
+    return core._replace(centre=place, axes=_triple(_into(axis, axes) for axis in core.axes))
+
+
+def _lowest(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
+    """Least height of a core above a plane, or a smooth lower bound, at most `rounding` below."""
+    if isinstance(core, Rod):
+        heights = [_dot(normal, _subtract(end, point)) for end in core.points]
+        if rounding == 0 or len(heights) == 1:
+            return reduce(ca.fmin, heights)
+        low, high = heights
+        return (low + high - ca.sqrt((high - low) ** 2 + (2 * rounding) ** 2)) / 2
+    assert not isinstance(core, Plane)
+    middle = _dot(normal, _subtract(core.centre, point))
+    shares = _into(normal, core.axes)
+    if isinstance(core, Block):
+        reaches = [h * share for h, share in zip(core.half, shares, strict=True)]
+        if rounding == 0:
+            return middle - sum(ca.fabs(reach) for reach in reaches)
+        return middle - sum(ca.sqrt(reach * reach + (rounding / 3) ** 2) for reach in reaches)
+    return middle + _least([_dot(shares, _scalars(vertex)) for vertex in core.hull.vertices], rounding)

@@ -1,0 +1,398 @@
+"""Bounds of an expression of time over whole intervals of it: interval arithmetic over the graph of the expression.
+
+Moore, Kearfott & Cloud, *Introduction to Interval Analysis*, 2009, chapters 2 to 5. Every instruction is done on all
+intervals at once and its result is let out by a few roundings, so the bounds hold for the real value as well as for
+what casadi works out at any time in the interval. They are wide by about the length of the interval: halve it, and they
+are half as wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import Array, ArrayInput, checked_array
+from models.errors import ModelError
+from models.spatial import FULL_TURN, Expression, expression
+
+OUTWARD = 4 * float(np.finfo(float).eps)
+"""Share of a bound by which every result is let out; the functions of a C library are that good."""
+SMALLEST = 1e-300
+WHERE = 1e-14
+"""Share of an angle that its multiples of a turn are known to."""
+
+
+class Interval(NamedTuple):
+    """Bounds of a number over each interval of time, and what it is for the sake of if_else.
+
+    Attributes:
+        low, high: Shape (M,).
+        negates: The test of which it is the opposite, if any.
+        part: Where it is (a test, a value): the value where the test holds and else 0.
+    """
+
+    low: Array
+    high: Array
+    negates: Interval | None = None
+    part: tuple[Interval, Interval] | None = None
+
+
+def bounds(values: Expression, symbol: Expression, low: ArrayInput, high: ArrayInput) -> tuple[Array, Array]:
+    """Bounds of each entry of a column of expressions of one symbol, over many intervals of the symbol.
+
+    They hold wherever the entry and all that it is made of are numbers: the root of something that dips below zero
+    counts where it is defined. An entry that the intervals do not bound, as 1/x about 0, gets -inf and inf.
+
+    Args:
+        values: Expressions of the symbol and of nothing else, SX, or MX that can be expanded. Shape (n, 1).
+        symbol: Shape (1, 1).
+        low, high: Ends of the intervals. Shape (M,).
+
+    Returns:
+        Lower and upper bounds. Shapes (M, n).
+
+    Raises:
+        ModelError: An instruction that is not known, by name; another symbol in the values; ends of different numbers,
+            not finite, or in the wrong order.
+    """
+    starts = checked_array(low, ("intervals",), "bounds", "low")
+    ends = checked_array(high, ("intervals",), "bounds", "high")
+    if starts.shape != ends.shape:
+        message = f"bounds: {len(ends)} high ends of {len(starts)} intervals"
+        raise ModelError(message, name="high", value=len(ends), limit=len(starts))
+    if (starts > ends).any():
+        wrong = int(np.flatnonzero(starts > ends)[0])
+        message = f"bounds: interval {wrong} ends at {ends[wrong]} before it starts at {starts[wrong]}"
+        raise ModelError(message, name="high", value=ends[wrong], limit=starts[wrong])
+    function = _instructions(values, symbol)
+    slots: dict[int, Interval] = {}
+    found: dict[int, Interval] = {}
+    for k in range(function.n_instructions()):
+        code, inputs = function.instruction_id(k), function.instruction_input(k)
+        if code == ca.OP_OUTPUT:
+            found[function.instruction_output(k)[1]] = slots[inputs[0]]
+            continue
+        if code == ca.OP_INPUT:
+            result = Interval(starts, ends)
+        elif code == ca.OP_CONST:
+            result = _constant(function.instruction_constant(k), starts)
+        elif code in RULES:
+            result = RULES[code](*(slots[slot] for slot in inputs))
+        else:
+            name = NAMES.get(code, str(code))
+            raise ModelError(f"bounds: {name} has no bounds", name=name, value=code, limit=sorted(NAMES))
+        slots[function.instruction_output(k)[0]] = result
+    columns = [found[k] for k in range(len(found))]
+    return np.column_stack([entry.low for entry in columns]), np.column_stack([entry.high for entry in columns])
+
+
+def _instructions(values: Expression, symbol: Expression) -> Any:
+    column = expression(values)
+    symbol_ok = isinstance(symbol, ca.SX | ca.MX) and symbol.shape == (1, 1) and symbol.is_valid_input()
+    if not symbol_ok:
+        raise ModelError(f"bounds: symbol {symbol!r} is no scalar symbol", name="symbol", value=symbol)
+    if column.shape[1] != 1 or column.shape[0] == 0:
+        message = f"bounds: values have shape {column.shape}, expected (n, 1)"
+        raise ModelError(message, name="values", value=column.shape, limit=("n", 1))
+    try:
+        function = ca.Function("values", [symbol], [ca.densify(type(symbol)(column))])
+        return function if isinstance(symbol, ca.SX) else function.expand()
+    except (RuntimeError, NotImplementedError, TypeError) as error:
+        message = f"bounds: values are no expressions of the symbol alone: {str(error).splitlines()[-1]}"
+        raise ModelError(message, name="values", value=values) from error
+
+
+# ---- rules ----------------------------------------------------------------------------------------------------------
+
+
+def _out(low: Any, high: Any) -> Interval:
+    """Bounds let out by what rounding may do; what is no number is no bound."""
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    spread = [OUTWARD * np.where(np.isfinite(end), np.abs(end), 0.0) + SMALLEST for end in (low, high)]
+    return Interval(low - spread[0], high + spread[1])
+
+
+def _constant(value: float, like: Array) -> Interval:
+    return Interval(np.full(like.shape, value), np.full(like.shape, value))
+
+
+def _least_and_most(corners: list[Array]) -> Interval:
+    stacked = np.array(corners)
+    return _out(stacked.min(axis=0), stacked.max(axis=0))
+
+
+def _quiet(rule: Callable[..., Interval]) -> Callable[..., Interval]:
+    def silent(*given: Interval) -> Interval:
+        with np.errstate(all="ignore"):
+            return rule(*given)
+
+    return silent
+
+
+def _add(x: Interval, y: Interval) -> Interval:
+    if x.part is not None and y.part is not None and _opposite(x.part[0], y.part[0]):
+        return _either(x.part[0], x.part[1], y.part[1])
+    return _out(x.low + y.low, x.high + y.high)
+
+
+def _opposite(test: Interval, other: Interval) -> bool:
+    return test.negates is other or other.negates is test
+
+
+def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
+    """One value where the test holds, else the other."""
+    holds, fails = _surely(test)
+    low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
+    high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
+    return Interval(low, high)
+
+
+def _surely(test: Interval) -> tuple[Any, Any]:
+    return (test.low > 0) | (test.high < 0), (test.low == 0) & (test.high == 0)
+
+
+def _if_else_zero(test: Interval, value: Interval) -> Interval:
+    found = _either(test, value, _constant(0.0, value.low))
+    return found._replace(part=(test, value))
+
+
+def _subtract(x: Interval, y: Interval) -> Interval:
+    return _out(x.low - y.high, x.high - y.low)
+
+
+def _multiply(x: Interval, y: Interval) -> Interval:
+    if x is y:
+        return _square(x)
+    corners = [a * b for a, b in product((x.low, x.high), (y.low, y.high))]
+    return _least_and_most([np.where(np.isnan(corner), 0.0, corner) for corner in corners])  # 0 inf is 0 here
+
+
+def _inverse(x: Interval) -> Interval:
+    about_zero = (x.low <= 0) & (x.high >= 0)
+    return _out(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
+
+
+def _divide(x: Interval, y: Interval) -> Interval:
+    return _multiply(x, _inverse(y))
+
+
+def _square(x: Interval) -> Interval:
+    most = np.maximum(np.abs(x.low), np.abs(x.high))
+    least = np.maximum(0.0, np.maximum(x.low, -x.high))
+    found = _out(least * least, most * most)
+    return Interval(np.maximum(found.low, 0.0), found.high)
+
+
+def _power(x: Interval, y: Interval) -> Interval:
+    fixed = (y.low == y.high).all() and (y.low == y.low[0]).all()
+    if fixed and float(y.low[0]).is_integer():
+        exponent = int(y.low[0])
+        if exponent < 0:
+            return _inverse(_power(x, _constant(-exponent, x.low)))
+        if exponent % 2 == 0:
+            base = _absolute(x)
+            return _clamped(_out(base.low**exponent, base.high**exponent), low=0.0)
+        return _out(x.low**exponent, x.high**exponent)
+    base = _clamped(x, low=0.0)
+    found = _least_and_most([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
+    unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # a whole exponent may lie in y
+    return Interval(np.where(unknown, -np.inf, found.low), np.where(unknown, np.inf, found.high))
+
+
+def _clamped(x: Interval, low: float = -np.inf, high: float = np.inf) -> Interval:
+    return Interval(np.clip(x.low, low, high), np.clip(x.high, low, high))
+
+
+def _absolute(x: Interval) -> Interval:
+    return Interval(np.maximum(0.0, np.maximum(x.low, -x.high)), np.maximum(np.abs(x.low), np.abs(x.high)))
+
+
+def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf) -> Callable[..., Interval]:
+    """The rule of a function that rises, defined from low to high."""
+
+    def rule(x: Interval) -> Interval:
+        inside = _clamped(x, low, high)
+        found = _out(function(inside.low), function(inside.high))
+        nowhere = (x.high < low) | (x.low > high)
+        return Interval(np.where(nowhere, -np.inf, found.low), np.where(nowhere, np.inf, found.high))
+
+    return rule
+
+
+def _falling(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
+    rising = _rising(lambda x: -function(x), low, high)
+
+    def rule(x: Interval) -> Interval:
+        return _negative(rising(x))
+
+    return rule
+
+
+def _negative(x: Interval) -> Interval:
+    return Interval(-x.high, -x.low)
+
+
+def _holds_one_of(x: Interval, first: float, step: float) -> Any:
+    """Whether first + k step lies in the interval for a whole k, or so near that rounding may have moved it."""
+    slack = WHERE * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
+    return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
+
+
+def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
+    """The rule of a wave of a full turn and height 1 with a crest at an angle."""
+
+    def rule(x: Interval) -> Interval:
+        ends = function(x.low), function(x.high)
+        found = _out(np.minimum(*ends), np.maximum(*ends))
+        high = np.where(_holds_one_of(x, crest, FULL_TURN), 1.0, np.minimum(found.high, 1.0))
+        low = np.where(_holds_one_of(x, crest + FULL_TURN / 2, FULL_TURN), -1.0, np.maximum(found.low, -1.0))
+        endless = ~(np.isfinite(x.low) & np.isfinite(x.high))
+        return Interval(np.where(endless, -1.0, low), np.where(endless, 1.0, high))
+
+    return rule
+
+
+def _tangent(x: Interval) -> Interval:
+    pole = _holds_one_of(x, FULL_TURN / 4, FULL_TURN / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
+    found = _out(np.tan(x.low), np.tan(x.high))
+    return Interval(np.where(pole, -np.inf, found.low), np.where(pole, np.inf, found.high))
+
+
+def _angle(y: Interval, x: Interval) -> Interval:
+    """atan2: of a rectangle that neither holds the origin nor meets the cut, the corners have the extremes."""
+    found = _least_and_most([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
+    whole = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
+    half = float(np.nextafter(np.pi, 4))
+    return Interval(np.where(whole, -half, found.low), np.where(whole, half, found.high))
+
+
+def _cosh(x: Interval) -> Interval:
+    base = _absolute(x)
+    return _out(np.cosh(base.low), np.cosh(base.high))
+
+
+def _hypot(x: Interval, y: Interval) -> Interval:
+    first, second = _absolute(x), _absolute(y)
+    return _clamped(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
+
+
+def _least(x: Interval, y: Interval) -> Interval:
+    return Interval(np.minimum(x.low, y.low), np.minimum(x.high, y.high))
+
+
+def _most(x: Interval, y: Interval) -> Interval:
+    return Interval(np.maximum(x.low, y.low), np.maximum(x.high, y.high))
+
+
+def _copysign(x: Interval, y: Interval) -> Interval:
+    size = _absolute(x)
+    return _either(_below(y, _constant(0.0, y.low), strict=False), _hull(_negative(size), size), size)
+
+
+def _hull(x: Interval, y: Interval) -> Interval:
+    return Interval(np.minimum(x.low, y.low), np.maximum(x.high, y.high))
+
+
+def _remainder(x: Interval, y: Interval) -> Interval:
+    """fmod: x minus the whole multiple of y towards zero; that multiple is known where the quotients' is."""
+    quotient = _divide(x, y)
+    multiple = np.trunc(quotient.low)
+    known = multiple == np.trunc(quotient.high)
+    same = _subtract(x, _multiply(Interval(multiple, multiple), y))
+    most = np.minimum(_absolute(y).high, _absolute(x).high)
+    low, high = np.where(x.low < 0, -most, 0.0), np.where(x.high > 0, most, 0.0)
+    return Interval(np.where(known, np.maximum(same.low, low), low), np.where(known, np.minimum(same.high, high), high))
+
+
+def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
+    """A test: 1 where x < y, or x <= y, 0 where not."""
+    surely = x.high < y.low if strict else x.high <= y.low
+    never = x.low >= y.high if strict else x.low > y.high
+    return Interval(np.where(surely, 1.0, 0.0), np.where(never, 0.0, 1.0))
+
+
+def _equal(x: Interval, y: Interval) -> Interval:
+    surely = (x.low == x.high) & (y.low == y.high) & (x.low == y.low)
+    never = (x.low > y.high) | (x.high < y.low)
+    return Interval(np.where(surely, 1.0, 0.0), np.where(never, 0.0, 1.0))
+
+
+def _not(x: Interval) -> Interval:
+    holds, fails = _surely(x)
+    return Interval(np.where(fails, 1.0, 0.0), np.where(holds, 0.0, 1.0), negates=x)
+
+
+def _and(x: Interval, y: Interval) -> Interval:
+    (first, first_fails), (second, second_fails) = _surely(x), _surely(y)
+    return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
+
+
+def _or(x: Interval, y: Interval) -> Interval:
+    (first, first_fails), (second, second_fails) = _surely(x), _surely(y)
+    return Interval(np.where(first | second, 1.0, 0.0), np.where(first_fails & second_fails, 0.0, 1.0))
+
+
+def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
+    """The rule of a function that rises in steps, which are whole numbers: rounding does not touch it."""
+    return lambda x: Interval(function(x.low), function(x.high))
+
+
+def _same(x: Interval) -> Interval:
+    return x
+
+
+_BY_NAME: dict[str, Callable[..., Interval]] = {
+    "ASSIGN": _same,
+    "ADD": _add,
+    "SUB": _subtract,
+    "MUL": _multiply,
+    "DIV": _divide,
+    "NEG": _negative,
+    "INV": _inverse,
+    "TWICE": lambda x: _out(2 * x.low, 2 * x.high),
+    "SQ": _square,
+    "SQRT": _rising(np.sqrt, low=0.0),
+    "POW": _power,
+    "CONSTPOW": _power,
+    "EXP": _rising(np.exp),
+    "EXPM1": _rising(np.expm1),
+    "LOG": _rising(np.log, low=0.0),
+    "LOG1P": _rising(np.log1p, low=-1.0),
+    "SIN": _wave(np.sin, FULL_TURN / 4),
+    "COS": _wave(np.cos, 0.0),
+    "TAN": _tangent,
+    "ASIN": _rising(np.arcsin, -1.0, 1.0),
+    "ACOS": _falling(np.arccos, -1.0, 1.0),
+    "ATAN": _rising(np.arctan),
+    "ATAN2": _angle,
+    "SINH": _rising(np.sinh),
+    "COSH": _cosh,
+    "TANH": _rising(np.tanh),
+    "ASINH": _rising(np.arcsinh),
+    "ACOSH": _rising(np.arccosh, low=1.0),
+    "ATANH": _rising(np.arctanh, -1.0, 1.0),
+    "HYPOT": _hypot,
+    "FABS": _absolute,
+    "FMIN": _least,
+    "FMAX": _most,
+    "FMOD": _remainder,
+    "COPYSIGN": _copysign,
+    "FLOOR": _step(np.floor),
+    "CEIL": _step(np.ceil),
+    "SIGN": _step(np.sign),
+    "LT": lambda x, y: _below(x, y, strict=True),
+    "LE": lambda x, y: _below(x, y, strict=False),
+    "EQ": _equal,
+    "NE": lambda x, y: _not(_equal(x, y))._replace(negates=None),
+    "NOT": _not,
+    "AND": _and,
+    "OR": _or,
+    "IF_ELSE_ZERO": _if_else_zero,
+}
+RULES = {getattr(ca, f"OP_{name}"): _quiet(rule) for name, rule in _BY_NAME.items()}
+"""Interval by the code of casadi's instruction."""
+NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

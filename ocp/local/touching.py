@@ -1,0 +1,117 @@
+"""How near the bodies of a machine come to each other and to obstacles at samples of a motion.
+
+Between the samples nothing is said: a plan's audit proves what holds there (:mod:`ocp.audit.clearance`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models import Machine, Surroundings
+from models.arrays import Array
+from ocp.errors import ProblemError, checked_instance
+from ocp.problem.formulation import Sampler
+from ocp.problem.hulls import Hull, HullPairs, frames_of, gap_along, grouped, nearest_directions
+
+__all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
+
+
+class Touch(NamedTuple):
+    """Two bodies that come too near.
+
+    Attributes:
+        pair: Its place in `Surroundings.pairs`. bodies: Their names.
+        distance: m, negative where they overlap. time: s.
+    """
+
+    pair: int
+    bodies: tuple[str, str]
+    distance: float
+    time: float
+
+    def __str__(self) -> str:
+        how = f"overlap by {-self.distance:.3g} m" if self.distance < 0 else f"are {self.distance:.3g} m apart"
+        return f"{self.bodies[0]} and {self.bodies[1]} {how} at {self.time:.4g} s"
+
+
+def hulls_of(surroundings: Surroundings) -> dict[str, Hull]:
+    """The bodies and obstacles, by name."""
+    return {
+        body.name: Hull(body.frame, body.shape.core, body.shape.swelling, getattr(body.shape, "normal", np.zeros(0)))
+        for body in surroundings.bodies
+    }
+
+
+def distances_along(surroundings: Surroundings, base: Array, joints: Array, times: Array) -> Array:
+    """Distances of all pairs at samples of a motion; where they overlap, about how deep. Shape (M, n), m.
+
+    Args:
+        surroundings: Of the machine that moves.
+        base: Its base, shape (M, base_size) or (base_size,). joints: Shape (M, joint_size). times: s. Shape (M,).
+    """
+    return _measured(surroundings, base, joints, times, np.inf)
+
+
+def touches(surroundings: Surroundings, base: Array, joints: Array, times: Array) -> list[Touch]:
+    """The pairs that come nearer than the clearance at some samples, each where it is nearest, the worst first.
+
+    Args: As of `distances_along`.
+    """
+    apart = _measured(surroundings, base, joints, times, surroundings.clearance)
+    if not apart.size:
+        return []
+    where, labels = apart.argmin(axis=0), surroundings.labels
+    found = [
+        Touch(pair, labels[pair], float(apart[where[pair], pair]), float(np.ravel(times)[where[pair]]))
+        for pair in np.flatnonzero(apart.min(axis=0) < surroundings.clearance).tolist()
+    ]
+    return sorted(found, key=lambda touch: touch.distance)
+
+
+def _measured(surroundings: Surroundings, base: Array, joints: Array, times: Array, near: float) -> Array:
+    """Distances of all pairs (M, n), of those that are no nearer than `near` some number that is no less."""
+    count, n = len(joints), len(surroundings.pairs)
+    apart = np.full((count, n), -np.inf)
+    if not n:
+        return apart
+    placements, lots = _prepared(surroundings)
+    places = np.broadcast_to(base, (count, surroundings.machine.base_size))
+    frames = frames_of(placements(places, joints, np.reshape(times, (-1, 1)))[0])
+    sample, pair = (part.ravel() for part in np.meshgrid(np.arange(count), np.arange(n), indexing="ij"))
+    for lot in lots:
+        chosen = np.flatnonzero(lot.has[pair])
+        row = lot.row[pair[chosen]]
+        sides = lot.points(frames, sample[chosen], row)
+        middles = [side.mean(axis=1) for side in sides]
+        ball = np.linalg.norm(middles[1] - middles[0], axis=1) - lot.sizes[row] - lot.radii[row]
+        far = ~lot.flat[row] & (ball >= near)
+        apart[sample[chosen[far]], pair[chosen[far]]] = ball[far]
+        chosen, row, sides = chosen[~far], row[~far], [side[~far] for side in sides]
+        along = np.where(lot.flat[row, None], lot.normals[row], nearest_directions(*sides)[0])
+        apart[sample[chosen], pair[chosen]] = gap_along(along, *sides) - lot.radii[row]
+    return np.where(np.isfinite(apart), apart, -np.inf)
+
+
+def _prepared(surroundings: Surroundings) -> tuple[Sampler, list[HullPairs]]:
+    """The function (base, joints, time) -> placements and the pairs by kind, kept with the surroundings."""
+    kept: tuple[Sampler, list[HullPairs]] | None = surroundings.__dict__.get("_prepared")
+    if kept is None:
+        machine = surroundings.machine
+        base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
+        time = ca.SX.sym("time")
+        sampler = Sampler([base, joints, time], [ca.SX(surroundings.placements(base, joints, time))])
+        kept = sampler, grouped(tuple(hulls_of(surroundings).values()), surroundings.pairs)
+        surroundings.__dict__["_prepared"] = kept
+    return kept
+
+
+def checked_surroundings(value: Any, machine: Machine) -> Surroundings:
+    """Surroundings of a machine, or ProblemError unless they are."""
+    if checked_instance("surroundings", value, Surroundings).machine is not machine:
+        words = "surroundings are those of another machine; make them of this one: Surroundings(machine, ...)"
+        raise ProblemError(words, name="surroundings", value=value)
+    found: Surroundings = value
+    return found

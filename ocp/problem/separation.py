@@ -1,0 +1,119 @@
+"""Bodies that have to stay apart at every time: what a problem says of them, and what its audit proves.
+
+A body is the convex hull of some points, its core, swelled by a radius; it rides on a frame whose placement is an
+expression of states and time. How near two bodies come is no constraint of a method: the audit proves it over all
+times, and who declares it adds the constraints that he wants held (:mod:`ocp.builders.clearance`).
+
+To prove anything between two times it has to be known how the states move the bodies. Seen from a frame that is told,
+with x the states that move the two, a state of rate x_k' moves no point of them by more than lever_k |x_k'| and turns
+none by more than turn_k |x_k'|. A point that is carried by many axes, each by those before it, has at most
+
+    |p'| <= sum lever_k |x_k'| + speed,
+    |p''| <= sum lever_k |x_k''| + 2 (sum turn_k |x_k'|) (sum lever_k |x_k'|) + acceleration,
+
+p being one body's point less the other's, speed and acceleration those of what moves by time alone. (The factor 2 is
+that of Coriolis: an axis that comes later moves points no farther than by its lever, and is turned by all before it.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ocp.errors import ProblemError, checked_text
+from ocp.problem.hulls import Hull
+from ocp.problem.values import check_finite, table
+
+__all__ = ["Separation"]
+
+WORLD = -1
+"""In the place of a frame: the world."""
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Pairs of bodies that have to stay apart.
+
+    Attributes:
+        name: Unique among those of a problem.
+        placements: Of F frames in world: rotation column by column, and position, one below the other, expressions of
+            states, parameters and time. Shape (12 F, 1).
+        hulls: The bodies, by their names.
+        pairs: Of each pair the two bodies, by their places in ``hulls``, and the frame in which one is seen from the
+            other, -1 for the world. Shape (n, 3).
+        least: How far they have to be apart. Shape (n,), m.
+        movers: Names of the states that move them, with their sizes.
+        levers, turns: As above, of the states in ``movers`` one after the other. Shape (n, k), in m and rad by the unit
+            of the state.
+        speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,), m/s and m/s^2.
+
+    Raises:
+        ProblemError: Other shapes, what is not finite, or negative, a body or frame that there is none of.
+    """
+
+    name: str
+    placements: Any
+    hulls: dict[str, Hull]
+    pairs: np.ndarray
+    least: np.ndarray
+    movers: dict[str, int]
+    levers: np.ndarray
+    turns: np.ndarray
+    speed: np.ndarray
+    acceleration: np.ndarray
+
+    def __post_init__(self) -> None:
+        what = f"separation {checked_text('separation: its name', self.name)!r}"
+        pairs = table(f"{what}: pairs", self.pairs).astype(int).reshape(-1, 3)
+        n, k = len(pairs), sum(self.movers.values())
+        frames, rest = divmod(int(self.placements.numel()), 12)
+        if rest:
+            words = f"{what}: placements have {self.placements.numel()} entries, 12 for each frame expected"
+            raise ProblemError(words, name="placements", value=self.placements.numel())
+        if n and (
+            pairs[:, :2].min() < 0 or pairs[:, :2].max() >= len(self.hulls) or (pairs[:, 0] == pairs[:, 1]).any()
+        ):
+            raise ProblemError(f"{what}: a pair is not one of two of the {len(self.hulls)} bodies", name="pairs")
+        riding = [hull.frame for hull in self.hulls.values()]
+        if not all(WORLD <= frame < frames for frame in [*riding, *pairs[:, 2]]):
+            raise ProblemError(f"{what}: a frame is none of the {frames} placed", name="frame", limit=frames)
+        hulls = tuple(self.hulls.values())
+        if any(hulls[k].normal.size and hulls[k].frame != seen for *bodies, seen in pairs for k in bodies):
+            words = f"{what}: a half-space has to be seen from the frame that it rides on, where it stands still"
+            raise ProblemError(words, name="pairs")
+        object.__setattr__(self, "pairs", pairs)
+        shapes = {"least": (n,), "levers": (n, k), "turns": (n, k), "speed": (n,), "acceleration": (n,)}
+        for label, shape in shapes.items():
+            value = table(f"{what}: {label}", getattr(self, label))
+            value = np.broadcast_to(value, shape) if value.ndim == 0 else value.reshape(shape) if not n else value
+            if value.shape != shape:
+                words = f"{what}: {label} has shape {value.shape}, expected {shape}"
+                raise ProblemError(words, name=label, value=value.shape, limit=shape)
+            check_finite(f"{what}: {label}", value)
+            if label != "least" and (value < 0).any():
+                raise ProblemError(f"{what}: {label} is negative", name=label, value=float(value.min()), limit=0.0)
+            object.__setattr__(self, label, np.array(value))
+
+    def __str__(self) -> str:
+        least = f"{self.least.min():g} m" if len(self) else "nothing"
+        return f"{self.name}: {len(self)} pairs of {len(self.hulls)} bodies, at least {least} apart"
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.pairs)
+
+    @property
+    def labels(self) -> tuple[tuple[str, str], ...]:
+        """Names of the two bodies of each pair."""
+        names = tuple(self.hulls)
+        return tuple((names[one], names[other]) for one, other, _ in self.pairs)
+
+    def of(self, pairs: Sequence[int]) -> Separation:
+        """The same of some pairs alone."""
+        keep = list(pairs)
+        parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
+        parts |= {label: getattr(self, label)[keep] for label in ("speed", "acceleration")}
+        return Separation(self.name, self.placements, self.hulls, movers=self.movers, **parts)

@@ -1,0 +1,250 @@
+"""What a machine may touch: distances by an independent way, and bounds of how its joints move the pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from models import (
+    Box,
+    Capsule,
+    CollisionShape,
+    Cylinder,
+    FixedBase,
+    FreeFloating,
+    HalfSpace,
+    Joint,
+    Link,
+    Mimic,
+    ModelError,
+    Moving,
+    Robot,
+    Sphere,
+    Surroundings,
+)
+from ocp.problem.hulls import gap_along, nearest_directions
+from tests.models.machines.armoured import armoured_arm
+
+OBSTACLES = (
+    Sphere(0.1, (0.5, 0.1, 0.5)),
+    Box((0.2, 0.3, 0.1), (-0.5, 0.2, 0.4)),
+    Capsule(0.05, (0.3, -0.4, 0.1), (0.3, -0.4, 0.9)),
+    HalfSpace((0, 0, 1), (0, 0, -0.4)),
+)
+
+
+def slider() -> Robot:
+    """A slide, an arm on it, and a gripper whose fingers move together."""
+    tube = CollisionShape("capsule", (0.05, 0.3), translation=(0, 0, 0.2))
+    block = CollisionShape("box", (0.1, 0.2, 0.1))
+    links = [Link(name, 1.0, inertia=np.eye(3) * 0.01, collisions=(shape,)) for name, shape in
+             (("base", block), ("sled", block), ("arm", tube), ("left", tube), ("right", tube))]  # fmt: skip
+    joints = [
+        Joint("rail", "prismatic", "base", "sled", axis=(1, 0, 0), translation=(0, 0, 0.3), lower=-0.5, upper=0.7),
+        Joint("shoulder", "revolute", "sled", "arm", axis=(0, 1, 0), translation=(0, 0, 0.2), lower=-2, upper=2),
+        Joint("finger", "revolute", "arm", "left", axis=(1, 0, 0), translation=(0, 0.1, 0.5), lower=-1, upper=1),
+        Joint("other", "revolute", "arm", "right", axis=(1, 0, 0), translation=(0, -0.1, 0.5), lower=-2, upper=2,
+              mimic=Mimic("finger", -1.5, 0.1)),
+    ]  # fmt: skip
+    return Robot(tuple(links), tuple(joints), tip="left")
+
+
+def machines() -> dict[str, Any]:
+    return {
+        "arm": FixedBase(armoured_arm(), translation=(0.1, 0, 0)),
+        "slider": FixedBase(slider()),
+        "space": FreeFloating(armoured_arm(4)),
+    }
+
+
+def postures(machine: Any, count: int, seed: int) -> tuple[Any, Any]:
+    rng = np.random.default_rng(seed)
+    low, high = np.clip(machine.robot.lower, -3, 3), np.clip(machine.robot.upper, -3, 3)
+    base = rng.normal(size=(count, machine.base_size))
+    if machine.base_size == 7:
+        base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1)[:, None]
+    return base, rng.uniform(low, high, size=(count, machine.joint_size))
+
+
+def points_of(around: Surroundings, machine: Any) -> Any:
+    """Casadi Function (base, q, time) -> points of each pair, seen from where they are seen."""
+    base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
+    frames = ca.reshape(around.placements(base, q, t), 12, -1)
+    found = []
+    for one, other, seen in around.pairs:
+        turn, origin = (ca.SX.eye(3), ca.SX(3, 1))
+        if seen >= 0:
+            turn, origin = ca.reshape(frames[:9, seen], 3, 3), frames[9:, seen]
+        sides = []
+        for body in (around.bodies[one], around.bodies[other]):
+            core = ca.DM(body.shape.core.T)
+            if body.frame >= 0:
+                own = ca.reshape(frames[:9, body.frame], 3, 3)
+                core = ca.mtimes(own, core) + ca.repmat(frames[9:, body.frame], 1, core.shape[1])
+            sides.append(ca.mtimes(turn.T, core - ca.repmat(origin, 1, core.shape[1])))
+        found.append([ca.densify(side) for side in sides])
+    return ca.Function("points", [base, q, t], [part for pair in found for part in pair])
+
+
+@pytest.mark.parametrize("name", machines())
+def test_distances_are_those_of_the_hulls(name: str) -> None:
+    machine = machines()[name]
+    around = Surroundings(machine, OBSTACLES)
+    assert len(around.pairs) >= 8
+    base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
+    exact = ca.Function("exact", [base, q, t], [around.distances(base, q, t)])
+    rounded = ca.Function("rounded", [base, q, t], [around.distances(base, q, t, rounding=1e-3)])
+    points = points_of(around, machine)
+    for b, j in zip(*postures(machine, 40, 1), strict=True):
+        told, below = np.array(exact(b, j, 0.0)).ravel(), np.array(rounded(b, j, 0.0)).ravel()
+        assert np.all(below <= told + 1e-9)
+        sides = [np.array(part).T for part in points(b, j, 0.0)]
+        for i, (one, other, _) in enumerate(around.pairs):
+            a, c = sides[2 * i][None], sides[2 * i + 1][None]
+            shapes = around.bodies[one].shape, around.bodies[other].shape
+            radii = shapes[0].swelling + shapes[1].swelling
+            way = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
+            gap = gap_along(way, a, c)[0]
+            if any(isinstance(shape, Cylinder) for shape in shapes):  # of which the distance is a bound from below
+                assert told[i] <= gap - radii + 1e-7
+            elif gap > 1e-6 or isinstance(shapes[1], HalfSpace):
+                assert_allclose(told[i], gap - radii, atol=1e-7)
+            else:
+                assert told[i] <= 1e-6 - radii
+
+
+@pytest.mark.parametrize("name", machines())
+def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
+    machine = machines()[name]
+    around = Surroundings(machine, OBSTACLES[:2])
+    levers = around.levers
+    lever = np.hstack([levers.base, levers.joints])
+    turn = np.hstack([levers.base_turns, levers.joint_turns])
+    x = ca.SX.sym("x", machine.base_size + machine.joint_size)
+    r, s = ca.SX.sym("r", x.numel()), ca.SX.sym("s", x.numel())
+    parts = points_of(around, machine)(x[: machine.base_size], x[machine.base_size :], 0.0)
+    first = [ca.jtimes(ca.vec(part), x, r) for part in parts]
+    second = [ca.jtimes(part, x, r) + ca.jtimes(part, r, s) for part in first]
+    moved = ca.Function("moved", [x, r, s], [ca.reshape(part, 3, -1) for part in (*first, *second)])
+    rng = np.random.default_rng(5)
+    base, q = postures(machine, 60, 2)
+    tight = 0.0
+    for at in np.hstack([base, q]):
+        rate, push = rng.normal(size=(2, len(at))) * rng.choice([0.0, 1.0], size=len(at))
+        if machine.base_size:  # a unit quaternion stays one
+            unit = at[3:7]
+            rate[3:7] -= unit * (unit @ rate[3:7])
+            push[3:7] -= unit * (unit @ push[3:7] + rate[3:7] @ rate[3:7])
+        found = [np.linalg.norm(np.array(part), axis=0).max() for part in moved(at, rate, push)]
+        speeds, bends = np.array(found[: len(parts)]), np.array(found[len(parts) :])
+        slow = lever @ np.abs(rate)
+        most = lever @ np.abs(push) + 2 * (turn @ np.abs(rate)) * slow
+        # of a swelling nothing is seen here; the core's points move less than it says
+        assert np.all(speeds.reshape(-1, 2).sum(axis=1) <= slow + 1e-9)
+        assert np.all(bends.reshape(-1, 2).sum(axis=1) <= most + 1e-9)
+        moving = slow > 0
+        tight = max([tight, *(speeds.reshape(-1, 2).sum(axis=1)[moving] / slow[moving])])
+    assert tight > 0.5  # and the bounds are no idle ones
+
+
+def test_a_moving_obstacle_is_no_faster_than_its_bounds() -> None:
+    box = Box((0.2, 0.1, 0.3), (0.1, 0, 0))
+    spin = 2.0
+
+    def turned(t: Any) -> Any:
+        c, s = ca.cos(spin * t), ca.sin(spin * t)
+        return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+
+    moving = Moving(box, lambda t: ca.vertcat(0.5 * t, 0.1 * ca.sin(3 * t), 0.4), turned)
+    speed, bend = moving.fastest(0.0, 2.0)
+    times = np.linspace(0, 2, 5001)
+    places = np.array(
+        [np.array(moving.frame(t).rotation) @ box.core.T + np.array(moving.frame(t).position) for t in times]
+    )
+    rates = np.gradient(places, times, axis=0)
+    sampled = np.linalg.norm(rates, axis=1).max()
+    assert sampled <= speed * (1 + 1e-6)
+    assert speed <= 1.2 * sampled
+    pushes = np.linalg.norm(np.gradient(rates, times, axis=0)[2:-2], axis=1).max()
+    assert pushes <= bend * (1 + 1e-5)
+    assert bend <= 1.3 * pushes
+    around = Surroundings(FixedBase(armoured_arm()), [moving])
+    speeds, _ = around.fastest(0.0, 2.0)
+    assert_allclose(speeds[[i for i, pair in enumerate(around.labels) if "obstacle 0" in pair]], speed)
+    assert np.all(speeds[[i for i, pair in enumerate(around.labels) if "obstacle 0" not in pair]] == 0)
+
+
+def test_scaled_machines_have_scaled_distances_and_levers() -> None:
+    plain, large = (Surroundings(FixedBase(armoured_arm(scale=k))) for k in (1.0, 3.0))
+    q = np.linspace(-1, 1, 7)
+    assert plain.labels == large.labels
+    assert_allclose(np.array(large.distances((), q)), 3 * np.array(plain.distances((), q)), rtol=1e-9)
+    assert_allclose(large.levers.joints, 3 * plain.levers.joints, rtol=1e-12)
+    assert_allclose(large.levers.joint_turns, plain.levers.joint_turns)
+
+
+def test_which_pairs_are_left() -> None:
+    machine = FixedBase(armoured_arm())
+    around = Surroundings(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
+    assert around.left["base", "obstacle 0"] == "neither moves"
+    assert around.left["link6", "obstacle 1"] == "told"
+    assert not {("link6", "obstacle 1"), ("link2", "link4"), ("base", "obstacle 3")} & set(around.labels)
+    assert ("link6", "obstacle 0") in around.labels
+    moving = Surroundings(machine, [Moving(OBSTACLES[0], lambda t: (t, 0, 0))])
+    assert ("base", "obstacle 0") in moving.labels
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "an obstacle that is none": ({"obstacles": [1.0]}, "obstacles"),
+    "an unknown link": ({"ignored": [("link2", "hand")]}, "hand"),
+    "a pair of one": ({"ignored": ["link2"]}, "ignored"),
+    "an unknown obstacle": ({"ignored": [("link2", "obstacle 7")]}, "obstacle 7"),
+    "obstacles in a word": ({"obstacles": "box"}, "obstacles"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_refused(case: str) -> None:
+    given, word = BAD[case]
+    with pytest.raises(ModelError, match=word):
+        Surroundings(FixedBase(armoured_arm()), **given)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"shape": HalfSpace((0, 0, 1), (0, 0, 0))}, "half-space"),
+        ({"shape": 3}, "shape"),
+        ({"position": (0, 0, 1)}, "position"),
+        ({"position": lambda t: (t, 0)}, "position"),
+        ({"position": lambda t: ca.vertcat(t, ca.SX.sym("y"), 0)}, "position"),
+        ({"rotation": lambda t: ca.SX.eye(2)}, "rotation"),
+        ({"position": lambda t: 1 / 0}, "position"),
+    ],
+)
+def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
+    good: dict[str, Any] = {"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0)}
+    with pytest.raises(ModelError, match=word):
+        Moving(**{**good, **given})
+
+
+def test_a_motion_without_a_bound() -> None:
+    moving = Moving(Sphere(0.1, (0, 0, 0)), lambda t: (ca.sqrt(t), 0, 0))
+    with pytest.raises(ModelError, match="no bound"):
+        moving.fastest(0.0, 1.0)
+
+
+def test_a_slide_without_limits() -> None:
+    robot = slider()
+    free = [
+        replace(joint, lower=-np.inf, upper=np.inf) if joint.kind == "prismatic" else joint for joint in robot.joints
+    ]
+    turned = [Joint("foot", "revolute", "ground", "base", axis=(0, 0, 1)), *free]
+    long = Robot((Link("ground", 1.0), *robot.links), tuple(turned), tip="left")
+    with pytest.raises(ModelError, match="rail"):
+        _ = Surroundings(FixedBase(long), OBSTACLES[:1]).levers

@@ -1,0 +1,187 @@
+"""The bodies of robots: what the description says, every point of a mesh inside, missing meshes named."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from models import CollisionShape, Link, ModelError, ModelWarning, Robot
+from models.arrays import Array
+from models.shapes.bodies import Body, bodies_of, capsule_around
+from models.shapes.covering import inside
+from models.shapes.mesh_files import find_mesh, read_mesh
+from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+PLACE = np.array([0.1, -0.2, 0.3])
+
+
+def one_link(*shapes: CollisionShape) -> Robot:
+    return Robot((Link("base", collisions=shapes),))
+
+
+def shape(kind: Any, size: Any, **more: Any) -> CollisionShape:
+    return CollisionShape(kind, size, translation=PLACE, rotation=TURN, **more)
+
+
+def test_simple_shapes_are_what_they_are() -> None:
+    robot = one_link(shape("box", (0.1, 0.2, 0.3)), shape("sphere", (0.1,)), shape("capsule", (0.1, 0.4)))
+    box, ball, rod = (body.shape for body in bodies_of(robot))
+    assert isinstance(box, Box)
+    np.testing.assert_array_equal(box.size, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(box.rotation, TURN, atol=1e-15)
+    assert isinstance(ball, Sphere)
+    np.testing.assert_array_equal(ball.position, PLACE)
+    assert isinstance(rod, Capsule)
+    np.testing.assert_allclose(rod.start, PLACE - 0.2 * TURN[:, 2], atol=1e-15)
+    np.testing.assert_allclose(rod.end, PLACE + 0.2 * TURN[:, 2], atol=1e-15)
+    assert [body.overhang for body in bodies_of(robot)] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("radius", "length"), [(0.05, 0.6), (0.05, 0.11), (0.1, 0.02), (0.03, 0.06), (0.01, 1.0)])
+def test_a_cylinder_lies_in_what_stands_for_it(radius: float, length: float) -> None:
+    (body,) = bodies_of(one_link(shape("cylinder", (radius, length))))
+    angles = np.linspace(0, 2 * np.pi, 500)
+    rim = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(500, length / 2)])
+    points = PLACE + np.concatenate([rim, rim * [1, 1, -1]]) @ TURN.T
+    if isinstance(body.shape, Capsule):
+        assert inside(body.shape, points).max() <= 0
+        pole = np.linalg.norm(np.subtract(body.shape.end, body.shape.start)) / 2 + body.shape.radius - length / 2
+        assert body.overhang == pytest.approx(pole)
+        assert body.overhang >= body.shape.radius - radius
+    else:
+        assert isinstance(body.shape, Cylinder)
+        assert (body.shape.radius, body.shape.length) == (radius, length)
+        assert length < 4 * radius
+
+
+def test_the_capsule_around_a_cylinder_has_the_least_volume() -> None:
+    """Against every radius of a fine search of the closed form, and where length rules or does not."""
+    for radius, length in [(0.05, 0.6), (0.1, 0.2), (0.1, 0.01)]:
+        least, (wide, straight), _ = capsule_around(radius, length)
+        tried = np.linspace(radius, np.hypot(radius, length / 2), 20_001)
+        lengths = np.maximum(length - 2 * np.sqrt(tried**2 - radius**2), 0)
+        assert least <= (np.pi * tried**2 * (lengths + 4 / 3 * tried)).min() * (1 + 1e-4)
+        assert np.hypot(radius, length / 2 - straight / 2) <= wide
+
+
+@pytest.fixture
+def mesh_robot(tmp_path: Path) -> Path:
+    """A URDF whose mesh is a package's, in millimetres, mirrored; the file."""
+    package = tmp_path / "arm_description"
+    for folder in ("meshes", "urdf"):
+        (package / folder).mkdir(parents=True)
+    mesh = trimesh.creation.capsule(radius=30.0, height=100.0, count=[16, 16])
+    mesh.apply_translation([10.0, 20.0, 30.0])
+    mesh.export(package / "meshes" / "upper.stl")
+    file = package / "urdf" / "arm.urdf"
+    file.write_text(
+        """<robot name="arm"><link name="upper"><collision><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/><geometry>
+        <mesh filename="package://arm_description/meshes/upper.stl" scale="0.001 -0.001 0.001"/></geometry></collision>
+        </link></robot>""",
+        encoding="utf-8",
+    )
+    return file
+
+
+def mesh_points(robot: Robot) -> dict[str, list[Array]]:
+    """Vertices of the meshes of each link, scaled and placed, by an own way."""
+    found: dict[str, list[Array]] = {}
+    for link in robot.links:
+        for each in link.collisions:
+            if each.kind == "mesh":
+                path = find_mesh(each.file, each.folder)
+                assert path is not None
+                points = read_mesh(path)[0] @ np.diag(each.size) @ np.asarray(each.rotation).T + each.translation
+                found.setdefault(link.name, []).append(points)
+    return found
+
+
+def outside(bodies: tuple[Body, ...], link: str, points: Array) -> float:
+    """How far the worst point is outside of all of a link's bodies that cover meshes, m."""
+    shapes = [body.shape for body in bodies if body.link == link]
+    return float(np.min([inside(each, points) for each in shapes if isinstance(each, Capsule | Box)], axis=0).max())
+
+
+def test_a_mesh_is_found_scaled_mirrored_and_placed(mesh_robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot.from_urdf(mesh_robot)
+    (points,) = mesh_points(robot)["upper"]
+    bodies = bodies_of(robot)
+    assert outside(bodies, "upper", points) <= 1e-12
+    assert len(bodies) == 1
+    assert isinstance(bodies[0].shape, Capsule)
+    assert bodies[0].shape.radius == pytest.approx(0.03, rel=0.02)
+    text = mesh_robot.read_text(encoding="utf-8")
+    with pytest.raises(ModelError, match=r"'upper'.*upper\.stl.*folders"):
+        bodies_of(Robot.from_urdf(text))  # a text has no folder
+    again = bodies_of(Robot.from_urdf(text), folders=[mesh_robot.parents[2]])
+    np.testing.assert_array_equal(again[0].shape.core, bodies[0].shape.core)
+
+
+def test_a_missing_mesh_is_named_and_skipped_only_if_told(mesh_robot: Path) -> None:
+    (mesh_robot.parents[1] / "meshes" / "upper.stl").unlink()
+    robot = Robot.from_urdf(mesh_robot)
+    with pytest.raises(ModelError, match=r"'upper'.*upper\.stl") as caught:
+        bodies_of(robot)
+    assert caught.value.name == "package://arm_description/meshes/upper.stl"
+    assert caught.value.value == "upper"
+    with pytest.warns(ModelWarning, match=r"'upper'.*upper\.stl"):
+        assert bodies_of(robot, missing="skip") == ()
+
+
+def test_a_broken_mesh_is_named_with_its_link(mesh_robot: Path) -> None:
+    (mesh_robot.parents[1] / "meshes" / "upper.stl").write_bytes(b"solid\nvertex\n")
+    robot = Robot.from_urdf(mesh_robot)
+    with pytest.raises(ModelError, match=r"link 'upper': mesh .*line 2"):
+        bodies_of(robot)
+    with pytest.warns(ModelWarning, match="line 2"):
+        assert bodies_of(robot, missing="skip") == ()
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "tiago", "anymal-kinova"])
+def test_real_robots_are_covered(name: str) -> None:
+    package, ending, options = ROBOTS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        robot = Robot.from_urdf(urdf_file(package, ending), **options)
+    bodies = bodies_of(robot)
+    assert {body.link for body in bodies} == {link.name for link in robot.links if link.collisions}
+    for link, meshes in mesh_points(robot).items():
+        for points in meshes:
+            assert outside(bodies, link, points) <= 1e-12, link
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"missing": "ignore"}, "missing"),
+        ({"missing": None}, "missing"),
+        ({"folders": "/tmp"}, "folders"),
+        ({"folders": [3]}, "folders"),
+        ({"folders": 3}, "folders"),
+        ({"robot": "arm"}, "robot"),
+        ({"robot": None}, "robot"),
+    ],
+)
+def test_bad_requests_are_named(options: dict[str, Any], name: str) -> None:
+    options = {"robot": one_link()} | options
+    with pytest.raises(ModelError) as caught:
+        bodies_of(options.pop("robot"), **options)
+    assert caught.value.name == name
+
+
+BALL = Sphere(1.0, (0, 0, 0))
+BAD = [(("", BALL), "link"), (("a", "b"), "shape"), (("a", HalfSpace((0, 0, 1), (0, 0, 0))), "shape")]
+
+
+@pytest.mark.parametrize(("given", "name"), [*BAD, (("a", BALL, -1.0), "overhang")])
+def test_bad_bodies_are_named(given: tuple[Any, ...], name: str) -> None:
+    with pytest.raises(ModelError) as caught:
+        Body(*given)
+    assert caught.value.name == name

@@ -1,0 +1,386 @@
+"""Signed distances of shapes: those of coal and of hulls of differences, their derivatives, what leaves them alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations_with_replacement, pairwise, product
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import Box, Capsule, Cylinder, Frame, HalfSpace, Mesh, ModelError, Sphere
+from models.shapes.distance import column, distance, pair_function
+from models.shapes.shapes import SIDES, Shape
+from tests.models.shapes.shape_oracles import by_coal, by_differences, moved_distance, random_frame, random_shape
+
+EXACT = (Sphere, Capsule, Box)
+EXACT_PAIRS = list(combinations_with_replacement(EXACT, 2))
+PAIRS = [
+    pair
+    for pair in combinations_with_replacement((Sphere, Capsule, Box, HalfSpace, Mesh, Cylinder), 2)
+    if pair != (HalfSpace, HalfSpace)
+]
+ROUNDINGS = (1e-3, 0.03, 0.2)
+
+
+def names(pair: Any) -> str:
+    return "-".join(kind.__name__ for kind in pair)
+
+
+def number(value: Any) -> float:
+    return float(ca.DM(value))
+
+
+def random_pairs(pair: tuple[type, type], count: int, seed: int, apart: float = 1.0) -> list[tuple[Any, Any]]:
+    rng = np.random.default_rng(seed)
+    spreads = apart * rng.uniform(0.05, 1.0, count)
+    return [(random_shape(pair[0], rng, 0.1), random_shape(pair[1], rng, spread)) for spread in spreads]
+
+
+def in_bulk(pairs: list[tuple[Any, Any]], rounding: float = 0.0) -> Any:
+    """Distances of pairs of the same two kinds, all at once."""
+    function = pair_function(type(pairs[0][0]), type(pairs[0][1]), rounding).map(len(pairs))
+    return np.array(function(*(ca.horzcat(*map(column, side)) for side in zip(*pairs, strict=True)))).ravel()
+
+
+@pytest.mark.parametrize("pair", EXACT_PAIRS, ids=names)
+def test_distances_of_many_random_pairs_are_those_of_coal(pair: tuple[type, type]) -> None:
+    """1e5 in all. Of deep boxes coal's search for the depth ends short of it now and then: there it is a bound."""
+    pairs = random_pairs(pair, 16700, seed=1)
+    found, known = in_bulk(pairs), np.array([by_coal(*both) for both in pairs])
+    assert (known < 0).mean() > 0.15
+    assert (known > 0).mean() > 0.15
+    assert (found - known).max() <= 1e-6
+    apart = known > 0 if Box in pair else np.full(len(known), True)
+    np.testing.assert_allclose(found[apart], known[apart], atol=1e-6, rtol=0)
+    assert np.mean(np.abs(found - known) < 1e-6) > 0.995
+
+
+@pytest.mark.parametrize("pair", [(Sphere, Box), (Capsule, Box), (Box, Box)], ids=names)
+def test_depths_and_gaps_are_those_of_the_hull_of_differences(pair: tuple[type, type]) -> None:
+    pairs = random_pairs(pair, 400, seed=2, apart=0.7)
+    known = np.array([by_differences(*both) for both in pairs])
+    np.testing.assert_allclose(in_bulk(pairs), known, atol=2e-7, rtol=0)
+
+
+def special_poses(rng: np.random.Generator) -> tuple[Any, Any]:
+    """Whole and half numbers, turned by right angles: parallel, aligned, touching, crossing, one in the other."""
+    grid = np.arange(-4, 5) / 4
+    quarter = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+    turn = quarter * np.linalg.det(quarter)
+    start = rng.choice(grid, 3)
+    end = start + rng.choice([0.0, 0.25, 0.5, 1.0], 3) * (rng.random(3) < 0.5)
+    return Capsule(0.125, start, end), Box(rng.choice([0.5, 1.0], 3), rng.choice(grid, 3), turn)
+
+
+def test_aligned_touching_and_crossing_shapes_are_no_exception() -> None:
+    rng = np.random.default_rng(3)
+    cases = [special_poses(rng) for _ in range(1500)]
+    rods, boxes = zip(*cases, strict=True)
+    for pairs in (cases, list(pairwise(rods)), list(pairwise(boxes))):
+        known = np.array([by_coal(*both) if _has_length(both) else np.nan for both in pairs])
+        found = in_bulk(pairs)
+        assert np.isfinite(found).all()
+        apart = known > 1e-9
+        np.testing.assert_allclose(found[apart], known[apart], atol=1e-6, rtol=0)
+        assert (found[known < -1e-6] < 0).all()
+        assert np.nanmax(found - known) < 1e-6
+
+
+def _has_length(shapes: tuple[Any, ...]) -> bool:
+    return all(not isinstance(shape, Capsule) or (shape.start != shape.end).any() for shape in shapes)
+
+
+def test_a_capsule_without_length_is_a_sphere() -> None:
+    rng = np.random.default_rng(4)
+    for kind in (Sphere, Capsule, Box, HalfSpace, Mesh):
+        other, ball = random_shape(kind, rng), random_shape(Sphere, rng)
+        known = number(distance(ball, other))
+        assert number(distance(Capsule(ball.radius, ball.position, ball.position), other)) == pytest.approx(
+            known, abs=1e-9
+        )
+
+
+@pytest.mark.parametrize("kind", [Sphere, Capsule, Box, Mesh, Cylinder], ids=lambda kind: kind.__name__)
+def test_height_above_a_half_space_is_that_of_the_lowest_point(kind: type) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        ground, shape = random_shape(HalfSpace, rng), random_shape(kind, rng)
+        known = ((shape.core - ground.point) @ ground.normal).min() - shape.swelling
+        assert number(distance(shape, ground)) == pytest.approx(known, abs=1e-12)
+        assert number(distance(ground, shape)) == pytest.approx(known, abs=1e-12)
+
+
+@pytest.mark.parametrize("other", [Sphere, Capsule, Box, Mesh, Cylinder], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [Mesh, Cylinder], ids=lambda kind: kind.__name__)
+def test_beside_a_mesh_or_a_cylinder_it_is_a_bound_from_below(kind: type, other: type) -> None:
+    """Of the distance of the hulls, by coal where they are apart; near it more often than not."""
+    rng = np.random.default_rng(6)
+    gaps = []
+    for _ in range(150):
+        one, two = random_shape(kind, rng, 0.1), random_shape(other, rng, 1.2)
+        found, known, true = number(distance(one, two)), by_differences(one, two), by_coal(one, two)
+        assert found <= known + 1e-7
+        assert true < 0 or found <= true + 1e-6
+        gaps.append(found - known)
+    assert np.median(gaps) > -0.2
+    assert max(gaps) > -1e-3
+
+
+def test_beside_the_face_of_a_mesh_or_the_end_of_a_cylinder_it_is_exact() -> None:
+    corners = Box((1, 2, 3)).core
+    turn = random_frame(np.random.default_rng(7)).rotation
+    ball = Sphere(0.25, turn @ (1.5, 0.2, -0.3))
+    assert number(distance(Mesh(corners, rotation=turn), ball)) == pytest.approx(0.75, abs=1e-12)
+    assert number(distance(ball, Cylinder(0.5, 2.0, (0, 0, 0), turn))) == pytest.approx(0.75, abs=1e-12)
+    assert number(distance(Sphere(0.5, turn @ (0, 0, 2.0)), Cylinder(0.5, 2.0, (0, 0, 0), turn))) == pytest.approx(0.5)
+    inside = Sphere(0.25, turn @ (0.4, 0, 0))
+    assert number(distance(Mesh(corners, rotation=turn), inside)) == pytest.approx(-0.35, abs=1e-12)
+
+
+def test_the_prism_holds_the_cylinder_and_stands_out_by_two_percent() -> None:
+    rod = Cylinder(0.5, 2.0, (1, 2, 3), random_frame(np.random.default_rng(8)).rotation)
+    own = (rod.core - rod.position) @ rod.rotation
+    around = np.linalg.norm(own[:, :2], axis=1)
+    assert (around > 0.5).all()
+    assert (around < 0.51).all()
+    np.testing.assert_allclose(np.abs(own[:, 2]), 1.0)
+    heights = rod.hull.normals @ own.T - rod.hull.offsets[:, None]
+    assert len(rod.hull.normals) == SIDES + 2
+    assert heights.max() < 1e-12
+    np.testing.assert_allclose(rod.hull.offsets, np.where(np.abs(rod.hull.normals[:, 2]) > 0.5, 1.0, 0.5))
+
+
+# ---- what motions, sizes and order leave alone --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+@pytest.mark.parametrize("pair", PAIRS, ids=names)
+def test_order_and_a_motion_of_both_change_nothing(pair: tuple[type, type], rounding: float) -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(3):
+        one, other = (random_shape(kind, rng) for kind in pair)
+        known = number(distance(one, other, rounding=rounding))
+        assert number(distance(other, one, rounding=rounding)) == pytest.approx(known, abs=1e-9)
+        frame = random_frame(rng)
+        both = number(distance(one, other, frame, frame, rounding=rounding))
+        placed = (shape.placed(frame.rotation, frame.position.ravel()) for shape in (one, other))
+        assert both == pytest.approx(known, abs=1e-9)
+        assert number(distance(*placed, rounding=rounding)) == pytest.approx(known, abs=1e-9)
+
+
+def scaled(shape: Any, factor: float) -> Shape:
+    if isinstance(shape, Sphere):
+        return Sphere(factor * shape.radius, factor * shape.position)
+    if isinstance(shape, Capsule):
+        return Capsule(factor * shape.radius, factor * shape.start, factor * shape.end)
+    if isinstance(shape, Box):
+        return Box(factor * shape.size, factor * shape.position, shape.rotation)
+    if isinstance(shape, Cylinder):
+        return Cylinder(factor * shape.radius, factor * shape.length, factor * shape.position, shape.rotation)
+    if isinstance(shape, HalfSpace):
+        return HalfSpace(factor * shape.normal, factor * shape.point)
+    return Mesh(shape.vertices, shape.faces, factor * shape.position, shape.rotation, scale=factor * shape.scale)
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=names)
+def test_a_larger_scene_has_larger_distances(pair: tuple[type, type]) -> None:
+    rng = np.random.default_rng(10)
+    for factor in (0.25, 3.0):
+        one, other = (random_shape(kind, rng) for kind in pair)
+        for rounding in (0.0, 0.05):
+            known = factor * number(distance(one, other, rounding=rounding))
+            grown = distance(scaled(one, factor), scaled(other, factor), rounding=factor * rounding)
+            assert number(grown) == pytest.approx(known, abs=1e-8)
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=names)
+def test_numbers_and_both_kinds_of_symbols_agree(pair: tuple[type, type]) -> None:
+    rng = np.random.default_rng(11)
+    one, other = (random_shape(kind, rng) for kind in pair)
+    frame, other_frame = random_frame(rng), random_frame(rng)
+    known = distance(one, other, frame, other_frame, rounding=0.02)
+    assert isinstance(known, ca.DM)
+    assert known.shape == (1, 1)
+    for kind in (ca.SX, ca.MX):
+        parts = [kind.sym("turn", 3, 3), kind.sym("place", 3), kind.sym("turn", 3, 3), kind.sym("place", 3)]
+        found = distance(one, other, Frame(*parts[:2]), Frame(*parts[2:]), rounding=0.02)
+        assert number(ca.Function("gap", parts, [found])(*frame, *other_frame)) == pytest.approx(
+            number(known), abs=1e-10
+        )
+    half = distance(one, other, Frame(parts[0], parts[1]), other_frame, rounding=0.02)
+    assert number(ca.Function("gap", parts[:2], [half])(*frame)) == pytest.approx(number(known), abs=1e-10)
+
+
+def test_what_is_small_is_as_exact() -> None:
+    rng = np.random.default_rng(17)
+    for pair in EXACT_PAIRS:
+        one, other = (random_shape(kind, rng) for kind in pair)
+        known = 1e-4 * number(distance(one, other))
+        assert number(distance(scaled(one, 1e-4), scaled(other, 1e-4))) == pytest.approx(known, abs=2e-12)
+    rod, crossing = (
+        Capsule(1e-5, (0, 0, 0), (1e-3, 0, 0)),
+        Capsule(1e-5, (2e-4, -2.5e-5, 1e-4), (1.2e-3, 2.5e-5, 1e-4)),
+    )
+    assert number(distance(rod, crossing)) == pytest.approx(8e-5, abs=2e-12)
+
+
+# ---- rounding -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rounding", ROUNDINGS)
+@pytest.mark.parametrize("pair", EXACT_PAIRS, ids=names)
+def test_rounded_distances_are_short_by_as_much_as_is_said(pair: tuple[type, type], rounding: float) -> None:
+    pairs = random_pairs(pair, 2000, seed=12)
+    known, found = in_bulk(pairs), in_bulk(pairs, rounding)
+    apart = known + [one.swelling + other.swelling for one, other in pairs]
+    assert (found <= known + 1e-9).all()
+    most = 4 * rounding if pair == (Box, Box) else 0.84 * rounding
+    assert (found >= known - most).all()
+    if pair == (Box, Box):
+        far = known > 6 * rounding
+        assert (found >= known - rounding - rounding**2 / np.maximum(known, 1e-12))[far].all()
+    if Sphere in pair:
+        np.testing.assert_array_equal(found, known)
+    elif Capsule in pair:
+        assert (found >= known - rounding**2 / np.maximum(apart, 1e-12)).all()
+
+
+@pytest.mark.parametrize("rounding", ROUNDINGS)
+@pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair not in EXACT_PAIRS], ids=names)
+def test_rounded_bounds_are_lower_by_no_more_than_is_said(pair: tuple[type, type], rounding: float) -> None:
+    rng = np.random.default_rng(13)
+    for _ in range(4):
+        one, other = (random_shape(kind, rng) for kind in pair)
+        known, found = number(distance(one, other)), number(distance(one, other, rounding=rounding))
+        assert known - 3 * rounding <= found <= known + 1e-9
+
+
+def test_the_bound_is_attained_within_a_fifth_where_segments_cross() -> None:
+    """What is said of the shortage is not too generous: crossing segments are short by e/sqrt(2)."""
+    one, other = Capsule(0.1, (-0.5, 0, 0), (0.5, 0, 0)), Capsule(0.1, (0, -0.5, 0), (0, 0.5, 0))
+    assert number(distance(one, other)) == pytest.approx(-0.2, abs=1e-9)
+    assert number(distance(one, other, rounding=0.1)) == pytest.approx(-0.2 - 0.1 / np.sqrt(2), abs=1e-3)
+
+
+# ---- derivatives --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+@pytest.mark.parametrize("pair", PAIRS, ids=names)
+def test_gradients_are_those_of_finite_differences(pair: tuple[type, type], rounding: float) -> None:
+    """Away from kinks: where the differences of two steps agree; kinks are rare."""
+    rng = np.random.default_rng(14)
+    kept, worst = 0, 0.0
+    for _ in range(6):
+        one, other = random_shape(pair[0], rng), random_shape(pair[1], rng, 0.8)
+        function, _ = moved_distance(one, other, rounding)
+        for x in rng.normal(size=(8, 6)) * [1.0, 1.0, 1.0, 0.4, 0.4, 0.4]:
+            slope = np.array(function(x)[1]).ravel()
+            assert np.isfinite(slope).all()
+            rough, fine = (_differences(lambda at, f=function: number(f(at)[0]), x, step) for step in (2e-5, 1e-5))
+            if np.abs(rough - fine).max() < 1e-7:
+                kept, worst = kept + 1, max(worst, float(np.abs(slope - fine).max()))
+    assert kept > 30
+    assert worst < 1e-6
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+@pytest.mark.parametrize("pair", EXACT_PAIRS, ids=names)
+def test_second_derivatives_are_those_of_finite_differences(pair: tuple[type, type], rounding: float) -> None:
+    rng = np.random.default_rng(15)
+    kept, worst = 0, 0.0
+    for _ in range(6):
+        one, other = random_shape(pair[0], rng), random_shape(pair[1], rng, 0.8)
+        function, bent = moved_distance(one, other, rounding)
+        for x in rng.normal(size=(6, 6)) * [1.0, 1.0, 1.0, 0.4, 0.4, 0.4]:
+            found = np.array(bent(x))
+            assert np.isfinite(found).all()
+            rough, fine = (_differences(lambda at, f=function: np.array(f(at)[1]).ravel(), x, h) for h in (2e-5, 1e-5))
+            if np.abs(rough - fine).max() < 1e-5 * (1 + np.abs(fine).max()):
+                kept += 1
+                worst = max(worst, float(np.abs(found - fine).max() / (1 + np.abs(fine).max())))
+    assert kept > 18
+    assert worst < 1e-4
+
+
+def _differences(function: Any, x: Any, step: float) -> Any:
+    return np.array([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))])
+
+
+def test_second_derivatives_of_an_aligned_capsule_are_those_of_one_nearly_aligned() -> None:
+    """A slab that the segment neither enters nor leaves must not lose its share of them."""
+    box = Box((1.0, 2.0, 3.0))
+    for rounding in (0.0, 0.05):
+        straight, tilted = (
+            np.array(
+                moved_distance(Capsule(0.1, (1.2, -0.3, 0.1), (1.9, -0.3 + e, 0.1 + e)), box, rounding)[1](np.zeros(6))
+            )
+            for e in (0.0, 1e-7)
+        )
+        assert np.isfinite(straight).all()
+        np.testing.assert_allclose(straight, tilted, atol=1e-5)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+def test_no_derivative_is_ever_spoilt(rounding: float) -> None:
+    """Coincident points, parallel, crossing and bare-point capsules, boxes one in the other, symmetric poses."""
+    here, along = (0, 0, 0), (1, 0, 0)
+    shapes: list[Shape] = [
+        Sphere(0.1, here),
+        Capsule(0.1, here, along),
+        Capsule(0.1, here, here),
+        Capsule(0.1, (0, -1, 0), (0, 1, 0)),
+        Capsule(0.1, (0, 0, 1), (1, 0, 1)),
+        Capsule(0.1, (0.5, 0, 0), (0.5 + 1e-13, 0, 0)),
+        Box((1, 1, 1)),
+        Box((2, 1, 1), (1, 1, 0)),
+        Mesh(Box((1, 1, 1)).core),
+        Cylinder(0.5, 1.0, here),
+        HalfSpace((0, 0, 1), here),
+    ]
+    for one, other in product(shapes, shapes):
+        if isinstance(one, HalfSpace) and isinstance(other, HalfSpace):
+            continue
+        function, bent = moved_distance(one, other, rounding)
+        for x in (np.zeros(6), np.array([0, 0, 0, 0.5, 0, 0]), np.array([0, 0, 0, 0, 0, 1.0])):
+            assert all(np.isfinite(np.array(part)).all() for part in (*function(x), bent(x))), (one, other, x)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.02])
+@pytest.mark.parametrize("pair", [p for p in PAIRS if p not in ((Sphere, Sphere), (Capsule, Capsule))], ids=names)
+def test_the_gradient_leads_out_of_an_overlap(pair: tuple[type, type], rounding: float) -> None:
+    """A step along it as long as the depth, again where that was short, ends apart."""
+    rng = np.random.default_rng(16)
+    tried = 0
+    while tried < 5:
+        one, other = random_shape(pair[0], rng, 0.1), random_shape(pair[1], rng, 0.2)
+        function, _ = moved_distance(one, other, rounding)
+        x = np.zeros(6)
+        if number(function(x)[0]) > -0.05:
+            continue
+        tried += 1
+        for _ in range(40):
+            gap, slope = number(function(x)[0]), np.array(function(x)[1]).ravel()[3:]
+            if gap > 0:
+                break
+            x[3:] += (1e-3 - gap) * slope / max(float(slope @ slope), 0.1)
+        assert gap > 0
+        assert np.linalg.norm(x) < 4
+
+
+def test_the_kinds_without_a_column_are_named() -> None:
+    calls: list[Callable[[], Any]] = [
+        lambda: pair_function(Mesh, Box),
+        lambda: pair_function(Box, Cylinder),
+        lambda: pair_function(HalfSpace, HalfSpace),
+        lambda: pair_function(Box, []),  # type: ignore[arg-type]
+        lambda: pair_function(Box, Box, -1.0),
+        lambda: column(Cylinder(1, 1, (0, 0, 0))),
+        lambda: column("box"),  # type: ignore[arg-type]
+    ]
+    for call in calls:
+        with pytest.raises(ModelError):
+            call()

@@ -1,0 +1,337 @@
+"""Which pairs of bodies are checked: by laws of the tree, by proof, as told; against a benchmark and coal."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import coal
+import numpy as np
+import pytest
+
+from models import CollisionShape, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
+from models.arrays import Array
+from models.shapes.bodies import Body, bodies_of
+from models.shapes.distance import distance
+from models.shapes.pairs import ALWAYS, COVERED, NEIGHBOURS, NEVER, RIGID, SRDF, TOLD, Pairs, checked_pairs
+from models.shapes.shapes import Box, Capsule, Sphere
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+
+DATA = Path(__file__).resolve().parents[2] / "data" / "redundancy"
+
+
+def chain(*lengths: float, radius: float = 0.02, limit: float = np.pi) -> tuple[Robot, tuple[Body, ...]]:
+    """Links along x at zero, each a capsule that stops short of its ends, on joints about z."""
+    links = tuple(Link(f"link{k}") for k in range(len(lengths)))
+    joints = []
+    for k, length in enumerate(lengths[:-1]):
+        ends = f"link{k}", f"link{k + 1}", (length, 0, 0)
+        joints.append(Joint(f"joint{k + 1}", "revolute", *ends, axis=(0, 0, 1), lower=-limit, upper=limit))
+    short = 2 * radius
+    bodies = tuple(
+        Body(f"link{k}", Capsule(radius, (short, 0, 0), (length - short, 0, 0))) for k, length in enumerate(lengths)
+    )
+    return Robot(links, tuple(joints)), bodies
+
+
+def by_links(bodies: tuple[Body, ...], pairs: Pairs) -> set[frozenset[str]]:
+    return {frozenset((bodies[i].link, bodies[j].link)) for i, j in pairs.checked}
+
+
+def test_neighbours_are_left_and_the_others_checked() -> None:
+    robot, bodies = chain(0.3, 0.3, 0.3, 0.3)
+    pairs = checked_pairs(robot, bodies)
+    assert pairs.checked == ((0, 2), (0, 3), (1, 3))
+    assert pairs.left == {(f"link{k}", f"link{k + 1}"): NEIGHBOURS for k in range(3)}
+
+
+def test_limits_prove_that_bodies_never_touch() -> None:
+    """Folded by less than needed: with the middle link of 0.3 and joints of at most 60 degrees nothing comes back."""
+    robot, bodies = chain(0.3, 0.3, 0.3, limit=np.deg2rad(60))
+    assert checked_pairs(robot, bodies).left["link0", "link2"] == NEVER
+    assert checked_pairs(robot, bodies, lower=-3.0, upper=3.0).checked == ((0, 2),)
+    assert checked_pairs(robot, bodies, clearance=0.5).checked == ((0, 2),)
+
+
+def test_what_cannot_be_proven_is_checked() -> None:
+    """Joints that move without limits, so far that no box of postures is finite."""
+    links = (Link("a"), Link("b"), Link("c"))
+    joints = (Joint("one", "prismatic", "a", "b"), Joint("two", "prismatic", "b", "c", axis=(0, 1, 0)))
+    bodies = tuple(Body(name, Sphere(0.1, (0.0, 0.0, z))) for name, z in (("a", 0.0), ("b", 5.0), ("c", 10.0)))
+    assert checked_pairs(Robot(links, joints), bodies).checked == ((0, 2),)
+
+
+def test_never_is_never() -> None:
+    """Trees at random: of the pairs that are called so none touches in any of 500 postures, by the expression."""
+    for seed in range(6):
+        robot, bodies = random_robot(np.random.default_rng(seed))
+        never = {pair for pair, reason in checked_pairs(robot, bodies).left.items() if reason == NEVER}
+        every = combinations(range(len(bodies)), 2)
+        chosen = [(i, j) for i, j in every if (bodies[i].link, bodies[j].link) in never]
+        if chosen:
+            assert gaps(robot, bodies, chosen, 500).min() > 0
+
+
+def random_robot(rng: np.random.Generator) -> tuple[Robot, tuple[Body, ...]]:
+    """A tree with a fork, revolute and prismatic joints, one of them a follower."""
+    links = tuple(Link(f"link{k}") for k in range(7))
+    joints = []
+    for k in range(1, 7):
+        kind: Any = "prismatic" if k == 3 else "revolute"
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        turn *= np.sign(np.linalg.det(turn))
+        low, high = (-0.1, 0.2) if kind == "prismatic" else np.sort(rng.uniform(-2, 2, 2))
+        mimic = Mimic("joint1", 0.5, 0.1) if k == 5 else None
+        parent = f"link{k - 1}" if k != 4 else "link1"
+        shift = rng.uniform(-0.3, 0.3, 3)
+        axis = rng.normal(size=3)
+        limits = {"lower": float(low), "upper": float(high)} if mimic is None else {}
+        joints.append(Joint(f"joint{k}", kind, parent, f"link{k}", shift, turn, axis, mimic=mimic, **limits))
+    bodies = []
+    for k in range(7):
+        place = rng.uniform(-0.1, 0.1, 3)
+        bodies.append(
+            Body(f"link{k}", Capsule(0.04, place, place + rng.uniform(-0.2, 0.2, 3)))
+            if k % 3
+            else Body(f"link{k}", Box(rng.uniform(0.03, 0.2, 3), place))
+        )
+    return Robot(links, tuple(joints), tip="link6"), tuple(bodies)
+
+
+def expression(bodies: tuple[Body, ...], frames: Any, i: int, j: int) -> Any:
+    """Distance of two bodies, given the frames of the links."""
+    return distance(bodies[i].shape, bodies[j].shape, frames[bodies[i].link], frames[bodies[j].link])
+
+
+def gaps(robot: Robot, bodies: tuple[Body, ...], pairs: list[tuple[int, int]], count: int) -> Array:
+    """Distances of pairs in random postures within limits. Shape (pairs, count)."""
+    q = ca.SX.sym("q", robot.dof)
+    frames = link_frames(robot, q)
+    each = ca.vertcat(*[expression(bodies, frames, i, j) for i, j in pairs])
+    postures = np.random.default_rng(1).uniform(robot.lower, robot.upper, (count, robot.dof)).T
+    return np.array(ca.Function("gaps", [q], [each])(postures))
+
+
+def test_pairs_that_are_checked_touch_somewhere_or_nearly() -> None:
+    """The proof is no blanket: of the checked pairs of random trees half and more do touch in random postures."""
+    touching = total = 0
+    for seed in range(4):
+        robot, bodies = random_robot(np.random.default_rng(seed))
+        checked = list(checked_pairs(robot, bodies).checked)
+        if checked:
+            least = gaps(robot, bodies, checked, 1000).min(axis=1)
+            touching, total = touching + int((least < 0.03).sum()), total + len(checked)
+    assert touching > 0.5 * total
+
+
+def test_bodies_that_always_touch_are_named() -> None:
+    robot, _ = chain(0.1, 0.001, 0.1)
+    bodies = tuple(Body(f"link{k}", Sphere(0.05, (0.0, 0.0, 0.0))) for k in (1, 2))
+    pairs = checked_pairs(robot, (Body("link0", Sphere(0.05, (0.1, 0, 0))), *bodies))
+    assert pairs.left["link0", "link2"] == ALWAYS
+    assert pairs.checked == ()
+    for overhang, reason in ((0.01, ALWAYS), (0.06, COVERED)):  # they overlap by 0.05 to 0.1
+        loose = Body("link2", Sphere(0.05, (0.0, 0.0, 0.0)), 2 * overhang)
+        pairs = checked_pairs(robot, (Body("link0", Sphere(0.05, (0.1, 0, 0))), bodies[0], loose))
+        assert pairs.left["link0", "link2"] == reason
+
+
+def test_fixed_links_are_one_rigid_part_and_links_without_bodies_are_passed_over() -> None:
+    links = tuple(Link(name) for name in ("base", "flange", "cross", "arm", "hand"))
+    joints = (
+        Joint("bolt", "fixed", "base", "flange", (0, 0, 0.1)),
+        Joint("yaw", "revolute", "flange", "cross", (0, 0, 0.1), lower=-1, upper=1),
+        Joint("pitch", "revolute", "cross", "arm", axis=(0, 1, 0), lower=-2, upper=2),
+        Joint("glue", "fixed", "arm", "hand", (0, 0, 0.5)),
+    )
+    ball = Sphere(0.06, (0.0, 0.0, 0.0))
+    bodies = tuple(Body(name, ball) for name in ("base", "flange", "arm", "hand"))
+    pairs = checked_pairs(Robot(links, joints), bodies)
+    assert pairs.left["base", "flange"] == pairs.left["arm", "hand"] == RIGID
+    assert pairs.left["flange", "arm"] == pairs.left["base", "hand"] == NEIGHBOURS
+    with_cross = checked_pairs(Robot(links, joints), (*bodies, Body("cross", Sphere(0.001, (0.0, 0.0, 0.0)))))
+    assert with_cross.left["base", "cross"] == NEIGHBOURS
+    assert with_cross.left.get(("base", "hand")) != NEIGHBOURS
+
+
+SRDF_TEXT = """<robot name="chain"><disable_collisions link1="link2" link2="link0" reason="Never"/>
+<disable_collisions link1="link0" link2="ghost"/></robot>"""
+
+
+def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
+    robot, bodies = chain(0.3, 0.3, 0.3, 0.3)
+    file = tmp_path / "chain.srdf"
+    file.write_text(SRDF_TEXT, encoding="utf-8")
+    for source in (SRDF_TEXT, file, str(file)):
+        with pytest.warns(ModelWarning, match="'ghost'"):
+            pairs = checked_pairs(robot, bodies, srdf=source, ignored=[("link3", "link0")])
+        assert pairs.checked == ((1, 3),)
+        assert pairs.left["link0", "link2"] == SRDF
+        assert pairs.left["link0", "link3"] == TOLD
+
+
+def test_names_and_the_order_of_declaration_do_not_matter() -> None:
+    for seed in range(4):
+        robot, bodies = random_robot(np.random.default_rng(seed))
+        pairs = checked_pairs(robot, bodies)
+        wanted = by_links(bodies, pairs)
+        turned = Robot(robot.links[::-1], robot.joints[::-1], tip=robot.tip)
+        assert by_links(bodies[::-1], checked_pairs(turned, bodies[::-1])) == wanted
+        other = renamed(robot, "other ")
+        moved = tuple(Body(f"other {body.link}", body.shape) for body in bodies)
+        assert checked_pairs(other, moved).checked == pairs.checked
+
+
+def test_a_follower_counts_as_it_moves() -> None:
+    """Two fingers on one drive, always 0.1 apart and more, which as joints of their own could meet."""
+    links = tuple(Link(name) for name in ("palm", "left", "right"))
+    left = Joint("left_slide", "prismatic", "palm", "left", axis=(1, 0, 0), lower=-0.2, upper=0.2)
+    ball = Sphere(0.02, (0.0, 0.0, 0.0))
+    bodies = (Body("left", ball), Body("right", ball))
+    for mimic, reason in ((Mimic("left_slide", 1.0, 0.1), NEVER), (None, None)):
+        limits = {} if mimic else {"lower": -0.2, "upper": 0.2}
+        right = Joint("right_slide", "prismatic", "palm", "right", axis=(1, 0, 0), mimic=mimic, **limits)
+        palm = Body("palm", Sphere(0.001, (0.0, 1.0, 0.0)))
+        pairs = checked_pairs(Robot(links, (left, right), tip="left"), (palm, *bodies))
+        assert pairs.left.get(("left", "right")) == reason
+
+
+@pytest.mark.parametrize("name", ["fetch", "fetch_arm", "panda"])
+def test_the_benchmark_of_redundant_arms(name: str) -> None:
+    """Capsules and pairs as given: distances at random postures as an own formula and coal have them."""
+    given = json.loads((DATA / "robots.json").read_text(encoding="utf-8"))[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        robot = Robot.from_urdf(DATA / given["urdf"], tip=given["tip"])
+    bodies = tuple(Body(link, Capsule(c[6], c[:3], c[3:6])) for link, c in given["capsules"].items())
+    ignored = [tuple(pair) for pair in given["ignored_pairs"]]
+    pairs = checked_pairs(robot, bodies, ignored=ignored)
+    for pair in ignored:
+        assert frozenset(pair) not in by_links(bodies, pairs)
+    listed = {frozenset(pair) for pair in ignored}
+    links = [body.link for body in bodies]
+    every = [(i, j) for i, j in combinations(range(len(links)), 2) if frozenset((links[i], links[j])) not in listed]
+    reasons = {frozenset(key): why for key, why in pairs.left.items()}
+    for i, j in set(every) - set(pairs.checked):
+        assert reasons[frozenset((bodies[i].link, bodies[j].link))] in (NEIGHBOURS, NEVER, ALWAYS, RIGID)
+    q = ca.SX.sym("q", robot.dof)
+    frames = link_frames(robot, q)
+    ours = [expression(bodies, frames, i, j) for i, j in every]
+    poses = [ca.horzcat(frames[link].rotation, frames[link].position) for link in links]
+    both = ca.Function("both", [q], [ca.vertcat(*ours), ca.horzcat(*poses)])
+    rng = np.random.default_rng(0)
+    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+    for _ in range(100):
+        found, placed = map(np.array, both(rng.uniform(low, high)))
+        for gap, (i, j) in zip(found.ravel(), every, strict=True):
+            sides = [(placed[:, 4 * k : 4 * k + 3], placed[:, 4 * k + 3]) for k in (i, j)]
+            ends = [bodies[k].shape.core @ turn.T + shift for k, (turn, shift) in zip((i, j), sides, strict=True)]
+            assert gap == pytest.approx(segments_apart(*ends) - radius(bodies[i]) - radius(bodies[j]), abs=1e-9)
+            assert gap == pytest.approx(by_coal(bodies[i], bodies[j], ends), abs=1e-6)
+
+
+def radius(body: Body) -> float:
+    assert isinstance(body.shape, Capsule)
+    return body.shape.radius
+
+
+def segments_apart(one: Array, other: Array) -> float:
+    """Least distance of two segments: of the ends from the other segment, and of the lines where they meet inside."""
+
+    def to_segment(point: Array, ends: Array) -> float:
+        along = ends[1] - ends[0]
+        share = np.clip((point - ends[0]) @ along / max(float(along @ along), 1e-300), 0, 1)
+        return float(np.linalg.norm(point - ends[0] - share * along))
+
+    found = [to_segment(point, b) for a, b in ((one, other), (other, one)) for point in a]
+    u, v = one[1] - one[0], other[1] - other[0]
+    matrix = np.column_stack([u, -v])
+    if np.linalg.matrix_rank(matrix, 1e-9) == 2:
+        s, t = np.linalg.lstsq(matrix, other[0] - one[0], rcond=None)[0]
+        if 0 <= s <= 1 and 0 <= t <= 1:
+            found.append(float(np.linalg.norm(one[0] + s * u - other[0] - t * v)))
+    return min(found)
+
+
+def by_coal(one: Body, other: Body, ends: list[Array]) -> float:
+    shapes, places = [], []
+    for body, (start, end) in zip((one, other), ends, strict=True):
+        along = end - start
+        length = float(np.linalg.norm(along))
+        z = along / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
+        x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
+        x /= np.linalg.norm(x)
+        shapes.append(coal.Capsule(radius(body), length))
+        places.append(coal.Transform3s(np.column_stack([x, np.cross(z, x), z]), (start + end) / 2))
+    result = coal.DistanceResult()
+    return float(coal.distance(shapes[0], places[0], shapes[1], places[1], coal.DistanceRequest(), result))
+
+
+FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02}  # closed they do touch
+HOME = {
+    "panda": {"panda_joint2": -0.785, "panda_joint4": -2.356, "panda_joint6": 1.571, "panda_joint7": 0.785, **FINGERS},
+    "ur5": {"shoulder_lift_joint": -1.2, "elbow_joint": 1.6, "wrist_1_joint": -1.2, "wrist_2_joint": -1.57},
+}
+
+
+@pytest.mark.parametrize("name", HOME)
+def test_arms_are_free_at_home(name: str) -> None:
+    package, ending, options = ROBOTS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        robot = Robot.from_urdf(urdf_file(package, ending), **options)
+    bodies = bodies_of(robot)
+    pairs = checked_pairs(robot, bodies)
+    assert not {ALWAYS, COVERED} & set(pairs.left.values())
+    frames = link_frames(robot, [HOME[name].get(joint, 0.0) for joint in robot.joint_names])
+    for i, j in pairs.checked:
+        one, other = bodies[i], bodies[j]
+        assert float(distance(one.shape, other.shape, frames[one.link], frames[other.link])) > 0, (one.link, other.link)
+
+
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"robot": None}, "robot"),
+    ({"bodies": [3]}, "bodies"),
+    ({"bodies": None}, "bodies"),
+    ({"bodies": [Body("link9", Sphere(1.0, (0, 0, 0)))]}, "link9"),
+    ({"ignored": [("link0", "link9")]}, "link9"),
+    ({"ignored": ["link0"]}, "ignored"),
+    ({"ignored": "link0"}, "ignored"),
+    ({"ignored": [("link0", "link1", "link2")]}, "ignored"),
+    ({"ignored": 3}, "ignored"),
+    ({"srdf": "<srdf/>"}, "the given text"),
+    ({"srdf": "absent.srdf"}, "file 'absent.srdf'"),
+    ({"srdf": "<robot><disable_collisions link1='link0'/></robot>"}, "link2"),
+    ({"lower": [0.0]}, "lower"),
+    ({"lower": np.nan}, "lower"),
+    ({"lower": 2.0, "upper": 1.0}, "lower"),
+    ({"clearance": -0.1}, "clearance"),
+    ({"seed": -1}, "seed"),
+    ({"samples": 0}, "samples"),
+]
+
+
+@pytest.mark.parametrize(("options", "name"), BAD, ids=range(len(BAD)))
+def test_bad_requests_are_named(options: dict[str, Any], name: str) -> None:
+    robot, bodies = chain(0.3, 0.3, 0.3)
+    given: dict[str, Any] = {"robot": robot, "bodies": bodies} | options
+    with pytest.raises(ModelError) as caught:
+        checked_pairs(given.pop("robot"), given.pop("bodies"), **given)
+    assert caught.value.name == name
+
+
+def test_collision_shapes_become_checked_bodies() -> None:
+    """From shapes to pairs in one go, with three links of the description's own kinds."""
+    sizes: list[tuple[Any, Any]] = [("box", (0.1, 0.1, 0.1)), ("sphere", (0.05,)), ("cylinder", (0.02, 0.3))]
+    shapes = [CollisionShape(kind, size) for kind, size in sizes]
+    links = tuple(Link(f"link{k}", collisions=(shape,)) for k, shape in enumerate(shapes))
+    joints = tuple(
+        Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0.12, 0, 0), lower=-3, upper=3) for k in (1, 2)
+    )
+    robot = Robot(links, joints)
+    assert checked_pairs(robot, bodies_of(robot)).checked == ((0, 2),)

@@ -1,0 +1,214 @@
+"""Proof of distances between the samples: closed forms, fine sampling, thin walls, and what must not change it."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
+from ocp.audit.clearance import Clearance
+from ocp.problem.hulls import Hull, gap_along, nearest_directions
+
+EYE = np.eye(3).ravel()
+
+
+def flight(
+    start: Any, end: Any, hulls: dict[str, Hull], pairs: Any, least: Any, horizon: float = 1.0, **more: Any
+) -> Problem:
+    """A frame that flies from one place to another in a smooth rest-to-rest motion."""
+    problem = Problem("flight")
+    q = problem.state("q", initial=start, terminal=end)
+    v = problem.state("v", 3, initial=0, terminal=0)
+    u = problem.control("u", 3)
+    problem.horizon(horizon)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.minimize(ca.sumsqr(u) / 2)
+    count = len(np.reshape(pairs, (-1, 3)))
+    problem.separate(
+        "clearance",
+        ca.vertcat(EYE, q),
+        hulls,
+        pairs,
+        least,
+        levers={"q": np.ones((count, 3))},
+        turns={"q": np.zeros((count, 3))},
+        **more,
+    )
+    return problem
+
+
+def proof(problem: Problem, intervals: int = 6) -> Clearance:
+    found: Clearance = solve(problem, Collocation(intervals, 3)).audit().clearances["clearance"]
+    return found
+
+
+BALL = Hull(0, np.zeros((1, 3)), 0.1)
+
+
+def test_a_ball_that_flies_past_a_ball() -> None:
+    hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.05)}
+    problem = flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1)
+    found = proof(problem)
+    assert found.settled
+    assert found.worst is not None
+    assert found.worst.bodies == ("ball", "post")
+    assert 0.15 - 0.02 * 0.05 - 1e-6 <= found.worst.least <= 0.15 <= found.worst.distance + 1e-12
+    assert found.worst.distance <= 0.15 / 0.98
+    assert_allclose(found.worst.time, 0.5, atol=0.05)
+    assert found.worst.missed == 0
+    solution = solve(problem, Collocation(6, 3))
+    assert solution.audit()["clearance"].passed
+    assert "proven; least ball and post" in str(solution.audit())
+
+
+@pytest.mark.parametrize("thickness", [1e-2, 1e-4, 1e-6])
+def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float) -> None:
+    wall = np.array([[0.437, y, z] for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    point = Hull(0, np.zeros((1, 3)), 0.0)
+    problem = flight([0, 0, 0], [1, 0, 0], {"point": point, "wall": Hull(-1, wall, thickness)}, [[0, 1, -1]], 0.0)
+    audit = solve(problem, Collocation(4, 3)).audit()
+    assert not audit["clearance"].passed
+    assert not audit.feasible
+    assert audit.clearances["clearance"].settled
+    assert audit["clearance"].time == pytest.approx(audit.clearances["clearance"].pairs[0].time)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=15, deadline=None)
+def test_bounds_lie_below_a_fine_sampling_and_near_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bodies = {
+        f"body {i}": Hull(int(rng.integers(-1, 1)), rng.normal(size=(m, 3)) * 0.3, 0.05)
+        for i, m in enumerate((1, 2, 4, 8))
+    }
+    bodies["flying"] = Hull(0, rng.normal(size=(2, 3)) * 0.3, 0.1)
+    names = list(bodies)
+    pairs = [[names.index("flying"), i, -1] for i in range(4) if bodies[f"body {i}"].frame == -1]
+    if not pairs:
+        return
+    problem = flight([-2, 0.1, 0], [2, 0.1, 0.3], bodies, pairs, 0.0)
+    solution = solve(problem, Collocation(5, 3))
+    found = solution.audit().clearances["clearance"]
+    q = solution.at(np.linspace(0, 1, 4001))["q"]
+    for one in found.pairs:
+        a, b = (bodies[name] for name in one.bodies)
+        sides = [part.core[None] + (q[:, None] if part.frame == 0 else 0 * q[:, None]) for part in (a, b)]
+        sampled = (gap_along(nearest_directions(*sides)[0], *sides) - a.radius - b.radius).min()
+        if sampled < -a.radius - b.radius:  # the hulls overlap, by a depth that is known from below alone
+            assert one.least < 0
+            continue
+        assert one.least <= sampled + 1e-9
+        assert one.distance >= sampled - 1e-3
+        if found.settled and 0 <= sampled < 0.2:
+            assert one.least >= sampled - 0.021 * sampled - 1e-6 - 1e-6
+
+
+def test_what_time_alone_moves() -> None:
+    """A post that crosses the way: seen at the right time, and with the speed that is told, in between."""
+    problem = Problem("crossing")
+    q = problem.state("q", initial=[0, 0, 0], terminal=[1, 0, 0])
+    u = problem.control("u", 3)
+    problem.horizon(1.0)
+    problem.dynamics(q, u)
+    problem.minimize(ca.sumsqr(u) / 2)
+    post = ca.vertcat(EYE, 0.5, 1.0 - 2.0 * problem.time, 0.0)
+    hulls = {"ball": BALL, "post": Hull(1, np.zeros((1, 3)), 0.1)}
+    problem.separate(
+        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], 0.0,
+        levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))}, speed=2.0, acceleration=0.0,
+    )  # fmt: skip
+    found = proof(problem, 3)
+    assert found.worst is not None
+    assert found.worst.missed > 0.19
+    assert_allclose(found.worst.time, 0.5, atol=0.01)
+
+
+def test_a_half_space() -> None:
+    ground = Hull(-1, np.array([[5.0, 7.0, -0.5]]), 0.0, np.array([0.0, 0.0, 1.0]))
+    rod = Hull(0, np.array([[0, 0, 0.2], [0, 0, -0.2]]), 0.05)
+    for pair in ([0, 1, -1], [1, 0, -1]):
+        found = proof(flight([0, 0, 0], [0, 0, -0.2], {"ground": ground, "rod": rod}, [pair], 0.0))
+        assert found.worst is not None
+        assert_allclose(found.worst.distance, 0.05, atol=1e-9)
+        assert 0.04 <= found.worst.least <= 0.05
+
+
+def test_time_and_length_rescaled_change_no_verdict() -> None:
+    for scale, horizon in ((1.0, 1.0), (1.0, 1e3), (1.0, 1e-3), (10.0, 1.0)):
+        hulls = {
+            "ball": Hull(0, np.zeros((1, 3)), 0.1 * scale),
+            "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]) * scale, 0.05 * scale),
+        }
+        problem = flight([0, 0, 0], [scale, 0, 0], hulls, [[0, 1, -1]], 0.1 * scale, horizon)
+        found = proof(problem)
+        assert found.settled
+        assert found.worst is not None
+        assert_allclose(found.worst.distance / scale, 0.15, rtol=0.03)
+        assert_allclose(found.worst.time / horizon, 0.5, atol=0.05)
+
+
+def test_a_plan_of_held_controls_and_one_that_was_saved(tmp_path: Any) -> None:
+    hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.05)}
+    problem = flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1)
+    solution = solve(problem, MultipleShooting(12))
+    found = solution.audit().clearances["clearance"]
+    assert found.settled
+    assert found.worst is not None
+    assert found.worst.missed == 0
+    solution.save(tmp_path / "plan.npz")
+    again = Solution.load(tmp_path / "plan.npz").audit().clearances["clearance"]
+    assert_allclose(again.pairs[0].least, found.worst.least, rtol=1e-12)
+    assert str(pickle.loads(pickle.dumps(problem))) == str(problem)
+
+
+def test_a_plan_that_was_moved_fails() -> None:
+    hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.05)}
+    solution = solve(flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1), Collocation(6, 3))
+    curve = solution.state_interpolant
+    values = curve.values.copy()
+    values[2:4, :, 1] += 0.2
+    moved = replace(solution, state_interpolant=replace(curve, values=values))
+    assert not moved.audit()["clearance"].passed
+
+
+GOOD: dict[str, Any] = {"hulls": {"a": BALL, "b": Hull(-1, np.zeros((1, 3)), 0.1)}, "pairs": [[0, 1, -1]], "least": 0.0}
+BAD: dict[str, dict[str, Any]] = {
+    "pair-of-itself": {"pairs": [[0, 0, -1]]},
+    "pair-of-none": {"pairs": [[0, 2, -1]]},
+    "frame-of-none": {"pairs": [[0, 1, 3]]},
+    "least-nan": {"least": np.nan},
+    "least-of-another-size": {"least": [0.0, 1.0]},
+    "speed-negative": {"speed": -1.0},
+    "acceleration-text": {"acceleration": "fast"},
+    "half-space-that-moves": {"hulls": {"a": BALL, "b": Hull(0, np.zeros((1, 3)), 0.0, np.array([0, 0, 1.0]))}},
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_declared(case: str) -> None:
+    given = {**GOOD, **BAD[case]}
+    with pytest.raises(ProblemError):
+        flight([0, 0, 0], [1, 0, 0], given.pop("hulls"), given.pop("pairs"), given.pop("least"), **given)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("core", (0, np.zeros((0, 3)))),
+        ("core", (0, np.full((1, 3), np.nan))),
+        ("radius", (0, np.zeros((1, 3)), -1.0)),
+        ("normal", (0, np.zeros((1, 3)), 0.0, np.array([1.0, 1.0, 0.0]))),
+    ],
+)
+def test_what_is_no_body(name: str, values: tuple[Any, ...]) -> None:
+    with pytest.raises(ProblemError, match=name):
+        Hull(*values)

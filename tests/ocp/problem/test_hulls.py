@@ -1,0 +1,94 @@
+"""Distances of convex hulls: closed forms, a convex program, and what must not change them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+
+from ocp.problem.hulls import gap_along, nearest_directions
+
+CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0
+
+
+def turns(rng: np.random.Generator, count: int) -> np.ndarray:
+    q = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    return np.asarray(q * np.sign(np.linalg.det(q))[:, None, None])
+
+
+def found(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distances, after it is shown that nothing nearer nor farther is possible."""
+    n, here, there = nearest_directions(one, other)
+    assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-12)
+    gap = gap_along(n, one, other)
+    apart = gap > 0
+    # a lower bound that is met by two points: the distance
+    assert_allclose(np.linalg.norm(there - here, axis=1)[apart], gap[apart], atol=1e-10)
+    return gap
+
+
+@pytest.mark.parametrize(("m", "k"), [(1, 1), (1, 2), (2, 2), (2, 8), (8, 8), (5, 30), (40, 3)])
+def test_the_gap_is_met_by_two_points(m: int, k: int) -> None:
+    rng = np.random.default_rng(m * 100 + k)
+    one, other = rng.normal(size=(400, m, 3)), rng.normal(size=(400, k, 3)) + 3 * rng.normal(size=(400, 1, 3))
+    gap = found(one, other)
+    assert (gap > 0).sum() > 200
+    n, here, there = nearest_directions(one, other)
+    back, there_again, here_again = nearest_directions(other, one)
+    assert_allclose(gap_along(back, other, one)[gap > 0], gap[gap > 0], atol=1e-9)
+    # both points are of the hulls: no direction leads past them
+    for points, hull in ((here, one), (there, other)):
+        for d in rng.normal(size=(20, 3)):
+            assert np.all(points @ d <= (hull @ d).max(axis=1) + 1e-9)
+    del n, there_again, here_again
+
+
+def test_boxes_that_are_placed_side_by_side() -> None:
+    shifts = np.array([[3.0, 0, 0], [0, 1.5, 0.2], [2, 2, 0.3], [2, 2, 2], [0.1, 0.1, 1.0 + 1e-6]])
+    exact = np.linalg.norm(np.maximum(np.abs(shifts) - 1, 0), axis=1)
+    one = np.tile(CORNERS, (5, 1, 1))
+    assert_allclose(found(one, one + shifts[:, None]), exact, atol=1e-9)
+
+
+def test_boxes_that_overlap_do_so_by_the_least_shift() -> None:
+    shifts = np.array([[0.9, 0, 0], [0.2, 0.7, 0.1], [0.0, 0.0, 0.0]])
+    one = np.tile(CORNERS, (3, 1, 1))
+    assert_allclose(found(one, one + shifts[:, None]), [-0.1, -0.3, -1.0], atol=1e-12)
+
+
+@given(st.integers(0, 10**6), st.floats(1e-3, 1e3))
+@settings(max_examples=30, deadline=None)
+def test_moved_and_scaled_together(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    one, other = rng.normal(size=(5, 4, 3)), rng.normal(size=(5, 6, 3)) + 4 * rng.normal(size=(5, 1, 3))
+    gap = found(one, other)
+    turn, shift = turns(rng, 1)[0], rng.normal(size=3)
+    moved = [scale * (part @ turn.T + shift) for part in (one, other)]
+    far = gap > 1e-3
+    assert_allclose(found(*moved)[far], scale * gap[far], rtol=1e-7)
+
+
+def test_against_a_convex_program() -> None:
+    rng = np.random.default_rng(3)
+    one, other = rng.normal(size=(12, 5, 3)), rng.normal(size=(12, 7, 3)) + 3
+    gaps = found(one, other)
+    for a, b, gap in zip(one, other, gaps, strict=True):
+        if gap <= 0:
+            continue
+
+        def square(w: np.ndarray, a: np.ndarray = a, b: np.ndarray = b) -> float:
+            return float(((w[:5] @ a - w[5:] @ b) ** 2).sum())
+
+        rows = [{"type": "eq", "fun": lambda w: w[:5].sum() - 1}, {"type": "eq", "fun": lambda w: w[5:].sum() - 1}]
+        start = np.r_[np.full(5, 0.2), np.full(7, 1 / 7)]
+        best = minimize(square, start, bounds=[(0, 1)] * 12, constraints=rows, options={"ftol": 1e-14})
+        assert_allclose(np.sqrt(best.fun), gap, rtol=1e-5)
+
+
+def test_points_that_coincide_and_lines_that_are_parallel() -> None:
+    one = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [1, 0, 0]]], dtype=float)
+    other = np.array([[[0, 2, 0], [1, 2, 0]], [[0, 0, 3], [0, 0, 3]], [[3, 0, 0], [5, 0, 0]]], dtype=float)
+    assert_allclose(found(one, other), [2, 3, 2], atol=1e-12)

@@ -1,0 +1,175 @@
+"""Random tasks among random boxes: what is planned is clear by an engine of others, and what can be planned is.
+
+python -m tests.sweep.crowded --count 300 [--robot panda] [--postures 30]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import coal
+import numpy as np
+
+from models import Box, FixedBase, Surroundings
+from ocp import Plan, ProblemError, SolveError, TipTask, inverse_kinematics, plan
+from ocp.local.touching import distances_along
+from tests.models.shapes.shape_oracles import in_coal
+from tests.ocp.planning.motions import pair
+from tests.ocp.tasks.space_tasks import panda, ur5
+
+SECONDS = 3.0
+CLEARANCE = 0.01
+ROBOTS = {"panda": panda, "ur5": ur5, "two arms": pair}
+COARSE, FINE = 1000, 60_000
+"""Samples of a plan, of all pairs and of those that come near."""
+NEAR = 0.05
+"""m."""
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A task of a machine among boxes.
+
+    Attributes:
+        machine, tasks, boxes: As of `plan`. start: Joints that it was made from, which are clear.
+    """
+
+    machine: FixedBase
+    tasks: TipTask
+    boxes: tuple[Box, ...]
+    start: np.ndarray
+
+
+@cache
+def alone(robot: str) -> Surroundings:
+    return Surroundings(ROBOTS[robot]())
+
+
+def crowd(robot: str, seed: int) -> Crowd:
+    """A straight way of 0.15 to 0.4 m from a posture that is clear of three to six boxes."""
+    rng = np.random.default_rng([sorted(ROBOTS).index(robot), seed])
+    machine = ROBOTS[robot]()
+    low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
+    while True:
+        joints = rng.uniform(0.9 * low, 0.9 * high)
+        first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()
+        if first[2] < 0.1 or distances_along(alone(robot), np.zeros(0), joints[None], np.zeros(1)).min() < CLEARANCE:
+            continue
+        way = rng.normal(size=3)
+        way *= rng.uniform(0.15, 0.4) / np.linalg.norm(way)
+        boxes = []
+        for _ in range(int(rng.integers(3, 7))):
+            turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            turn *= np.sign(np.linalg.det(turn))
+            at = first + way * rng.uniform(-0.2, 1.2) + rng.normal(size=3) * 0.25
+            boxes.append(Box(rng.uniform(0.05, 0.25, size=3), at, turn))
+        around = Surroundings(machine, boxes, CLEARANCE)
+        if distances_along(around, np.zeros(0), joints[None], np.zeros(1)).min() < CLEARANCE:
+            continue
+
+        def where(t: Any, first: np.ndarray = first, way: np.ndarray = way) -> Any:
+            s = t / SECONDS
+            return ca.DM(first) + (10 * s**3 - 15 * s**4 + 6 * s**5) * ca.DM(way)
+
+        return Crowd(
+            machine, TipTask(position=where, duration=SECONDS, link=machine.robot.tip_link), tuple(boxes), joints
+        )
+
+
+def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
+    """Least distance by coal of all pairs at 1000 times, and of those that come near at sixty times as many."""
+    around = Surroundings(result.machine, boxes, CLEARANCE)
+    least = np.inf
+    pairs = np.arange(len(around.pairs))
+    for count in (COARSE, FINE):
+        at = result.sample(result.horizon / count)
+        apart = distances_along(around, np.zeros(0), at.joints, at.t)
+        found = _by_coal(around, at.joints, apart < NEAR if count == FINE else np.ones_like(apart, dtype=bool), pairs)
+        least = min(least, float(found.min(initial=np.inf)))
+        pairs = pairs[(found < NEAR).any(axis=0)] if count == COARSE else pairs
+    return least
+
+
+def _by_coal(around: Surroundings, joints: np.ndarray, wanted: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    q = ca.SX.sym("q", joints.shape[1])
+    placed = ca.Function("placed", [q], [around.placements((), q)]).map(len(joints))
+    frames = np.array(placed(joints.T)).T.reshape(len(joints), -1, 4, 3)
+    bodies = [in_coal(body.shape) for body in around.bodies]
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = True
+    found = np.full(wanted.shape, np.inf)
+    for k in pairs:
+        one, other = around.pairs[k, :2]
+        for m in np.flatnonzero(wanted[:, k]):
+            sides = []
+            for body in (one, other):
+                geometry, own = bodies[body]
+                frame = around.bodies[body].frame
+                place = own
+                if frame >= 0:
+                    turn = frames[m, frame, :3].T
+                    place = coal.Transform3s(
+                        turn @ own.getRotation(), turn @ own.getTranslation() + frames[m, frame, 3]
+                    )
+                sides += [geometry, place]
+            result.clear()
+            found[m, k] = coal.distance(*sides, request, result)
+    return found
+
+
+def planned(given: Crowd, **options: Any) -> Plan | str:
+    """The plan, or the first line of why there is none."""
+    try:
+        return plan(given.machine, given.tasks, obstacles=given.boxes, clearance=CLEARANCE, **options)
+    except (ProblemError, SolveError) as error:
+        return str(error).split("\n")[0]
+
+
+def by_postures(given: Crowd, count: int) -> Plan | None:
+    """The first plan from one of so many postures that are clear at the start."""
+    around = Surroundings(given.machine, given.boxes, CLEARANCE)
+    found = inverse_kinematics(given.machine, given.tasks, surroundings=around, starts=4 * count, near=given.start)
+    for posture in found[:count]:
+        result = planned(given, start=posture.joints, search="start")
+        if isinstance(result, Plan):
+            return result
+    return None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.sweep.crowded", description=__doc__)
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--robot", choices=sorted(ROBOTS), action="append")
+    parser.add_argument("--postures", type=int, default=0, help="of the search that the share solved is compared with")
+    given = parser.parse_args(arguments)
+    robots = given.robot or sorted(ROBOTS)
+    solved = hits = tried = lost = 0
+    for number in range(given.first, given.first + given.count):
+        robot, seed = robots[number % len(robots)], number // len(robots)
+        began, task = time.time(), crowd(robot, seed)
+        result = planned(task)
+        took = time.time() - began
+        tried += 1
+        word = result if isinstance(result, str) else f"cost {result.cost:.4f}"
+        if isinstance(result, Plan):
+            solved += 1
+            least = least_by_coal(result, task.boxes)
+            hits += least < CLEARANCE - 1e-6
+            word += f", {least:.6f} m apart by coal"
+        elif given.postures and (other := by_postures(task, given.postures)) is not None:
+            lost += 1
+            word += f"; but from {np.round(other.at(0.0)['joints'], 3).tolist()} cost {other.cost:.4f}"
+        print(f"{robot} {seed}: {took:.1f} s, {word}", flush=True)
+    print(f"{tried} tasks, {solved} solved, {lost} that a search of postures solves, {hits} that touch by coal")
+    return int(hits > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
