@@ -20,10 +20,11 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
 from ocp.problem.hulls import Frames, frames_of, gap_along, grouped, nearest_directions
+from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
-from ocp.solution import Solution
+from ocp.solution import Solution, check_belongs, in_order_of
 
-__all__ = ["Clearance", "Nearest", "clearance"]
+__all__ = ["Clearance", "Nearest", "clearance", "nearest_at"]
 
 SETTLED = 0.02
 """Of the least distance: it is known to so much where that is more than is asked."""
@@ -105,6 +106,19 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
     return _Search(form, apart, solution, p).run()
 
 
+def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | None:
+    """The two bodies of a plan that are nearest to each other at a time (s); None where none have to stay apart.
+
+    Raises:
+        ProblemError: The plan does not belong to the problem.
+    """
+    form = Formulation.of(problem)
+    check_belongs(form, solution)
+    solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
+    found = [near for apart in problem.declared.apart.values() for near in _Search(form, apart, solution, p).at(time)]
+    return min(found, key=lambda near: near.distance, default=None)
+
+
 class _Search:
     """The halving of intervals of pairs until each is settled."""
 
@@ -119,7 +133,7 @@ class _Search:
         self.accelerations = bends + apart.acceleration
         self.kinds = grouped(tuple(apart.hulls.values()), apart.pairs)
         n = len(apart)
-        self.best, self.at, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
+        self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
         self.lower, self.ball, self.ball_at = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n)
 
     def run(self) -> Clearance:
@@ -146,23 +160,34 @@ class _Search:
             middle = (begin + end) / 2
             pair, piece = np.tile(pair, 2), np.tile(piece, 2)
             begin, end = np.concatenate([begin, middle]), np.concatenate([middle, end])
+        return Clearance(
+            self.apart.name, tuple(sorted(self._found(), key=lambda one: one.least - one.asked)), settled, looked
+        )
+
+    def at(self, time: float) -> list[Nearest]:
+        """Each pair at one time, s."""
+        pair = np.arange(len(self.apart))
+        now = np.full(len(pair), np.clip(time / self.solution.horizon, 0.0, 1.0))
+        self._bounds(pair, np.zeros(len(pair), dtype=int), now, now)
+        return self._found()
+
+    def _found(self) -> list[Nearest]:
+        """What was found of each pair."""
         self._look_at_the_far()
-        rotations, positions = self._frames(self.at)
+        rotations, positions = self._frames(self.when)
         each, seen = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, seen], self.points) + positions[each, seen][:, None]
-        found = [
+        return [
             Nearest(
                 bodies,
                 float(min(self.lower[i], self.best[i])),
                 float(self.best[i]),
-                float(self.at[i] * self.solution.horizon),
+                float(self.when[i] * self.solution.horizon),
                 points[i],
                 float(self.apart.least[i]),
             )
             for i, bodies in enumerate(self.apart.labels)
         ]
-        found.sort(key=lambda one: one.least - one.asked)
-        return Clearance(self.apart.name, tuple(found), settled, looked)
 
     def _bounds(
         self, pair: np.ndarray, piece: np.ndarray, begin: np.ndarray, end: np.ndarray
@@ -224,7 +249,7 @@ class _Search:
         first = order[np.unique(pair[order], return_index=True)[1]]
         first = first[distance[first] < self.best[pair[first]]]
         i = pair[first]
-        self.best[i], self.at[i], self.points[i] = distance[first], at[first], points[first]
+        self.best[i], self.when[i], self.points[i] = distance[first], at[first], points[first]
 
     def _frames(self, at: np.ndarray) -> Frames:
         """At fractions (M,) of the horizon."""

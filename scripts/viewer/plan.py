@@ -18,6 +18,7 @@ import numpy as np
 from models import Robot
 from models.arrays import Array
 from ocp import ProblemError, Solution
+from ocp.audit.clearance import Nearest, nearest_at
 from scripts.papers.run import written
 from scripts.robots.frames import Frames, frames_function
 
@@ -58,6 +59,11 @@ class Played:
         at = self.solution.at(np.clip(np.atleast_1d(np.asarray(times, dtype=float)), 0.0, self.horizon))
         base = None if self.base is None else at[self.base]
         return self._frames(at[self.joints][:, self.columns], base)
+
+    def nearest(self, time: float) -> Nearest | None:
+        """The two bodies that are nearest to each other at a time, s; None where the plan does not know of any."""
+        problem = self.solution.problem
+        return None if problem is None else nearest_at(problem, self.solution, time)
 
     @cached_property
     def _frames(self) -> Callable[[Any, Any], Frames]:

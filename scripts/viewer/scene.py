@@ -19,6 +19,7 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
 LINE = (60, 64, 72)
 PATH = (86, 180, 233)
 TRACE = (213, 94, 0)
+NEAREST = (204, 121, 167)
 BOX = (150, 156, 166)
 
 
@@ -142,6 +143,11 @@ class View:
         tip = self._dense.tip
         scene.add_line_segments("/path", np.stack([tip[:-1], tip[1:]], axis=1), PATH, thickness=0.004 * self._size)
         self._trace = scene.add_line_segments("/trace", np.zeros((1, 2, 3)), TRACE, thickness=0.007 * self._size)
+        self._nearest: Any = None
+        if self.played.nearest(0.0) is not None:
+            self._nearest = scene.add_line_segments(
+                "/nearest", np.zeros((1, 2, 3)), NEAREST, thickness=0.008 * self._size
+            )
         camera = self.server.initial_camera
         middle = (tip.max(axis=0) + tip.min(axis=0)) / 2
         camera.look_at = middle
@@ -157,6 +163,7 @@ class View:
         self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         tracing = gui.add_checkbox("tip trace", True)
         framing = gui.add_checkbox("link frames", False)
+        self._apart: Any = None if self._nearest is None else gui.add_markdown("")
         if self.missing:
             gui.add_markdown(f"{len(self.missing)} mesh files are not shown: see the terminal")
 
@@ -189,6 +196,9 @@ class View:
             if self._lines is not None:
                 self._lines.points = segments.astype(np.float32)
             self._trace.points = np.stack([passed[:-1], passed[1:]], axis=1).astype(np.float32)
+            if self._nearest is not None and (near := self.played.nearest(time)) is not None:
+                self._nearest.points = near.points[None].astype(np.float32)
+                self._apart.content = f"nearest: {near.bodies[0]} and {near.bodies[1]}, {1000 * near.distance:.1f} mm"
 
 
 def _add_mesh(scene: Any, node: str, shape: Any) -> None:

@@ -14,16 +14,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from models import FixedBase, FreeFloating, Machine, ModelError, Robot, link_frames
+from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Sphere, Surroundings, link_frames
 from models.arrays import Array
 from models.shapes.mesh_files import find_mesh
-from ocp import Collocation, ProblemError, Solution, minimum_velocity_problem, solve
+from ocp import Clear, Collocation, ProblemError, Solution, minimum_velocity_problem, solve
+from ocp.local.touching import distances_along
 from scripts import view
 from scripts.robots.frames import TIP, frames_along, inertia_box
 from scripts.viewer.command import parser, read
 from scripts.viewer.meshes import read_shapes
 from scripts.viewer.plan import Played, play, read_record, save_plan
 from scripts.viewer.scene import View
+from tests.models.machines.armoured import armoured_arm
 
 pytestmark = pytest.mark.xdist_group("view")
 
@@ -123,6 +125,31 @@ def test_every_frame_stands_where_the_model_has_it_at_every_time(folder: Path, s
         at = played.solution.at(now)
         assert shown.time == pytest.approx(now)
         assert_frames(shown, machine, at["base"] if kind == "floating" else (), at["joints"])
+
+
+def test_the_two_bodies_that_are_nearest_are_joined(tmp_path: Path, show: Factory) -> None:
+    robot = armoured_arm()
+    machine = FixedBase(robot)
+    robot.to_urdf(tmp_path / "arm.urdf")
+    start = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
+    clear = Clear(Surroundings(machine, [Sphere(0.05, (0.9, 0.4, 0.2))]))
+    problem = minimum_velocity_problem(machine, (0.0, 0.1, 0.0), (3, 4, 5), start, 1.0, clear=clear)
+    solution = solve(problem, Collocation(intervals=6, degree=3))
+    save_plan(tmp_path / "plan.npz", solution, robot, {"tip": robot.tip_link})
+    played = play(tmp_path / "plan.npz", tmp_path / "arm.urdf")
+    shown = show(played)
+    for now in (0.0, 0.7):
+        shown.time = now
+        near = played.nearest(now)
+        assert near is not None
+        apart = distances_along(clear.surroundings, np.zeros(0), solution.at(now)["joints"][None], np.array([now]))
+        assert near.distance == pytest.approx(apart.min(), abs=1e-9)
+        np.testing.assert_allclose(shown._nearest.points[0], near.points, atol=1e-6)
+        assert near.bodies[0] in shown._apart.content
+
+
+def test_a_plan_that_knows_of_no_bodies_joins_none(folder: Path, show: Factory) -> None:
+    assert show(play(folder / "fixed.npz", folder / "arm.urdf"))._nearest is None
 
 
 def test_the_slider_alone_moves_the_robot(folder: Path, show: Factory) -> None:

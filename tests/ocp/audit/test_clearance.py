@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.audit.clearance import Clearance
+from ocp.audit.clearance import Clearance, nearest_at
 from ocp.problem.hulls import Hull, gap_along, nearest_directions
 
 EYE = np.eye(3).ravel()
@@ -68,6 +68,24 @@ def test_a_ball_that_flies_past_a_ball() -> None:
     solution = solve(problem, Collocation(6, 3))
     assert solution.audit()["clearance"].passed
     assert "proven; least ball and post" in str(solution.audit())
+
+
+def test_the_nearest_two_at_a_time() -> None:
+    posts = {f"post {k}": Hull(-1, np.array([[x, 0.3, 0.0]]), 0.05) for k, x in enumerate((0.2, 0.8))}
+    problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, -1]], 0.1)
+    solution = solve(problem, Collocation(6, 3))
+    for time in (0.0, 0.3, 0.7, 1.0):
+        found, x = nearest_at(problem, solution, time), float(solution.at(time)["q"][0])
+        assert found is not None
+        assert set(found.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
+        assert_allclose(found.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
+        assert_allclose(sorted(found.points[:, 1]), [0.0, 0.3], atol=1e-9)
+    free = Problem("free")
+    q = free.state("q", initial=0.0)
+    free.dynamics(q, free.control("u"))
+    free.horizon(1.0)
+    free.minimize(q**2)
+    assert nearest_at(free, solve(free, Collocation(3, 2)), 0.5) is None
 
 
 @pytest.mark.parametrize("thickness", [1e-2, 1e-4, 1e-6])
