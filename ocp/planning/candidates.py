@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -154,8 +155,8 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Can
                 queue.insert(place, (bent, clear))
             continue
         # where the first one of its cost does not hold, another one may
-        others = [one for one in alike if one.cost >= candidate.cost and not maker.touches(one.solution)][:RESERVES]
-        for one in (candidate, *others):
+        others = (one for one in alike if one.cost >= candidate.cost and not maker.touches(one.solution))
+        for one in chain((candidate,), islice(others, RESERVES)):
             solved = maker.solved(one.start, one.solution, clear=clear)
             told.append(solved)
             if not solved.why:
