@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark test sweep check format dev build clean anew
+.PHONY: help reproduce gallery benchmark test sweep crowded check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -47,6 +47,9 @@ test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options 
 
 sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is known (ARGS="--only pendulum --seed 3")
 	$(BIN)/python -m tests.sweep --workers $(WORKERS) --out "$(OUT)" $(ARGS)
+
+crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes and look for collisions with coal (ARGS="--robot ur5 --count 20")
+	$(BIN)/python -W ignore -m tests.sweep.crowded $(ARGS)
 
 check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
 	$(BIN)/ruff check .

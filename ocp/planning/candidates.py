@@ -137,10 +137,11 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Can
     failures, barred = 0, ""
     while queue:
         candidate, clear = queue.pop(0)
-        if candidate.cost > least * (1 + beyond) or (first and np.isfinite(least)):
-            told.append(replace(candidate, why="dearer on a coarse mesh", solution=None))
-            continue
         touching = maker.touches(candidate.solution)
+        if candidate.cost > least * (1 + beyond) or (first and np.isfinite(least)):
+            why = f"{TOUCHES}: {touching[0]}" if touching else "dearer on a coarse mesh"
+            told.append(replace(candidate, why=why, solution=None))
+            continue
         if touching and clear is not None:
             if failures == FAILURES or (barred := maker.barred(touching[0].time)):
                 why = f"{TOUCHES}: {touching[0]}{barred and f'; {barred}'}"

@@ -30,6 +30,8 @@ from ocp import (
 )
 from ocp.local.touching import distances_along
 from tests.models.machines.armoured import armoured_arm
+from tests.ocp.planning.motions import DOWN, bent_seam
+from tests.ocp.tasks.space_tasks import ur5
 
 ARM = FixedBase(armoured_arm())
 START = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
@@ -172,6 +174,39 @@ def test_tasks_one_after_the_other_are_proven_stretch_by_stretch() -> None:
     assert result.audit().passed
     assert len(result.audit().clearances) == 3
     assert least_apart(result, [ball], 10001) >= 0.01 - 1e-6
+
+
+def torch_ur5() -> FixedBase:
+    """A UR5 whose torch is a tube with a bent neck, 0.3 m long in all."""
+    robot = ur5().robot
+    tube = CollisionShape("capsule", (0.03, 0.16), translation=(0.0, 0.0, 0.11))
+    neck = CollisionShape("capsule", (0.015, 0.1), translation=(0.03, 0.0, 0.23), rotation=rotation_about_y(0.5))
+    carrier = robot.link(robot.tip_link)
+    torch = replace(carrier, collisions=(*carrier.collisions, tube, neck))
+    links = tuple(torch if link.name == carrier.name else link for link in robot.links)
+    return FixedBase(replace(robot, links=links, tip_translation=(0.06, 0.0, 0.3)))
+
+
+def rotation_about_y(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
+    machine = torch_ur5()
+    around = Surroundings(machine)
+    assert any("tool0" in pair[1] and "upper_arm" in pair[0] for pair in around.labels)
+    result = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN))
+    assert result.audit().passed
+    assert result.audit().clearances["clearance"].settled
+    reasons = [one.why for one in result.candidates]
+    assert any(why.startswith("touches: ") and " overlap by " in why and " s" in why for why in reasons)
+    for one in result.candidates:
+        if one.solution is not None and not one.why.startswith("touches"):
+            at = one.solution.at_fraction(np.linspace(0, 1, 2001))
+            assert distances_along(around, np.zeros(0), at["joints"], np.zeros(2001)).min() >= -1e-6
+    bare = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN), clearance=None)
+    assert bare.cost <= result.cost * (1 + 1e-6)
 
 
 # ---- what cannot be kept clear -----------------------------------------------------------------------------------
