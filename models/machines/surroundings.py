@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, checked_nonnegative
+from models.arrays import MOST, Array, checked_nonnegative
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.robot.kinematics import link_frames
@@ -186,7 +186,7 @@ class Surroundings:
         near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
         object.__setattr__(self, "clearance", near)
         robot = self.machine.robot
-        own = bodies_of(robot, folders=self.folders, missing=self.missing)
+        own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing)
         names = [f"obstacle {number}" for number in range(len(found))]
         ignored = [_pair(each, number) for number, each in enumerate(_listed(self.ignored, "ignored"))]
         around = {pair for pair in ignored if names and any(name in names for name in pair)}
@@ -418,9 +418,9 @@ def _named(bodies: Sequence[Body]) -> list[str]:
 
 
 def _listed(values: Any, what: str) -> tuple[Any, ...]:
-    if isinstance(values, str | bytes | dict) or not hasattr(values, "__iter__"):
-        message = f"surroundings: {what} must be a list, not {values!r}"
-        raise ModelError(message, name=what, value=values)
+    if not isinstance(values, list | tuple) or len(values) > MOST:
+        message = f"surroundings: {what} must be a list of at most {MOST}, not {repr(values)[:80]}"
+        raise ModelError(message, name=what, value=values, limit=MOST)
     return tuple(values)
 
 

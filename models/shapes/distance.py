@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
+from models.arrays import MOST, Array, checked_array, checked_instance, checked_nonnegative, checked_number
 from models.errors import ModelError
 from models.shapes.hull import Hull
 from models.shapes.shapes import Box, Capsule, HalfSpace, Shape, Sphere, checked_shape
@@ -174,9 +174,16 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     Raises:
         ModelError: No value, or a width that is not positive.
     """
-    if not values:
-        raise ModelError("soft_minimum of no values", name="values", value=values)
+    if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST:
+        message = f"soft_minimum of no values, or not of a list of at most {MOST}: {repr(values)[:80]}"
+        raise ModelError(message, name="values", value=values, limit=MOST)
     checked_number(width, "soft_minimum", "width", positive=True)
+    for value in values:
+        if not isinstance(value, ca.SX | ca.MX | ca.DM):
+            checked_number(value, "soft_minimum", "values")
+        elif value.shape != (1, 1):
+            message = f"soft_minimum: values must be numbers, not of shape {value.shape}"
+            raise ModelError(message, name="values", value=value.shape, limit=(1, 1))
     stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
 

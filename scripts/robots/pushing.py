@@ -90,7 +90,6 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
         "limits": Limits(friction=FRICTION),
         "external": reaction(machine),
         "tip_level": "acceleration",
-        "clear": Clear(Surroundings(machine)),
         **changes,
     }
     hand = task(machine) if along == "time" else reach(machine)
@@ -104,7 +103,7 @@ def plan(coarse: bool = False) -> StandingExample:
     local = resolve_accelerations(
         machine, task(machine), START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
     ).motion
-    solution = solve(problem(machine), METHOD)
+    solution = solve(problem(machine, clear=Clear(Surroundings(machine))), METHOD)
     motion = standing.sampled(machine, solution, pressed)
     found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
     return StandingExample(ANYMAL.name, found, task(machine), solution.audit())

@@ -123,7 +123,7 @@ def from_rest(task: TipTask, seconds: float = SECONDS) -> TipTask:
     return timed(task, lambda time: rest_to_rest(time / seconds))
 
 
-def problem(machine: Standing, *, along: Any = "time") -> Problem:
+def problem(machine: Standing, *, along: Any = "time", clear: Clear | None = None) -> Problem:
     """The plan to be made: the circle at a given time law, or with the time law left to the plan ("parameter")."""
     robot, hand = machine.robot, circle(machine)
     return standing_problem(
@@ -137,7 +137,7 @@ def problem(machine: Standing, *, along: Any = "time") -> Problem:
         limits=Limits(velocity=SHARE * robot.velocity, torque=SHARE * robot.effort, friction=0.6),
         along=along,
         tip_level="acceleration",
-        clear=Clear(Surroundings(machine)),
+        clear=clear,
     )
 
 
@@ -156,7 +156,7 @@ def plan() -> Results:
     local = resolve_accelerations(
         machine, from_rest(circle(machine)), START, SECONDS, external=pulled, step=5e-3, stop_at_lift_off=False
     ).motion
-    solution = solve(problem(machine), METHOD)
+    solution = solve(problem(machine, clear=Clear(Surroundings(machine))), METHOD)
     return Results(robot_file(), machine, ground, solution, sampled(machine, solution, pulled), local, pulled)
 
 

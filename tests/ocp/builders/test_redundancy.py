@@ -295,7 +295,7 @@ def test_a_plan_of_which_it_is_not_decided_whether_it_is_a_minimum_stands(
     undecided: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No fault is found in it, and its audit says what is not decided."""
-    audit = SimpleNamespace(passed=False, failures=(), undecided=undecided, controls={})
+    audit = SimpleNamespace(passed=False, failures=(), undecided=undecided, controls={}, clearances={})
     plan = SimpleNamespace(success=True, states={}, cost=CHEAP, audit=lambda: audit)
     monkeypatch.setattr(redundancy, "solve", lambda *_, **__: plan)
     found: Any = plan_minimum_velocity(paper_example(), method=Collocation(intervals=10), **ASKED)
@@ -317,7 +317,7 @@ def test_meshes_are_refined_while_the_audit_mends_and_guesses_tried_until_one_is
         (worst, cost), number = script[len(calls)], len(calls)
         calls.append((mesh.intervals, guess, check))
         found = Finding("task", worst, 1.0)
-        audit = SimpleNamespace(passed=found.passed, failures=[found], controls={})
+        audit = SimpleNamespace(passed=found.passed, failures=[found], controls={}, clearances={})
         plans.append(SimpleNamespace(success=True, states={}, cost=cost, number=number, audit=lambda: audit))
         if np.isinf(worst):
             raise SolveError(f"attempt {number} fails", name=f"attempt {number}")
