@@ -28,7 +28,7 @@ CLEARANCE = 0.01
 ROBOTS = {"panda": panda, "ur5": ur5, "two arms": pair}
 COARSE, FINE = 1000, 60_000
 """Samples of a plan, of all pairs and of those that come near."""
-NEAR = 0.05
+NEAR = 0.02
 """m."""
 
 
@@ -85,28 +85,31 @@ def crowd(robot: str, seed: int) -> Crowd:
 def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
     """Least distance by coal of all pairs at 1000 times, and of those that come near at sixty times as many."""
     around = Surroundings(result.machine, boxes, CLEARANCE)
-    least = np.inf
     pairs = np.arange(len(around.pairs))
-    for count in (COARSE, FINE):
-        at = result.sample(result.horizon / count)
-        apart = distances_along(around, np.zeros(0), at.joints, at.t)
-        found = _by_coal(around, at.joints, apart < NEAR if count == FINE else np.ones_like(apart, dtype=bool), pairs)
-        least = min(least, float(found.min(initial=np.inf)))
-        pairs = pairs[(found < NEAR).any(axis=0)] if count == COARSE else pairs
+    times = np.linspace(0.0, result.horizon, COARSE + 1)
+    found = _by_coal(around, np.asarray(result.at(times)["joints"]), pairs)
+    least, near = float(found.min(initial=np.inf)), found < NEAR
+    steps = np.flatnonzero(near.any(axis=1))
+    if steps.size:
+        between = np.linspace(-1, 1, 2 * FINE // COARSE + 1) * (result.horizon / COARSE)
+        finer = np.unique(np.clip(times[steps, None] + between, 0.0, result.horizon))
+        again = _by_coal(around, np.asarray(result.at(finer)["joints"]), pairs[near.any(axis=0)])
+        least = min(least, float(again.min(initial=np.inf)))
     return least
 
 
-def _by_coal(around: Surroundings, joints: np.ndarray, wanted: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def _by_coal(around: Surroundings, joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Distances of some pairs at joints (M, n). Shape (M, all pairs), inf for those left out."""
     q = ca.SX.sym("q", joints.shape[1])
     placed = ca.Function("placed", [q], [around.placements((), q)]).map(len(joints))
     frames = np.array(placed(joints.T)).T.reshape(len(joints), -1, 4, 3)
     bodies = [in_coal(body.shape) for body in around.bodies]
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
-    found = np.full(wanted.shape, np.inf)
+    found = np.full((len(joints), len(around.pairs)), np.inf)
     for k in pairs:
         one, other = around.pairs[k, :2]
-        for m in np.flatnonzero(wanted[:, k]):
+        for m in range(len(joints)):
             sides = []
             for body in (one, other):
                 geometry, own = bodies[body]
