@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_nonnegative
+from models.arrays import MOST, Array, checked_flag, checked_nonnegative
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.robot.kinematics import link_frames
@@ -154,7 +154,8 @@ class Surroundings:
         srdf: File whose pairs are not looked at either, or None.
         folders: Where meshes are looked for.
         missing: "raise" where a mesh is missing; "skip" goes on without it, and warns.
-        bodies: All that is looked at, obstacles last.
+        limits: Whether the joints keep to the robot's position limits, by which pairs are left that never touch.
+        bodies: All that is looked at: of the links, obstacles, hulls of meshes.
         pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
         left: Pairs of names that are not looked at, and why.
 
@@ -170,6 +171,7 @@ class Surroundings:
     srdf: str | Path | None = None
     folders: Sequence[str | Path] = ()
     missing: MissingRule = "raise"
+    limits: bool = True
     bodies: tuple[Placed, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     left: dict[tuple[str, str], str] = field(init=False, repr=False)
@@ -195,7 +197,10 @@ class Surroundings:
                 if name not in names:
                     robot.link(name)
         links = [pair for pair in ignored if pair not in around]
-        known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near)
+        reach: dict[str, Any] = (
+            {} if checked_flag(self.limits, "surroundings", "limits") else {"lower": -np.inf, "upper": np.inf}
+        )
+        known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near, **reach)
         paths = {body.link: _way(robot, body.link) for body in own}
         close = self._close_meshes(own, known.checked)
         covered = {pair for pairs in close.values() for pair in pairs}
@@ -377,7 +382,7 @@ class Surroundings:
                 share = abs(drive.multiplier)
                 if joint.kind == "prismatic":
                     levers[drive.column] += share
-                    most = max(abs(joint.lower), abs(joint.upper))
+                    most = max(abs(joint.lower), abs(joint.upper)) if self.limits else np.inf
                     if not np.isfinite(most):
                         message = f"surroundings: joint {joint.name!r} slides without limits; give it some"
                         raise ModelError(message, name=joint.name, value=most)

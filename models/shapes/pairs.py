@@ -37,7 +37,7 @@ NEIGHBOURS, RIGID, ALWAYS, NEVER = "neighbours", "one rigid part", "always touch
 COVERED = "always touch, perhaps only in their covers"
 """Where in some posture bodies overlap by no more than their covers stand out of the meshes: these may be apart."""
 SRDF, TOLD = "the SRDF file", "told"
-VERSION = "pairs 4"
+VERSION = "pairs 5"
 """Of what is kept between runs: another one where the same input gives other pairs."""
 LIMITLESS = 1.0
 """m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
@@ -347,9 +347,10 @@ class _Between:
         return None if touching.any() or not self._apart(low, high, near) else NEVER
 
     def seen(self, low: Array, high: Array) -> str | None:
-        """NEVER for bodies two joints apart that are apart on a grid of both, refined where they are nearest.
+        """NEVER for hulls two joints apart that are apart on a grid of both, refined where they are nearest.
 
-        ALWAYS for those that are so nowhere on it, else None.
+        ALWAYS for those of which everywhere on it a corner of one lies in the other, else None: that no gap was seen
+        is no evidence that there is none.
         """
         columns = sorted({self.robot.drives[step.joint.name].column for step in (*self.up, *self.down)})
         first = np.where(np.isfinite(low), low, -np.pi)[columns]
@@ -362,13 +363,27 @@ class _Between:
             q[:, columns] = tried
             gaps = self.gaps(q)[0]
             if gaps.min() <= SURE:
-                return ALWAYS if gaps.max() <= 0 else None
+                return ALWAYS if gaps.max() <= 0 and self._nested(q) else None
             nearest = tried[np.argsort(gaps)[:LOWEST]]
             around = np.stack(np.meshgrid(*(np.linspace(-1, 1, 9) for _ in columns), indexing="ij"), axis=-1)
             offsets = around.reshape(-1, len(columns)) * step
             tried = np.clip((nearest[:, None] + offsets).reshape(-1, len(columns)), first, last)
             step = step / 4
         return NEVER
+
+    def _nested(self, q: Array) -> bool:
+        """Whether at all joint vectors (k, dof) a corner of one of two hulls lies in the other."""
+        assert isinstance(self.one, Mesh)
+        assert isinstance(self.other, Mesh)
+        one, other = self.one.hull, self.other.hull
+        for turn, shift in zip(*self._relative(q), strict=True):
+            there, here = other.vertices @ turn.T + shift, (one.vertices - shift) @ turn
+            held = [
+                (points @ hull.normals.T <= hull.offsets).all(axis=1) for points, hull in ((there, one), (here, other))
+            ]
+            if not any(inside.any() for inside in held):
+                return False
+        return True
 
     def gaps(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
         """Bounds of the distance from below at joint vectors, shape (k, dof).

@@ -90,8 +90,8 @@ class Clearance:
     def __str__(self) -> str:
         if self.worst is None:
             return "no pairs"
-        proven = "" if not self.settled and self.worst.missed else "proven; " if not self.worst.missed else "violated; "
-        return f"{proven or 'not proven; '}least {self.worst}"
+        verdict = "proven" if not self.worst.missed else "violated" if self.settled else "not proven"
+        return f"{verdict}; least {self.worst}"
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:

@@ -22,7 +22,8 @@ from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
 from ocp.local.touching import Touch, hulls_of, touches
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, Variable
+from ocp.problem.values import constant
 from ocp.solution import Solution
 
 __all__ = ["LOOKS", "Clear", "keeping_clear", "touching_error"]
@@ -107,6 +108,7 @@ class Clear:
             ProblemError: A moving obstacle and a free horizon; obstacles whose motion has no bound.
         """
         around, time = self.surroundings, begin + pace * problem.time
+        _check_limits(around, problem.declared.states[joints_name])
         n = len(around.pairs)
         speed, acceleration = np.zeros(n), np.zeros(n)
         if horizon is not None:
@@ -141,6 +143,18 @@ class Clear:
     def touches(self, base: Array, joints: Array, times: Array) -> list[Touch]:
         """The pairs that come nearer than they may at some samples of a motion, see `ocp.local.touching.touches`."""
         return touches(self.surroundings, base, joints, times)
+
+
+def _check_limits(around: Surroundings, joints: Variable) -> None:
+    """Raise where joints may leave the limits by which pairs were left that never touch."""
+    robot = around.machine.robot
+    kept = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
+    if around.limits and not kept.all():
+        name = robot.joint_names[int(np.flatnonzero(~kept)[0])]
+        words = (
+            f"surroundings keep joint {name!r} within its limits, the problem does not: Surroundings(..., limits=False)"
+        )
+        raise ProblemError(words, name=name)
 
 
 def keeping_clear(clear: Clear | None, run: Callable[[Clear | None], Solution]) -> Solution:

@@ -129,7 +129,7 @@ def inverse_kinematics(
     checked_count("seed", seed, 0, LARGEST_SEED)
     checked_flag("limits", limits)
     if surroundings is not None:
-        checked_surroundings(surroundings, machine)
+        checked_surroundings(surroundings, machine, limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size

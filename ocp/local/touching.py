@@ -108,10 +108,13 @@ def _prepared(surroundings: Surroundings) -> tuple[Sampler, list[HullPairs]]:
     return kept
 
 
-def checked_surroundings(value: Any, machine: Machine) -> Surroundings:
-    """Surroundings of a machine, or ProblemError unless they are."""
+def checked_surroundings(value: Any, machine: Machine, limits: bool = True) -> Surroundings:
+    """Surroundings of a machine whose joints keep their limits, or do not, or ProblemError unless they are."""
     if checked_instance("surroundings", value, Surroundings).machine is not machine:
         words = "surroundings are those of another machine; make them of this one: Surroundings(machine, ...)"
+        raise ProblemError(words, name="surroundings", value=value)
+    if value.limits and not limits:
+        words = "surroundings keep the joints within their limits; make them without: Surroundings(..., limits=False)"
         raise ProblemError(words, name="surroundings", value=value)
     found: Surroundings = value
     return found

@@ -109,10 +109,10 @@ def plan(
             limits=limits,
             search=search,
             seed=seed,
-            clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing),
+            clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits),
         )
     asked = _checked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
-    asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing))
+    asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits))
     postures = postures_at_the_start(asked)
     if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
         words = f"start: {touch}; start clear of everything, or name what may touch: ignored=[{touch.bodies}]"
@@ -137,7 +137,14 @@ def plan(
 
 
 def clear_of(
-    machine: Machine, obstacles: Any, clearance: Any, ignored: Any, srdf: Any, folders: Any, missing: Any
+    machine: Machine,
+    obstacles: Any,
+    clearance: Any,
+    ignored: Any,
+    srdf: Any,
+    folders: Any,
+    missing: Any,
+    limits: Limits | None,
 ) -> Clear | None:
     """What a motion has to stay clear of; None where there is nothing.
 
@@ -151,7 +158,8 @@ def clear_of(
                 raise ProblemError(words, name=what, value=value)
         return None
     try:
-        around = Surroundings(machine, obstacles, clearance, ignored, srdf, folders, missing)
+        kept = not isinstance(limits, Limits) or limits.joints
+        around = Surroundings(machine, obstacles, clearance, ignored, srdf, folders, missing, kept)
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
     return Clear(around) if len(around.pairs) else None

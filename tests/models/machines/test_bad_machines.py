@@ -31,6 +31,7 @@ from tests.bad_values import (
     CALLABLE,
     CHOICE,
     FINITE,
+    FLAG,
     INF,
     INSTANCE,
     NONNEGATIVE,
@@ -109,6 +110,7 @@ BOLTED_CASES = [
             "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
             "folders": {"number": 3, "word": "a", "numbers": [1, 2], "object": object()},
             "missing": CHOICE,
+            "limits": FLAG,
         },
     ),
     Case(

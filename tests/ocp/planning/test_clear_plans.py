@@ -16,6 +16,7 @@ from models import Box, CollisionShape, FixedBase, FreeFloating, Moving, Sphere,
 from ocp import (
     Clear,
     Collocation,
+    Limits,
     Plan,
     ProblemError,
     SolveError,
@@ -210,6 +211,24 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
 
 
 # ---- what cannot be kept clear -----------------------------------------------------------------------------------
+
+
+def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
+    robot = armoured_arm()
+    narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
+    within, beyond = (Surroundings(FixedBase(narrow), limits=limits) for limits in (True, False))
+    assert within.left["link2", "link6"] == "never touch"
+    assert ("link2", "link6") in beyond.labels
+    asked: dict[str, Any] = {"task": line(), "start_joints": START, "horizon": SECONDS, "limits": False}
+    around = Surroundings(ARM)
+    with pytest.raises(ProblemError, match="limits=False"):
+        minimum_velocity_problem(ARM, **asked, clear=Clear(around))
+    with pytest.raises(ProblemError, match="limits=False"):
+        inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, surroundings=around)
+    free = Surroundings(ARM, limits=False)
+    assert minimum_velocity_problem(ARM, **asked, clear=Clear(free)).declared.apart
+    wide = plan(ARM, line(), start=START, search="start", limits=Limits(joints=False))
+    assert wide.audit().passed
 
 
 def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
