@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark test sweep crowded check format dev build clean anew
+.PHONY: help reproduce gallery benchmark test sweep crowded redundancy global brute passages check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -50,6 +50,21 @@ sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is kno
 
 crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes and look for collisions with coal (ARGS="--robot ur5 --count 20")
 	$(BIN)/python -W ignore -m tests.sweep.crowded $(ARGS)
+
+brute: $(VENV)/test.stamp ## 1000 coarse tasks searched, beside all sequences of postures of a fine grid (ARGS="--only two")
+	$(BIN)/python -W ignore -m tests.sweep.brute_force --out "$(OUT)/brute_force.jsonl" $(ARGS)
+
+global: $(VENV)/test.stamp ## plan seeded tasks by search over all motions, beside 200 random starts each (ARGS="--kind panda")
+	$(BIN)/python -W ignore -m tests.sweep.global_plans --out "$(OUT)/global_plans.jsonl" $(ARGS)
+
+redundancy: $(VENV)/test.stamp ## plan the problems of a public benchmark of redundant arms, and check them (ARGS="--only panda__1cube")
+	$(BIN)/python -W ignore -m tests.sweep.redundancy $(ARGS)
+
+passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--beyond 4": that cannot)
+	$(BIN)/python -W ignore -m tests.sweep.passages $(ARGS)
+
+faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batches of 500 plans, and fill a disk
+	$(BIN)/python -W ignore -m tests.sweep.faults
 
 check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
 	$(BIN)/ruff check .

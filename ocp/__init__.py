@@ -19,7 +19,7 @@ from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.local.laws import Layer, Stabiliser
 from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
-from ocp.planning import Candidate, Plan, plan
+from ocp.planning import Candidate, DeadEnd, Plan, WaypointPlan, plan, plan_waypoints
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Solution
@@ -36,6 +36,7 @@ __all__ = [
     "Certificate",
     "Clear",
     "Collocation",
+    "DeadEnd",
     "Finding",
     "Following",
     "FreeTime",
@@ -55,6 +56,7 @@ __all__ = [
     "Stabiliser",
     "TipTask",
     "Unreachable",
+    "WaypointPlan",
     "Weights",
     "certificate",
     "inverse_kinematics",
@@ -65,6 +67,7 @@ __all__ = [
     "plan_minimum_time",
     "plan_minimum_velocity",
     "plan_standing",
+    "plan_waypoints",
     "prepare",
     "refine",
     "resolve",

@@ -16,6 +16,7 @@ import numpy as np
 
 __all__ = [
     "MOST",
+    "MOST_NUMBERS",
     "NOT_NUMBERS",
     "AuditError",
     "Detailed",

@@ -51,8 +51,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
-def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file whole or not at all, and see it on the disk.
+def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any], synced: bool = True) -> None:
+    """Write a file whole or not at all, and see it on the disk, where ``synced``.
+
+    Without, a file that a reader can tell to be whole is there some ms sooner, and after a loss of power perhaps empty.
 
     A link is followed, the mode of a file that is there kept. Until it is whole the file bears a name of its own,
     ``NAME.xxxxxxxx.part``, and is locked; one that is not locked any more, because who wrote it was killed, is removed.
@@ -76,11 +78,14 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
                 os.fchmod(stream.fileno(), mode)
             write(stream)
             stream.flush()
-            os.fsync(stream.fileno())
+            if synced:
+                os.fsync(stream.fileno())
             os.replace(stream.name, target)
     except BaseException:
         Path(stream.name).unlink(missing_ok=True)
         raise
+    if not synced:
+        return
     with suppress(PermissionError):  # a folder that may be written, not read
         folder = os.open(target.parent, os.O_RDONLY)
         try:

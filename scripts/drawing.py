@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from cycler import cycler
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -117,7 +118,15 @@ def time_bar(figure: Figure, axes: Any, horizon: float, *, fraction: float = 0.0
     figure.colorbar(scale, ax=axes, label="time, s", fraction=fraction, pad=pad)
 
 
-def gif(path: Path, frames: Iterable[Figure], *, seconds: float, colors: int = 64, hold: float = 1.0) -> None:
+def gif(
+    path: Path,
+    frames: Iterable[Figure],
+    *,
+    seconds: float,
+    colors: int = 64,
+    hold: float = 1.0,
+    moving: Collection[Artist] = (),
+) -> None:
     """Write an endless animation.
 
     Args:
@@ -126,12 +135,23 @@ def gif(path: Path, frames: Iterable[Figure], *, seconds: float, colors: int = 6
         seconds: Between two frames.
         colors: Of the palette that all frames share: fewer make a smaller file.
         hold: How long the last frame stays, s.
+        moving: Where all frames are one figure, what changes in it: the rest is drawn once, behind these.
     """
     pictures: list[Image.Image] = []
+    canvas: Any = None
+    still: Any = None
     with matplotlib.rc_context(STYLE):
         for figure in frames:
-            canvas: Any = FigureCanvasAgg(figure)
-            canvas.draw()
+            if moving and canvas is not None:
+                canvas.restore_region(still)
+            else:
+                for artist in moving:
+                    artist.set_animated(True)  # is left out by `draw`
+                canvas = FigureCanvasAgg(figure)
+                canvas.draw()
+                still = canvas.copy_from_bbox(figure.bbox)
+            for artist in moving:
+                figure.draw_artist(artist)
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
             palette = pictures[0] if pictures else None
             pictures.append(picture.quantize(colors, palette=palette, dither=Image.Dither.NONE))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import models
 import ocp
+import ocp.batch
 import ocp.files
 import ocp.schedule
 from tests.bad_values import panel
@@ -13,15 +14,17 @@ from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
 from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
 from tests.models.shapes.test_bad_shapes import CASES as SHAPES
+from tests.ocp.batch.test_bad_batches import CASES as BATCHES
 from tests.ocp.builders.test_bad_tasks import CASES as TASKS
 from tests.ocp.files.test_bad_files import CASES as FILES
 from tests.ocp.planning.test_bad_plans import CASES as PLANS
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
 
-CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS]
+CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS, *BATCHES]
 MADE_BY_THE_PACKAGE = {
     "Audit",
+    "Batch",
     "Candidate",
     "Certificate",
     "Cut",
@@ -41,24 +44,28 @@ MADE_BY_THE_PACKAGE = {
     "Program",
     "ProgramMotion",
     "Rapid",
+    "Result",
+    "RawTrajectory",
     "STANDING_STARTS",
     "Schedule",
     "SmoothPath",
     "Solution",
     "Stretch",
     "TimedProgram",
+    "WaypointPlan",
     "Waypoints",
 }
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "paper_example", "reference_tunnel", "standing_example"}
+RAISED = {"DeadEnd", "Unreachable"}
 LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
 """What a rule says of the zero moment point is looked at by standing_problem, which has them in its panel."""
 
 
 def test_everything_a_user_types_is_in_a_panel() -> None:
     asked = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
-    faces = {*models.__all__, *ocp.__all__, *ocp.files.__all__, *ocp.schedule.__all__}
-    errors = {name for name in faces if name.endswith(("Error", "Warning")) or name == "Unreachable"}
+    faces = {*models.__all__, *ocp.__all__, *ocp.batch.__all__, *ocp.files.__all__, *ocp.schedule.__all__}
+    errors = {name for name in faces if name.endswith(("Error", "Warning")) or name in RAISED}
     assert faces - asked - errors - MADE_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - LOOKED_AT_IN_A_PROBLEM == set()
 
 

@@ -33,7 +33,8 @@ FLOORS = {
         ["confirmation", "refinement", "tightening"],
         ["builders"],
         ["planning"],
-        ["batch", "files", "app"],
+        ["batch", "files"],
+        ["app"],
     ],
 }
 """Rooms and single modules from the ground up; each may import what stands on lower floors."""

@@ -30,11 +30,13 @@ def run(line: int, source: str, namespace: dict[str, object]) -> None:
 @pytest.mark.parametrize(("line", "source"), BLOCKS, ids=[f"line {line}" for line, _ in BLOCKS])
 def test_a_python_block_runs_alone(line: int, source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # what a block writes must not land in the repository
+    monkeypatch.syspath_prepend(tmp_path)  # as a script's own folder is
     run(line, source, {"__name__": "__main__"})
 
 
 def test_the_python_blocks_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     assert BLOCKS, "README.md has no Python block: the pattern or the fences are wrong"
     namespace: dict[str, object] = {"__name__": "__main__"}
     for line, source in BLOCKS:

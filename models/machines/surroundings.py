@@ -19,13 +19,12 @@ from models.arrays import MOST, Array, checked_flag, checked_nonnegative
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.robot.kinematics import link_frames
-from models.robot.parts import Joint
-from models.robot.robot import Robot
-from models.shapes.bodies import Body, MissingRule, bodies_of
+from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
 from models.shapes.intervals import bounds
-from models.shapes.pairs import checked_pairs
-from models.shapes.shapes import KINDS, HalfSpace, Mesh, Shape, checked_shape
+from models.shapes.pairs import TOLD, checked_pairs
+from models.shapes.rigid_parts import RigidParts, arms
+from models.shapes.shapes import KINDS, HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
 WORLD = -1
@@ -175,6 +174,7 @@ class Surroundings:
     bodies: tuple[Placed, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     left: dict[tuple[str, str], str] = field(init=False, repr=False)
+    _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
     _covers: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
@@ -189,61 +189,78 @@ class Surroundings:
         object.__setattr__(self, "clearance", near)
         robot = self.machine.robot
         own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing)
-        names = [f"obstacle {number}" for number in range(len(found))]
-        ignored = [_pair(each, number) for number, each in enumerate(_listed(self.ignored, "ignored"))]
-        around = {pair for pair in ignored if names and any(name in names for name in pair)}
-        for pair in around:
-            for name in pair:
-                if name not in names:
-                    robot.link(name)
-        links = [pair for pair in ignored if pair not in around]
+        links, around = self._told()
         reach: dict[str, Any] = (
             {} if checked_flag(self.limits, "surroundings", "limits") else {"lower": -np.inf, "upper": np.inf}
         )
         known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near, **reach)
-        paths = {body.link: _way(robot, body.link) for body in own}
-        close = self._close_meshes(own, known.checked)
-        covered = {pair for pairs in close.values() for pair in pairs}
-        seen = [
-            (one, other, _last_common(paths[own[one].link], paths[own[other].link]))
-            for one, other in known.checked
-            if (one, other) not in covered
-        ]
-        left = dict(known.left)
-        touching: list[tuple[int, int, str]] = []
-        for number, name in enumerate(names):
+        object.__setattr__(self, "_parts", RigidParts.of(robot))
+        beside, still = self._beside_obstacles(own, around)
+        object.__setattr__(self, "left", {**known.left, **still})
+        self._place(own, known.checked, beside)
+
+    def _told(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
+        """Pairs of links that are ignored, and those of a link and an obstacle."""
+        names = {f"obstacle {number}" for number in range(len(self.obstacles))}
+        ignored = [_pair(each, number) for number, each in enumerate(_listed(self.ignored, "ignored"))]
+        around = {pair for pair in ignored if names & set(pair)}
+        for pair in around:
+            for name in set(pair) - names:
+                self.machine.robot.link(name)
+        return [pair for pair in ignored if pair not in around], around
+
+    def _beside_obstacles(
+        self, own: Sequence[Body], told: set[tuple[str, str]]
+    ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], str]]:
+        """Bodies and obstacles that may touch, by their numbers; and why others are left."""
+        pairs, left = [], {}
+        for number, one in enumerate(self.obstacles):
+            name = f"obstacle {number}"
             for i, body in enumerate(own):
-                if {(body.link, name), (name, body.link)} & around:
-                    left[body.link, name] = "told"
-                elif not self._moves(body.link) and not isinstance(found[number], Moving):
+                if {(body.link, name), (name, body.link)} & told:
+                    left[body.link, name] = TOLD
+                elif not self._moves(body.link) and not isinstance(one, Moving):
                     left[body.link, name] = "neither moves"
                 else:
-                    touching.append((i, len(own) + number, ""))
-        meeting = [_last_common(paths[own[i].link], paths[own[j].link]) for i, j in known.checked]
-        carriers = dict.fromkeys([body.link for body in own] + meeting)
-        object.__setattr__(self, "_carriers", tuple(carriers))
-        places = {link: k for k, link in enumerate(carriers)}
+                    pairs.append((i, number))
+        return pairs, left
+
+    def _place(
+        self, own: Sequence[Body], checked: Sequence[tuple[int, int]], beside: Sequence[tuple[int, int]]
+    ) -> None:
+        """What is looked at: bodies of links, obstacles and hulls of meshes, each on its frame, and their pairs."""
+        close = self._close_meshes(own, checked)
+        covered = {pair for pairs in close.values() for pair in pairs}
+        frames = dict.fromkeys([body.link for body in own] + [self._seen_from(own[i], own[j]) for i, j in checked])
+        places = {link: k for k, link in enumerate(frames)}
         bodies = [Placed(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
-        movers = [one for one in found if isinstance(one, Moving)]
-        for name, one in zip(names, found, strict=True):
-            frame = len(carriers) + movers.index(one) if isinstance(one, Moving) else WORLD
-            bodies.append(Placed(name, one.shape if isinstance(one, Moving) else one, frame))
-        hulls: dict[int, int] = {}
+        moving = 0
+        for number, one in enumerate(self.obstacles):
+            if isinstance(one, Moving):
+                bodies.append(Placed(f"obstacle {number}", one.shape, len(places) + moving))
+                moving += 1
+            else:
+                bodies.append(Placed(f"obstacle {number}", one, WORLD))
+        pairs = [(i, j, places[self._seen_from(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
         covers: dict[int, tuple[tuple[int, int], ...]] = {}
-        for stand_ins in close.values():
-            for k in stand_ins[0]:
-                mesh = own[k].mesh
-                if id(mesh) not in hulls:
-                    hulls[id(mesh)] = len(bodies)
-                    bodies.append(Placed(f"{own[k].link} hull {len(hulls)}", Mesh(mesh), places[own[k].link]))
-            one, other = (own[k] for k in stand_ins[0])
-            covers[len(seen)] = tuple(stand_ins)
-            seen.append((hulls[id(one.mesh)], hulls[id(other.mesh)], _last_common(paths[one.link], paths[other.link])))
+        hulls: dict[LinkMesh, int] = {}
+        for (one_mesh, other_mesh), stand_ins in close.items():
+            first, second = (own[k] for k in stand_ins[0])
+            for mesh, body in ((one_mesh, first), (other_mesh, second)):
+                if mesh not in hulls:
+                    hulls[mesh] = len(bodies)
+                    bodies.append(Placed(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
+            covers[len(pairs)] = tuple(stand_ins)
+            pairs.append((hulls[one_mesh], hulls[other_mesh], places[self._seen_from(first, second)]))
+        pairs += [(i, len(own) + number, WORLD) for i, number in beside]
+        object.__setattr__(self, "_carriers", tuple(frames))
         object.__setattr__(self, "bodies", tuple(bodies))
-        object.__setattr__(self, "_covers", covers)
-        pairs = [(*pair, places[link]) for *pair, link in seen] + [(*pair, WORLD) for *pair, _ in touching]
         object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
-        object.__setattr__(self, "left", left)
+        object.__setattr__(self, "_covers", covers)
+
+    def _seen_from(self, one: Body, other: Body) -> str:
+        """The link that two bodies are seen from: the last rigid part that carries both."""
+        return self._parts.meeting(*(self._parts.of_link[body.link] for body in (one, other)))
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
@@ -315,9 +332,8 @@ class Surroundings:
             for placed in (self.bodies[one], self.bodies[other]):
                 if not 0 <= placed.frame < len(self._carriers):
                     continue  # an obstacle
-                way = robot.path_to(self._carriers[placed.frame])
-                above = len(robot.path_to(self._carriers[seen])) if seen != WORLD else 0
-                reach = self._sum_levers(placed, way[above:], joints[row], turns[row])
+                above = robot.root if seen == WORLD else self._carriers[seen]
+                reach = self._sum_levers(placed, above, joints[row], turns[row])
                 if seen == WORLD and size == 3:
                     base[row] += (1.0, 1.0, reach)
                     base_turns[row] += (0.0, 0.0, 1.0)
@@ -351,69 +367,41 @@ class Surroundings:
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
-    ) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    ) -> dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]]:
         """Pairs of bodies, by the two meshes that they cover, of links two or three joints apart.
 
         These may be a few millimetres from each other by design, less than covers stand out: their hulls are looked at.
         """
-        robot = self.machine.robot
-        found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        found: dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]] = {}
         for i, j in checked:
             one, other = own[i], own[j]
-            apart = set(_moving(robot, one.link)) ^ set(_moving(robot, other.link))
-            if one.mesh is not None and other.mesh is not None and len(apart) <= CLOSE:
-                found.setdefault((id(one.mesh), id(other.mesh)), []).append((i, j))
+            up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (one, other)))
+            if one.mesh is not None and other.mesh is not None and len(up) + len(down) <= CLOSE:
+                found.setdefault((one.mesh, other.mesh), []).append((i, j))
         return found
 
     def _moves(self, link: str) -> bool:
         """Whether a link ever moves in world."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
-    def _sum_levers(self, placed: Placed, way: Sequence[Joint], levers: Array, turns: Array) -> float:
-        """Add the levers (dof,) and turns (dof,) of the joints on the way to a body from the tip of the way on; the
-        farthest that any of its points comes from where the way begins, m."""
-        robot = self.machine.robot
-        points, swelling = placed.shape.core, placed.shape.swelling
-        reach = float(np.linalg.norm(points, axis=1).max()) + swelling
-        exact = True  # as long as nothing moved between the joint and the points
-        for joint in reversed(way):
-            drive = robot.drives.get(joint.name)
-            if joint.moves and drive is not None:
-                share = abs(drive.multiplier)
-                if joint.kind == "prismatic":
-                    levers[drive.column] += share
-                    most = max(abs(joint.lower), abs(joint.upper)) if self.limits else np.inf
-                    if not np.isfinite(most):
-                        message = f"surroundings: joint {joint.name!r} slides without limits; give it some"
-                        raise ModelError(message, name=joint.name, value=most)
-                    reach, exact = reach + most, False
-                else:
-                    across = points - np.outer(points @ joint.axis, joint.axis)
-                    lever = float(np.linalg.norm(across, axis=1).max()) + swelling if exact else reach
-                    levers[drive.column] += share * lever
-                    turns[drive.column] += share
-                    exact = False
-            if exact:
-                points = points @ joint.rotation.T + joint.translation
-                reach = float(np.linalg.norm(points, axis=1).max()) + swelling
-            else:
-                reach += float(np.linalg.norm(joint.translation))
+    def _sum_levers(self, placed: Placed, above: str, levers: Array, turns: Array) -> float:
+        """Add the levers (dof,) and turns (dof,) of the joints from the rigid part of a link above down to a body; the
+        farthest that any of its points comes from that part's origin, m."""
+        robot, parts, link = self.machine.robot, self._parts, self._carriers[placed.frame]
+        way = parts.path(parts.of_link[above], parts.of_link[link])[1]
+        endless = np.full(robot.dof, np.inf)
+        low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
+        own, reach = arms(robot, [(step, True) for step in way], placed.shape.placed(*parts.place[link]), low, high)
+        for (joint, *_), arm in zip(way, own, strict=True):
+            column, ratio, _ = robot.drives[joint.name]
+            slides = joint.kind == "prismatic"
+            levers[column] += abs(ratio) * (1.0 if slides else arm)
+            turns[column] += 0.0 if slides else abs(ratio)
+        if not np.isfinite(levers).all() or not np.isfinite(reach):
+            name = next(joint.name for joint, *_ in way if joint.kind == "prismatic")
+            message = f"surroundings: joint {name!r} slides without limits; give it some"
+            raise ModelError(message, name=name, value=np.inf)
         return reach
-
-
-def _way(robot: Robot, link: str) -> tuple[str, ...]:
-    """Links from the root to a link."""
-    return robot.root, *(joint.child for joint in robot.path_to(link))
-
-
-def _moving(robot: Robot, link: str) -> list[str]:
-    """Joints that move and carry a link."""
-    return [joint.name for joint in robot.path_to(link) if joint.moves]
-
-
-def _last_common(one: tuple[str, ...], other: tuple[str, ...]) -> str:
-    """The last link that two ways have in common."""
-    return [a for a, b in zip(one, other, strict=False) if a == b][-1]
 
 
 def _named(bodies: Sequence[Body]) -> list[str]:

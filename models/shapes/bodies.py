@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, TypeAlias, get_args
 from warnings import warn
 
@@ -15,8 +16,9 @@ from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Link
 from models.robot.robot import Robot
 from models.shapes.covering import Cover, cover
+from models.shapes.hull import kept_hull
 from models.shapes.mesh_files import find_mesh, read_mesh
-from models.shapes.shapes import SIDES, Box, Capsule, Cylinder, Shape, Sphere, checked_shape
+from models.shapes.shapes import SIDES, Box, Capsule, Cylinder, Mesh, Shape, Sphere, checked_shape
 
 MissingRule: TypeAlias = Literal["raise", "skip"]
 Folders: TypeAlias = Sequence[str | os.PathLike[str]]
@@ -29,6 +31,26 @@ are closest at the first, where a little more lets the caps begin much earlier."
 
 
 @dataclass(frozen=True, eq=False)
+class LinkMesh:
+    """A mesh of a link that bodies cover together.
+
+    Attributes:
+        points: Its corners, in the frame of the link. Shape (n, 3), m.
+    """
+
+    points: Array
+
+    @cached_property
+    def hull(self) -> Mesh:
+        """Its convex hull, in the frame of the link.
+
+        Raises:
+            ModelError: Points in a plane.
+        """
+        return Mesh.around(kept_hull(self.points))
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """A shape of a link.
 
@@ -37,8 +59,7 @@ class Body:
         shape: In the frame of the link.
         overhang: How far it stands out of what the description says at most, m: of a mesh out of its convex hull, as
             `models.shapes.covering` measures it.
-        mesh: Points of the mesh that it covers, or a part of, in the frame of the link; None of other shapes. Shape
-            (n, 3), m.
+        mesh: The mesh that it covers, or a part of; None of other shapes.
 
     Raises:
         ModelError: A name that is none, something that is no shape or has no end, a negative overhang.
@@ -47,7 +68,7 @@ class Body:
     link: str
     shape: Shape
     overhang: float = 0.0
-    mesh: Array | None = None
+    mesh: LinkMesh | None = None
 
     def __post_init__(self) -> None:
         owner = f"body of link {checked_name(self.link, 'body', 'link')!r}"
@@ -89,14 +110,14 @@ def bodies_of(robot: Robot, *, folders: Folders = (), missing: MissingRule = "ra
                 found.append(_simple(link, shape))
                 continue
             try:
-                covers, points = _covers(link, shape, folders)
+                covers, mesh = _covers(link, shape, folders)
             except ModelError as error:
                 if missing == "raise":
                     raise
                 skipped[f"{link.name}: {shape.file}"] = str(error)
                 continue
             found += [
-                Body(link.name, each.shape.placed(shape.rotation, shape.translation), each.overhang, points)
+                Body(link.name, each.shape.placed(shape.rotation, shape.translation), each.overhang, mesh)
                 for each in covers
             ]
     if skipped:
@@ -143,8 +164,8 @@ def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, fl
     return float(volumes[k]), (wide, float(lengths[k])), wide + float(lengths[k]) / 2 - length / 2
 
 
-def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[Cover, ...], Array]:
-    """Of a mesh, scaled, in the axes of the shape; and its points in the frame of the link."""
+def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[Cover, ...], LinkMesh]:
+    """Of a mesh, scaled, in the axes of the shape; and the mesh in the frame of the link."""
     path = find_mesh(shape.file, shape.folder or None, folders)
     if path is None:
         message = (
@@ -156,7 +177,7 @@ def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[
         vertices, faces = read_mesh(path)
         scaled = _scaled(vertices, shape)
         points = scaled[np.unique(faces)] @ shape.rotation.T + shape.translation
-        return cover(scaled, faces), np.asarray(points)
+        return cover(scaled, faces), LinkMesh(np.asarray(points))
     except ModelError as error:
         raise ModelError(
             f"link {link.name!r}: {error}", name=error.name, value=error.value, limit=error.limit

@@ -35,6 +35,15 @@ def folder() -> Path:
     return place / "selfmotion"
 
 
+def files() -> list[Path]:
+    """All that is kept, and parts that were left by who was killed."""
+    try:
+        place = folder()
+        return sorted(file for file in place.iterdir() if file.is_file() and file.suffix in (".json", ".part"))
+    except (OSError, RuntimeError):
+        return []
+
+
 def kept(key: str) -> Any:
     """What was kept under a key: lists, dictionaries, texts, numbers; None where there is nothing or nothing whole."""
     try:

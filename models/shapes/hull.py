@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array, frozen
 from models.errors import ModelError
+from models.shapes.cache import keep, kept, key_of
 
 FLAT = 1e-10
 """Share of the size of all points: thinner is flat, and what stands out less counts as inside."""
 SAME_PLANE = 1e-9
 """Normals of faces that differ by less are one."""
 TRIES = 6
+VERSION = "hull 1"
+"""Of what is kept between runs: another one where the same points have another hull."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +67,33 @@ def convex_hull(points: Array) -> Hull:
             break
     offsets = (centred @ normals.T).max(axis=0)  # of all points: nothing stands out, whatever rounding did
     return Hull(frozen(vertices + middle), faces, frozen(normals), frozen(offsets + normals @ middle))
+
+
+def kept_hull(points: Array) -> Hull:
+    """The convex hull of points, sought once and kept in a file by their content, see `models.shapes.cache`.
+
+    Args, Raises: As `convex_hull`.
+    """
+    key = key_of(VERSION, points)
+    known = _read(kept(key), points)
+    if known is None:
+        known = convex_hull(points)
+        parts = known.vertices, known.faces, known.normals, known.offsets
+        keep(key, [part.tolist() for part in parts])
+    return known
+
+
+def _read(value: Any, points: Array) -> Hull | None:
+    """A hull as it was kept; None where it is something else, or does not hold the points."""
+    try:
+        vertices, faces, normals, offsets = (np.array(part) for part in value)
+        found = Hull(frozen(vertices), faces.astype(np.intp), frozen(normals), frozen(offsets))
+        slack = SAME_PLANE * float(np.abs(points).max())
+        farthest = [(each @ normals.T).max(axis=0) for each in (points, vertices)]
+        sound = vertices[faces].shape == (len(faces), 3, 3)
+        return found if sound and np.abs(np.array(farthest) - offsets).max() <= slack else None
+    except (TypeError, ValueError, IndexError):
+        return None
 
 
 def _normals(vertices: Array, faces: NDArray[np.intp]) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -24,12 +23,12 @@ from models.arrays import (
     one_for_each,
 )
 from models.errors import ModelError, ModelWarning
-from models.robot.parts import Joint
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
 from models.shapes.bodies import Body
 from models.shapes.cache import keep, kept, key_of
 from models.shapes.distance import distance
+from models.shapes.rigid_parts import RigidParts, Step, arms
 from models.shapes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from models.spatial import Frame
 
@@ -125,30 +124,31 @@ def checked_pairs(
     key = _key(robot, bodies, low, high, named, near, count, seed)
     if (known := _read(kept(key), bodies)) is not None:
         return known
-    groups = _Groups.of(robot)
-    close = groups.close({groups.of_link[body.link] for body in bodies})
-    placed = [body.shape.placed(*groups.place[body.link]) for body in bodies]
+    parts = RigidParts.of(robot)
+    close = parts.close({parts.of_link[body.link] for body in bodies})
+    placed = [body.shape.placed(*parts.place[body.link]) for body in bodies]
     postures = _postures(robot, low, high, count, rng)
     checked: list[tuple[int, int]] = []
     left: dict[tuple[str, str], str] = {}
     of_hulls: dict[tuple[int, int], str | None] = {}
     for i, j in combinations(range(len(bodies)), 2):
         one, other = bodies[i].link, bodies[j].link
-        sides = frozenset((groups.of_link[one], groups.of_link[other]))
+        sides = frozenset((parts.of_link[one], parts.of_link[other]))
         if len(sides) == 1:
             reason: str | None = RIGID
         elif (reason := named.get(frozenset((one, other)))) is None and sides in close:
             reason = NEIGHBOURS
         if reason is None:
-            ends = groups.path(*(groups.of_link[link] for link in (one, other)))
+            ends = parts.path(*(parts.of_link[link] for link in (one, other)))
             between = _Between(robot, placed[i], placed[j], *ends, _bound(placed[i], placed[j]))
             reason = between.settled(low, high, postures, near, bodies[i].overhang + bodies[j].overhang)
-            meshes = bodies[i].mesh, bodies[j].mesh
+            one_mesh, other_mesh = bodies[i].mesh, bodies[j].mesh
             two_joints = len(between.up) + len(between.down) == 2
-            if reason != NEVER and two_joints and not any(mesh is None for mesh in meshes):
-                of_meshes = id(meshes[0]), id(meshes[1])
+            if reason != NEVER and two_joints and one_mesh is not None and other_mesh is not None:
+                of_meshes = id(one_mesh), id(other_mesh)
                 if of_meshes not in of_hulls:
-                    one_hull, other_hull = (_hull(bodies[k], *groups.place[bodies[k].link]) for k in (i, j))
+                    one_hull = one_mesh.hull.placed(*parts.place[one])
+                    other_hull = other_mesh.hull.placed(*parts.place[other])
                     hulls = _Between(robot, one_hull, other_hull, *ends, _bound(one_hull, other_hull))
                     of_hulls[of_meshes] = hulls.seen(low, high)
                 reason = of_hulls[of_meshes] or (None if reason == COVERED else reason)
@@ -183,7 +183,12 @@ def _key(
         parts += [joint.axis, joint.translation, joint.rotation]
     for body in bodies:
         words.append(f"{body.link} {type(body.shape).__name__}")
-        parts += [body.shape.core, body.shape.swelling, body.overhang, np.zeros(0) if body.mesh is None else body.mesh]
+        parts += [
+            body.shape.core,
+            body.shape.swelling,
+            body.overhang,
+            np.zeros(0) if body.mesh is None else body.mesh.points,
+        ]
     return key_of("\n".join(words), *parts)
 
 
@@ -219,81 +224,6 @@ def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[st
         message = f"the SRDF file names links that {robot.name!r} has not: {', '.join(map(repr, unknown))}"
         warn(ModelWarning(message, name="srdf", value=tuple(unknown)), stacklevel=3)
     return [pair for pair in pairs if pair <= known]
-
-
-# ------------------------------------------------------------------------------------------- rigid parts of a robot
-
-
-class _Step(NamedTuple):
-    """A moving joint between two rigid parts: its frame in the part above, whose child link is the part below."""
-
-    joint: Joint
-    turn: Array
-    shift: Array
-    above: str
-
-
-@dataclass(frozen=True)
-class _Groups:
-    """Links with no moving joint between them, each named by its link nearest to the root.
-
-    Attributes:
-        of_link: The group of each link.
-        place: Rotation and translation of each link in the frame of its group.
-        step: The joint above each group but the root's.
-    """
-
-    of_link: dict[str, str]
-    place: dict[str, tuple[Array, Array]]
-    step: dict[str, _Step]
-
-    @classmethod
-    def of(cls, robot: Robot) -> _Groups:
-        groups = cls({robot.root: robot.root}, {robot.root: (np.eye(3), np.zeros(3))}, {})
-        for joint in robot.joints:
-            turn, shift = groups.place[joint.parent]
-            turn, shift = turn @ joint.rotation, shift + turn @ joint.translation
-            if joint.moves:
-                groups.of_link[joint.child], groups.place[joint.child] = joint.child, (np.eye(3), np.zeros(3))
-                groups.step[joint.child] = _Step(joint, turn, shift, groups.of_link[joint.parent])
-            else:
-                groups.of_link[joint.child] = groups.of_link[joint.parent]
-                groups.place[joint.child] = turn, shift
-        return groups
-
-    def path(self, one: str, other: str) -> tuple[list[_Step], list[_Step]]:
-        """Joints from one group up to where it meets the other's, and from there down to the other."""
-        up, down = self._above(one), self._above(other)
-        while up and down and up[-1] is down[-1]:
-            up, down = up[:-1], down[:-1]
-        return up, down[::-1]
-
-    def _above(self, group: str) -> list[_Step]:
-        found = []
-        while group in self.step:
-            found.append(self.step[group])
-            group = found[-1].above
-        return found
-
-    def close(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Groups with bodies that a joint connects, or a chain of joints with no body in between."""
-        next_to: dict[str, set[str]] = defaultdict(set)
-        for group, step in self.step.items():
-            next_to[group].add(step.above)
-            next_to[step.above].add(group)
-        found = set()
-        for start in bodied:
-            seen, waiting = {start}, list(next_to[start])
-            while waiting:
-                group = waiting.pop()
-                if group in seen:
-                    continue
-                seen.add(group)
-                if group in bodied:
-                    found.add(frozenset((start, group)))
-                else:
-                    waiting += next_to[group]
-        return found
 
 
 def _postures(robot: Robot, low: Array, high: Array, count: int, rng: np.random.Generator) -> Array:
@@ -333,8 +263,8 @@ class _Between:
     robot: Robot
     one: Shape
     other: Shape
-    up: list[_Step]
-    down: list[_Step]
+    up: list[Step]
+    down: list[Step]
     below: Callable[[Array, Array], Array]
 
     def settled(self, low: Array, high: Array, postures: Array, near: float, overhang: float) -> str | None:
@@ -375,11 +305,12 @@ class _Between:
         """Whether at all joint vectors (k, dof) a corner of one of two hulls lies in the other."""
         assert isinstance(self.one, Mesh)
         assert isinstance(self.other, Mesh)
-        one, other = self.one.hull, self.other.hull
+        one, other = self.one, self.other
         for turn, shift in zip(*self._relative(q), strict=True):
-            there, here = other.vertices @ turn.T + shift, (one.vertices - shift) @ turn
+            there, here = other.core @ turn.T + shift, (one.core - shift) @ turn
             held = [
-                (points @ hull.normals.T <= hull.offsets).all(axis=1) for points, hull in ((there, one), (here, other))
+                ((points - mesh.position) @ mesh.rotation @ mesh.hull.normals.T <= mesh.hull.offsets).all(axis=1)
+                for points, mesh in ((there, one), (here, other))
             ]
             if not any(inside.any() for inside in held):
                 return False
@@ -406,7 +337,7 @@ class _Between:
         back = back.transpose(0, 2, 1)
         return back @ turn, np.einsum("kij,kj->ki", back, shift - away)
 
-    def _chain(self, steps: Sequence[_Step], q: Array) -> tuple[Array, Array]:
+    def _chain(self, steps: Sequence[Step], q: Array) -> tuple[Array, Array]:
         turn, shift = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in steps:
             column, ratio, offset = self.robot.drives[step.joint.name]
@@ -460,38 +391,14 @@ class _Between:
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
         """Of the joints between the bodies, in order, each the shorter of the arms of the two sides."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
-        ahead = self._arms(chain, self.other, low, high)
-        behind = self._arms([(step, not down) for step, down in chain[::-1]], self.one, low, high)[::-1]
+        ahead, _ = arms(self.robot, chain, self.other, low, high)
+        back = [(step, not down) for step, down in chain[::-1]]
+        behind = arms(self.robot, back, self.one, low, high)[0][::-1]
         found = []
         for (step, _), one, other in zip(chain, ahead, behind, strict=True):
             column, ratio, _ = self.robot.drives[step.joint.name]
             found.append(_Lever(column, ratio, 0.0 if step.joint.kind == "prismatic" else max(min(one, other), 1e-300)))
         return found
-
-    def _arms(self, chain: list[tuple[_Step, bool]], end: Shape, low: Array, high: Array) -> list[float]:
-        """How far points of the last body are from each joint's axis at most; joints go down (True) or up the tree."""
-        arms, beyond = [], 0.0  # beyond: how far those points are from the next joint's origin
-        for k in range(len(chain) - 1, -1, -1):
-            step, down = chain[k]
-            # In the rigid part behind the joint, as seen along the chain: a point and the direction of its axis.
-            origin = np.zeros(3) if down else step.shift
-            axis = np.asarray(step.joint.axis) if down else step.turn @ step.joint.axis
-            if k == len(chain) - 1:
-                along = (end.core - origin) @ axis
-                squares = ((end.core - origin) ** 2).sum(axis=1)
-                arms.append(float(np.sqrt(np.maximum(squares - along**2, 0)).max()) + end.swelling)
-                reach = float(np.sqrt(squares).max()) + end.swelling
-            else:
-                following, going_down = chain[k + 1]
-                hop = (following.shift if going_down else np.zeros(3)) - origin
-                arms.append(float(np.linalg.norm(hop - (hop @ axis) * axis)) + beyond)
-                reach = float(np.linalg.norm(hop)) + beyond
-            if step.joint.kind == "prismatic":
-                column, ratio, offset = self.robot.drives[step.joint.name]
-                ends = ratio * np.array([low[column], high[column]]) + offset
-                reach += float(np.abs(ends).max())
-            beyond = reach
-        return arms[::-1]
 
 
 def _turns(axis: Array, angle: Array) -> Array:
@@ -543,12 +450,6 @@ def _bound(one: Shape, other: Shape) -> Callable[[Array, Array], Array]:
         return np.asarray(np.maximum(ahead, behind).max(axis=1) - swelling)
 
     return measured
-
-
-def _hull(body: Body, turn: Array, shift: Array) -> Mesh:
-    """The hull of the mesh that a body covers, in the frame of its rigid part."""
-    assert body.mesh is not None
-    return Mesh(body.mesh @ turn.T + shift)
 
 
 def _directions(shape: Shape) -> tuple[Array, Array]:

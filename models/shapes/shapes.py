@@ -316,6 +316,15 @@ class Mesh:
         counted = vertices if self.faces is None else vertices[np.unique(self.faces)]
         object.__setattr__(self, "hull", convex_hull(counted * scale))
 
+    @classmethod
+    def around(cls, hull: Hull) -> Mesh:
+        """The body of a hull, which is not sought again."""
+        found = object.__new__(cls)
+        parts = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
+        for what, value in {**parts, "file": None, "scale": np.ones(3), "hull": hull}.items():
+            object.__setattr__(found, what, value)
+        return found
+
     def _read(self) -> None:
         if self.vertices is not None or self.faces is not None:
             raise ModelError("mesh: give vertices or a file, not both", name="file", value=self.file)

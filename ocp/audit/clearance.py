@@ -11,29 +11,35 @@ bound does not settle it, the time between is halved. The plan's own polynomials
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 
 from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
-from ocp.problem.hulls import Frames, frames_of, gap_along, grouped, nearest_directions
+from ocp.problem.hulls import Frames, frames_of, grouped
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of
 
-__all__ = ["Clearance", "Nearest", "clearance", "nearest_at"]
+__all__ = ["Clearance", "Nearest", "Track", "clearance", "clearance_along", "nearest_at"]
 
 SETTLED = 0.02
-"""Of the least distance: it is known to so much where that is more than is asked."""
+"""Of what the least distance is more or less than is asked: it is known to so much."""
 SHORT = 1e-6
 """m: a distance is known to so much where less is asked."""
 HALVINGS = 26
 """Of an interval of the mesh."""
 MOST = 400_000
 """Intervals of pairs looked at, beyond which what is left is not proven."""
+BLOCKS = 128
+"""Intervals of the whole time that are looked at first, at most: of finer pieces several together."""
+MOST_TIMES = 512
+"""Of those at which the balls about bodies are looked at first."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +72,34 @@ class Nearest:
         return f"{one} and {other} {'are ' if self.distance >= 0 else ''}{how} at {self.time:.4g} s"
 
 
+class Track(NamedTuple):
+    """How bodies move.
+
+    Attributes:
+        breaks: Where its N pieces begin and end, from 0 to 1, fractions of the horizon. Shape (N + 1,).
+        horizon: s.
+        rates, seconds: Bounds of the sizes of the first and second derivatives in time of what moves the bodies, in
+            every piece. Shape (N, k).
+        smooth: Whether the rates do not jump from piece to piece.
+        frames: Fractions (M,) to the frames there.
+    """
+
+    breaks: np.ndarray
+    horizon: float
+    rates: np.ndarray
+    seconds: np.ndarray
+    smooth: bool
+    frames: Callable[[np.ndarray], Frames]
+
+
 @dataclass(frozen=True)
 class Clearance:
     """What was proven of a separation.
 
     Attributes:
         name: Of the separation.
-        pairs: How near each pair comes, the nearest to what is allowed first.
+        pairs: How near each pair comes, the nearest to what is allowed first, whose bound is close; of those beyond it
+            the bounds say that they are no nearer than that one.
         settled: Whether every pair's least distance was told from what is asked, one way or the other.
         looked: Number of intervals of pairs that were looked at.
     """
@@ -101,9 +128,14 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         form: Of the problem. apart: A separation of it. solution: The plan, its states in the order of the problem.
         p: Parameters. Shape (np,).
     """
-    if not len(apart):
+    return clearance_along(apart, _track_of(form, apart, solution, p)) if len(apart) else clearance_along(apart, None)
+
+
+def clearance_along(apart: Separation, track: Track | None) -> Clearance:
+    """How near each pair of bodies comes along any track, at any time; no track is needed where there are no pairs."""
+    if not len(apart) or track is None:
         return Clearance(apart.name, (), True, 0)
-    return _Search(form, apart, solution, p).run()
+    return _Search(apart, track).run()
 
 
 def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | None:
@@ -115,133 +147,173 @@ def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | N
     form = Formulation.of(problem)
     check_belongs(form, solution)
     solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
-    found = [near for apart in problem.declared.apart.values() for near in _Search(form, apart, solution, p).at(time)]
+    found = []
+    for apart in problem.declared.apart.values():
+        found += _Search(apart, _track_of(form, apart, solution, p)).at(time)
     return min(found, key=lambda near: near.distance, default=None)
 
 
-class _Search:
-    """The halving of intervals of pairs until each is settled."""
+def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:
+    """Of a plan."""
+    columns = [k for name in apart.movers for k in range(*form.states[name].indices(form.nx))]
+    curve, horizon = solution.state_interpolant, solution.horizon
+    outputs, kept = [form.apart[apart.name]], ("placements", apart.name)
 
-    def __init__(self, form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> None:
-        self.form, self.apart, self.solution, self.p = form, apart, solution, p
-        self.breaks = solution.state_interpolant.breaks
-        columns = [k for name in apart.movers for k in range(*form.states[name].indices(form.nx))]
-        rates, seconds = _fastest(solution.state_interpolant, columns, solution.horizon)
-        moves = rates @ apart.levers.T
-        self.speeds = moves + apart.speed
-        bends = seconds @ apart.levers.T + 2 * (rates @ apart.turns.T) * moves
-        self.accelerations = bends + apart.acceleration
+    def frames(at: np.ndarray) -> Frames:
+        controls = np.zeros((len(at), form.nu))
+        return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, kept=kept)[0])
+
+    return Track(curve.breaks, horizon, *_fastest(curve, columns, horizon), False, frames)
+
+
+class _Search:
+    """The halving of intervals of pairs until each is settled.
+
+    At a level l >= 0 an interval is a block of 2^l pieces, below it a share 2^l of one: begin and end are numbers of
+    pieces, index 2^l and (index + 1) 2^l.
+    """
+
+    def __init__(self, apart: Separation, track: Track) -> None:
+        self.apart, self.track = apart, track
+        self.breaks, self.pieces = track.breaks, len(track.breaks) - 1
+        self.top = max(0, int(np.ceil(np.log2(self.pieces / BLOCKS))))
+        self.fastest = [(track.rates, track.seconds)]
+        for level in range(self.top):
+            rates, seconds = (_of_two(values) for values in self.fastest[level])
+            self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
         self.kinds = grouped(tuple(apart.hulls.values()), apart.pairs)
         n = len(apart)
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
-        self.lower, self.ball, self.ball_at = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n)
 
     def run(self) -> Clearance:
-        n, nodes = len(self.apart), len(self.breaks)
-        pair, node = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(nodes), indexing="ij"))
-        self._bounds(pair, np.minimum(node, nodes - 2), self.breaks[node], self.breaks[node])
-        looked, settled = len(pair), True
-        pair, piece = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(nodes - 1), indexing="ij"))
-        begin, end = self.breaks[piece], self.breaks[piece + 1]
-        for halvings in range(HALVINGS + 1):
+        n, level = len(self.apart), self.top
+        self._look_where_balls_are_nearest()
+        blocks = np.arange(-(-self.pieces >> level) if level else self.pieces)
+        pair, block = (part.ravel() for part in np.meshgrid(np.arange(n), blocks, indexing="ij"))
+        lower, looked, settled = self.best.copy(), n, True
+        while True:
             check_time()
             looked += len(pair)
-            bound, far = self._bounds(pair, piece, begin, end)
-            asked, known = self.apart.least, np.maximum(SETTLED * np.abs(self.best - self.apart.least), SHORT)
-            enough = np.where(self.best >= asked, np.maximum(asked, self.best - known), self.best - known)
-            left = (bound < enough[pair]) & ~far
-            last = halvings == HALVINGS or looked + 2 * left.sum() > MOST
+            bound, enough = self._bounds(pair, block, level)
+            left = bound < enough[pair]
+            last = level == -HALVINGS or looked + 2 * left.sum() > MOST
             told = np.ones_like(left) if last else ~left
-            np.minimum.at(self.lower, pair[told], bound[told])
+            np.minimum.at(lower, pair[told], bound[told])
             settled = not left.any()
             if settled or last:
                 break
-            pair, piece, begin, end = (part[left] for part in (pair, piece, begin, end))
-            middle = (begin + end) / 2
-            pair, piece = np.tile(pair, 2), np.tile(piece, 2)
-            begin, end = np.concatenate([begin, middle]), np.concatenate([middle, end])
-        return Clearance(
-            self.apart.name, tuple(sorted(self._found(), key=lambda one: one.least - one.asked)), settled, looked
-        )
+            level -= 1
+            pair, block = np.tile(pair[left], 2), np.concatenate([2 * block[left], 2 * block[left] + 1])
+            if level >= 0:
+                inside = block << level < self.pieces
+                pair, block = pair[inside], block[inside]
+        found = sorted(self._found(np.minimum(lower, self.best)), key=lambda one: one.least - one.asked)
+        return Clearance(self.apart.name, tuple(found), settled, looked)
 
     def at(self, time: float) -> list[Nearest]:
         """Each pair at one time, s."""
-        pair = np.arange(len(self.apart))
-        now = np.full(len(pair), np.clip(time / self.solution.horizon, 0.0, 1.0))
-        self._bounds(pair, np.zeros(len(pair), dtype=int), now, now)
-        return self._found()
+        self._look(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
+        return self._found(self.best)
 
-    def _found(self) -> list[Nearest]:
-        """What was found of each pair."""
-        self._look_at_the_far()
-        rotations, positions = self._frames(self.when)
+    def _found(self, least: np.ndarray) -> list[Nearest]:
+        """What was found of each pair, with lower bounds of the distances."""
+        rotations, positions = self.track.frames(self.when)
         each, seen = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, seen], self.points) + positions[each, seen][:, None]
         return [
             Nearest(
                 bodies,
-                float(min(self.lower[i], self.best[i])),
+                float(least[i]),
                 float(self.best[i]),
-                float(self.when[i] * self.solution.horizon),
+                float(self.when[i] * self.track.horizon),
                 points[i],
                 float(self.apart.least[i]),
             )
             for i, bodies in enumerate(self.apart.labels)
         ]
 
-    def _bounds(
-        self, pair: np.ndarray, piece: np.ndarray, begin: np.ndarray, end: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Lower bounds of the distances of pairs between two times, and whether they are far. Shape (K,) each.
+    def _look_where_balls_are_nearest(self) -> None:
+        """At each pair at the node, or middle of an interval, where the balls about its bodies are nearest."""
+        times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
+        times = times[:: -(-len(times) // MOST_TIMES)]
+        frames = self.track.frames(times)
+        when = np.zeros(len(self.apart))
+        for kind in self.kinds:
+            rows = np.arange(len(kind.radii))
+            row, at = (part.ravel() for part in np.meshgrid(rows, np.arange(len(times)), indexing="ij"))
+            when[kind.has] = times[kind.balls(frames, at, row).reshape(len(rows), -1).argmin(axis=1)]
+        self._look(when)
 
-        Bodies that are farther apart than they are large are far enough to be told by their balls. Of others the least
-        distances found are kept.
+    def _look(self, when: np.ndarray) -> None:
+        """At each pair at one time (n,), a fraction of the horizon."""
+        frames = self.track.frames(when)
+        for kind in self.kinds:
+            pair = np.flatnonzero(kind.has)
+            _, gap, points = kind.nearest(frames, pair, kind.row[pair])
+            self._keep(pair, gap, when[pair], points)
+
+    def _enough(self) -> np.ndarray:
+        """Lower bounds of each pair's distance with which it is settled. Shape (n,), m.
+
+        The least is known to a share of itself of the pair that is nearest to what is asked, or nearer; of others it is
+        known that they are no nearer than that pair.
         """
-        width = (end - begin) * self.solution.horizon
+        spare = self.best - self.apart.least
+        least = max(float(spare.min()), 0.0)
+        missing = self.best - np.maximum(SETTLED * np.abs(spare), SHORT)
+        return np.where(spare >= 0, self.apart.least + max(least - max(SETTLED * least, SHORT), 0.0), missing)
+
+    def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
+        """Lower bounds of the distances of pairs in intervals of a level (K,), and what is enough of each pair's (n,).
+
+        What the balls about two bodies do not settle is looked at in the middle. The least distances found are kept.
+        """
+        begin, end = self._fraction(block, level), self._fraction(block + 1, level)
+        width = (end - begin) * self.track.horizon
         times, where = np.unique(np.concatenate([begin, (begin + end) / 2, end]), return_inverse=True)
         first, middle, last = np.split(where, 3)
-        frames = self._frames(times)
-        sway, bow = self.speeds[piece, pair] * width / 2, self.accelerations[piece, pair] * width**2 / 8
-        bound, is_far = np.full(len(pair), -np.inf), np.zeros(len(pair), dtype=bool)
+        frames = self.track.frames(times)
+        sway, bow = self._moves(pair, block, level, width)
+        bound, enough = np.full(len(pair), -np.inf), self._enough()
         for kind in self.kinds:
             chosen = np.flatnonzero(kind.has[pair])
-            row = kind.row[pair[chosen]]
-            sides = kind.points(frames, middle[chosen], row)
-            centres = [part.mean(axis=1) for part in sides]
-            apart = np.linalg.norm(centres[1] - centres[0], axis=1)
-            sizes = kind.sizes[row]
-            ball = apart - sizes - kind.radii[row]
-            bound[chosen] = np.where(kind.flat[row], -np.inf, ball - sway[chosen])
-            is_far[chosen] = far = bound[chosen] > self.apart.least[pair[chosen]] + sizes + kind.radii[row]
-            nearer = far & (ball < self.ball[pair[chosen]])
-            self.ball[pair[chosen[nearer]]] = ball[nearer]
-            self.ball_at[pair[chosen[nearer]]] = times[middle[chosen[nearer]]]
-            chosen, row, sides = chosen[~far], row[~far], [part[~far] for part in sides]
+            bound[chosen] = kind.balls(frames, middle[chosen], kind.row[pair[chosen]]) - sway[chosen]
+            chosen = chosen[bound[chosen] < enough[pair[chosen]]]
             if not chosen.size:
                 continue
-            along, here, there = nearest_directions(*sides)
-            along = np.where(kind.flat[row, None], kind.normals[row], along)
-            gap = gap_along(along, *sides) - kind.radii[row]
-            chord = np.minimum(
-                *(gap_along(along, *kind.points(frames, at[chosen], row)) - kind.radii[row] for at in (first, last))
-            )
-            bound[chosen] = np.maximum(bound[chosen], np.maximum(chord - bow[chosen], gap - sway[chosen]))
-            self._keep(pair[chosen], gap, times[middle[chosen]], np.stack([here, there], axis=1))
-        return bound, is_far
+            row = kind.row[pair[chosen]]
+            along, gap, points = kind.nearest(frames, middle[chosen], row)
+            self._keep(pair[chosen], gap, times[middle[chosen]], points)
+            bound[chosen] = np.maximum(bound[chosen], gap - sway[chosen])
+            near = (bound[chosen] < enough[pair[chosen]]) & np.isfinite(bow[chosen])
+            chosen, row, along = chosen[near], row[near], along[near]
+            chord = np.minimum(*(kind.gaps(along, frames, at[chosen], row) for at in (first, last)))
+            bound[chosen] = np.maximum(bound[chosen], chord - bow[chosen])
+        return bound, self._enough()
 
-    def _look_at_the_far(self) -> None:
-        """What is never near is looked at once, where its balls are nearest."""
-        pair = np.flatnonzero(np.isinf(self.best))
-        if not pair.size:
-            return
-        frames = self._frames(self.ball_at[pair])
-        for kind in self.kinds:
-            place = np.flatnonzero(kind.has[pair])
-            row = kind.row[pair[place]]
-            sides = kind.points(frames, place, row)
-            along, here, there = nearest_directions(*sides)
-            gap = gap_along(along, *sides) - kind.radii[row]
-            self._keep(pair[place], gap, self.ball_at[pair[place]], np.stack([here, there], axis=1))
+    def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
+        """Fractions of the horizon where the intervals of a level begin, by their numbers (K,)."""
+        if level >= 0:
+            return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
+        piece = place >> -level
+        share = (place - (piece << -level)) * 2.0**level
+        left, right = self.breaks[piece], self.breaks[np.minimum(piece + 1, self.pieces)]
+        return np.asarray(left + share * (right - left))
+
+    def _moves(
+        self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """By how much pairs may come nearer than in the middle of intervals (s wide), and than a chord. (K,), m."""
+        apart = self.apart
+        rates, seconds = self.fastest[max(level, 0)]
+        piece = block >> max(-level, 0)
+        levers = apart.levers[pair]
+        moves = (rates[piece] * levers).sum(axis=1)
+        turns = (rates[piece] * apart.turns[pair]).sum(axis=1)
+        with np.errstate(invalid="ignore"):  # nothing that moves a pair, times no bound
+            bends = np.where(levers > 0, seconds[piece] * levers, 0.0).sum(axis=1)
+        speed, acceleration = moves + apart.speed[pair], bends + 2 * turns * moves + apart.acceleration[pair]
+        return speed * width / 2, acceleration * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
         """Keep what is nearer than what was found before."""
@@ -251,12 +323,11 @@ class _Search:
         i = pair[first]
         self.best[i], self.when[i], self.points[i] = distance[first], at[first], points[first]
 
-    def _frames(self, at: np.ndarray) -> Frames:
-        """At fractions (M,) of the horizon."""
-        form, horizon = self.form, self.solution.horizon
-        states, controls = self.solution.state_interpolant(at), np.zeros((len(at), form.nu))
-        outputs, kept = [form.apart[self.apart.name]], ("placements", self.apart.name)
-        return frames_of(form.sampled(outputs, states, controls, at * horizon, horizon, self.p, kept=kept)[0])
+
+def _of_two(values: np.ndarray) -> np.ndarray:
+    """The larger of each two rows, the last by itself where they are odd. (N, k) to (ceil(N / 2), k)."""
+    even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
+    return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
 def _fastest(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:

@@ -19,14 +19,17 @@ import numpy as np
 from models import ModelError, Surroundings
 from models.arrays import Array
 from ocp.audit.audit import Audit
-from ocp.audit.clearance import Clearance
+from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
 from ocp.local.touching import Touch, hulls_of, touches
+from ocp.problem.formulation import Sampler
+from ocp.problem.hulls import frames_of
 from ocp.problem.problem import Problem, Variable
+from ocp.problem.separation import Separation
 from ocp.problem.values import constant
 from ocp.solution import Solution
 
-__all__ = ["LOOKS", "Clear", "keeping_clear", "touching_error"]
+__all__ = ["LOOKS", "MARGIN", "ROUNDING", "Clear", "clearance_of", "keeping_clear", "touching_error"]
 
 CLEARANCE = "clearance"
 """Name of what the audit proves, and of the constraints, with the suffix of a stretch of time."""
@@ -143,6 +146,44 @@ class Clear:
     def touches(self, base: Array, joints: Array, times: Array) -> list[Touch]:
         """The pairs that come nearer than they may at some samples of a motion, see `ocp.local.touching.touches`."""
         return touches(self.surroundings, base, joints, times)
+
+
+def clearance_of(
+    around: Surroundings,
+    joints: Callable[[Array], Array],
+    breaks: Array,
+    horizon: float,
+    rates: Array,
+    seconds: Array,
+    smooth: bool,
+) -> Clearance:
+    """How near each pair comes at any time of a motion of a machine whose base stands still, and nothing else moves.
+
+    Args:
+        joints: From fractions of the horizon (M,) to joints (M, n).
+        breaks, horizon, rates, seconds, smooth: Of the joints, as of `ocp.audit.clearance.Track`.
+
+    Raises:
+        ModelError: Joints that slide without limits.
+    """
+    machine, levers, n = around.machine, around.levers, len(around.pairs)
+    q = ca.SX.sym("q", machine.joint_size)
+    placements = ca.SX(around.placements(ca.DM(machine.base_home()), q, 0.0))
+    apart = Separation(
+        CLEARANCE,
+        placements,
+        hulls_of(around),
+        around.pairs,
+        np.full(n, around.clearance),
+        movers={"joints": machine.joint_size},
+        levers=levers.joints,
+        turns=levers.joint_turns,
+        speed=np.zeros(n),
+        acceleration=np.zeros(n),
+    )
+    sampler = Sampler([q], [placements])
+    frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))
+    return clearance_along(apart, frames)
 
 
 def _check_limits(around: Surroundings, joints: Variable) -> None:

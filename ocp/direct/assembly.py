@@ -17,6 +17,9 @@ from ocp.problem.values import symbols_of
 
 __all__ = ["Program", "assemble"]
 
+LARGE = 50_000
+"""Instructions: to look for equal ones among more takes longer than a solve with all of them."""
+
 
 @dataclass(frozen=True)
 class Program:
@@ -123,7 +126,6 @@ def derive(block: Block, options: dict[str, Any]) -> Derived:
     gradient = ca.jacobian(cost, v)
     jacobian = ca.jacobian(g, v)
     hessian = ca.triu(ca.hessian(sigma * cost + ca.dot(lam, g), v)[0])
-    opts = {"cse": True, **options}
 
     _, gradient_at = (np.array(part, dtype=int) for part in gradient.sparsity().get_triplet())
     row, column = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
@@ -135,14 +137,20 @@ def derive(block: Block, options: dict[str, Any]) -> Derived:
     doubled = np.where((upper == lower) & np.tile(first != second, where.shape[1]), 2.0, 1.0)
     return Derived(
         block,
-        ca.Function("value", [v, d, p], [cost, g], opts),
-        ca.Function("gradient", [v, d, p], [gradient.nz[:]], opts),
-        ca.Function("jacobian", [v, d, p], [jacobian.nz[:]], opts),
-        ca.Function("hessian", [v, d, p, sigma, lam], [hessian.nz[:]], opts),
+        without_repeats("value", [v, d, p], [cost, g], options),
+        without_repeats("gradient", [v, d, p], [gradient.nz[:]], options),
+        without_repeats("jacobian", [v, d, p], [jacobian.nz[:]], options),
+        without_repeats("hessian", [v, d, p, sigma, lam], [hessian.nz[:]], options),
         where[gradient_at].ravel(order="F"),
         (rows[row].ravel(order="F"), where[column].ravel(order="F")),
         (upper, lower, doubled),
     )
+
+
+def without_repeats(name: str, given: list[Any], outputs: list[Any], options: dict[str, Any]) -> Any:
+    """A casadi Function in which nothing is computed twice, unless it is LARGE."""
+    large = ca.Function(name, given, outputs).n_instructions() > LARGE
+    return ca.Function(name, given, outputs, {"cse": not large, **options})
 
 
 def inputs(block: Block, x: Any) -> list[Any]:

@@ -1,8 +1,9 @@
-"""Files: tool paths from waypoints and from G-code, plans as logs."""
+"""Files: tool paths from waypoints and from G-code, anybody's trajectories, plans as logs."""
 
 from ocp.files.gcode import read_gcode
 from ocp.files.mcap import write_mcap
 from ocp.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Stretch, TimedProgram
+from ocp.files.trajectory import RawTrajectory, read_trajectory
 from ocp.files.waypoints import Waypoints, read_waypoints
 
 __all__ = [
@@ -12,10 +13,12 @@ __all__ = [
     "Program",
     "ProgramMotion",
     "Rapid",
+    "RawTrajectory",
     "Stretch",
     "TimedProgram",
     "Waypoints",
     "read_gcode",
+    "read_trajectory",
     "read_waypoints",
     "write_mcap",
 ]

@@ -18,8 +18,10 @@ MOST_LINES, LONGEST_LINE = 500_000, 10_000
 LONGEST_SHOWN = 120  # characters of a line in a message
 
 
-def read_lines(file: FileName) -> list[str]:
+def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE) -> list[str]:
     """The lines of a text file, of any line ends, without a byte order mark; what is no UTF-8 is read as Latin-1.
+
+    None may have more than `longest` characters.
 
     Raises:
         ProblemError: No file name, a file that cannot be read, an empty one, one or a line that is too long, bytes.
@@ -45,9 +47,9 @@ def read_lines(file: FileName) -> list[str]:
     if len(lines) > MOST_LINES:
         message = f"{path}: {len(lines)} lines, at most {MOST_LINES} are read; split it"
         raise ProblemError(message, name="file", value=len(lines), limit=MOST_LINES)
-    if (longest := max(len(line) for line in lines)) > LONGEST_LINE:
-        i = next(i for i, line in enumerate(lines) if len(line) == longest)
-        raise wrong_line(path, i + 1, lines[i], f"longer than {LONGEST_LINE} characters; break it", LONGEST_LINE)
+    if longest is not None and max(len(line) for line in lines) > longest:
+        i = next(i for i, line in enumerate(lines) if len(line) > longest)
+        raise wrong_line(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)
     if not text.strip():
         raise ProblemError(f"{path}: the file is empty", name="file", value=str(path))
     return lines

@@ -1,4 +1,4 @@
-"""Plans as MCAP, the log format that ROS 2 and Foxglove read and play: joint states over time, and the tip's path.
+"""MCAP, the log format that ROS 2 and Foxglove read and play: joint states over time, and the tip's path.
 
 Messages are those of ROS 2, written as CDR (OMG, DDS-XTypes 1.3, 7.4: little endian, each number aligned to its size,
 lengths before strings and sequences). The package `mcap`, of the extra of that name, writes the file around them.
@@ -17,7 +17,7 @@ from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.planning import Plan
 from ocp.storage import write_whole
 
-__all__ = ["write_mcap"]
+__all__ = ["read_joint_messages", "write_mcap"]
 
 HEADER = "std_msgs/Header header\n"
 BAR = "=" * 80 + "\n"
@@ -134,3 +134,109 @@ def _path(stamps: list[int], poses: Array, frame: str) -> bytes:
         message.header(stamp, frame)
         message.numbers("d", x, y, z, i, j, k, w)
     return bytes(message.data)
+
+
+# ---- reading -----------------------------------------------------------------------------------------------------
+
+
+def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
+    """The joint states, or joint trajectories, of one topic of a log: the topic; stamps, ns, and messages by fields.
+
+    A stamp is that of the message's header, or where that is zero the log's own.
+
+    Args:
+        file: As ROS 2 writes it, in CDR.
+        topic: Its name; None: the only one of these kinds, or `/joint_states`.
+
+    Raises:
+        ProblemError: No such file, no log, no such topic, or the package `mcap` is not installed.
+    """
+    try:
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
+    except ImportError as error:
+        words = "MCAP is read by the package mcap: pip install 'selfmotion[mcap]'"
+        raise ProblemError(words, name="mcap") from error
+    found: dict[str, list[tuple[int, Any]]] = {}
+    try:
+        with open(file, "rb") as stream:
+            for schema, channel, message in make_reader(stream).iter_messages():
+                read = READERS.get(schema.name) if schema is not None else None
+                if read is not None and channel.message_encoding == "cdr":
+                    told = read(_Cursor(message.data))
+                    found.setdefault(channel.topic, []).append((told.pop("stamp") or message.log_time, told))
+    except OSError as error:
+        raise ProblemError(f"{file}: cannot be read: {error}", name="file", value=str(file)) from error
+    except (McapError, struct.error, ValueError, EOFError, UnicodeDecodeError) as error:
+        raise ProblemError(f"{file} is no log that can be read: {error}", name="file", value=str(file)) from error
+    chosen = topic
+    if topic is None and len(found) == 1:
+        chosen = next(iter(found))
+    elif topic is None and "/joint_states" in found:
+        chosen = "/joint_states"
+    if chosen not in found:
+        known = ", ".join(sorted(found)) or "none"
+        words = f"{file}: no topic {topic!r} of joint states or joint trajectories; there are: {known}; tell the topic"
+        raise ProblemError(words, name="topic", value=topic, limit=tuple(found))
+    return chosen, found[chosen]
+
+
+class _Cursor:
+    """A place in a message of CDR."""
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 4 or data[1] not in (0, 1):
+            raise ValueError("a message is no plain CDR")
+        self.order = "<" if data[1] else ">"
+        self.data, self.place = memoryview(data)[4:], 0
+
+    def numbers(self, kind: str, count: int = 1) -> tuple[Any, ...]:
+        size = struct.calcsize(kind)
+        self.place += -self.place % size
+        if count < 0 or self.place + count * size > len(self.data):
+            raise ValueError("a message ends too early")
+        values = struct.unpack_from(f"{self.order}{count}{kind}", self.data, self.place)
+        self.place += count * size
+        return values
+
+    def text(self) -> str:
+        (count,) = self.numbers("I")
+        return bytes(self.numbers("B", count)).rstrip(b"\0").decode()
+
+    def texts(self) -> list[str]:
+        (count,) = self.numbers("I")
+        if count > len(self.data):
+            raise ValueError("a message ends too early")
+        return [self.text() for _ in range(count)]
+
+    def sequence(self) -> list[float]:
+        (count,) = self.numbers("I")
+        return list(self.numbers("d", count)) if count else []
+
+    def stamp(self) -> int:
+        (seconds,), (nanoseconds,) = self.numbers("i"), self.numbers("I")
+        self.text()
+        return int(seconds * 10**9 + nanoseconds)
+
+
+def _read_state(cursor: _Cursor) -> dict[str, Any]:
+    told: dict[str, Any] = {"stamp": cursor.stamp(), "name": cursor.texts()}
+    for word in ("position", "velocity", "effort"):
+        told[word] = cursor.sequence()
+    return told
+
+
+def _read_trajectory(cursor: _Cursor) -> dict[str, Any]:
+    told: dict[str, Any] = {"stamp": cursor.stamp(), "joint_names": cursor.texts(), "points": []}
+    (count,) = cursor.numbers("I")
+    for _ in range(count):
+        point: dict[str, Any] = {
+            word: cursor.sequence() for word in ("positions", "velocities", "accelerations", "effort")
+        }
+        (seconds,), (nanoseconds,) = cursor.numbers("i"), cursor.numbers("I")
+        point["time_from_start"] = {"sec": seconds, "nanosec": nanoseconds}
+        told["points"].append(point)
+    return told
+
+
+READERS = {"sensor_msgs/msg/JointState": _read_state, "trajectory_msgs/msg/JointTrajectory": _read_trajectory}

@@ -44,6 +44,11 @@ class Followed:
     misfit: Array
     lost_at: Array
 
+    def of(self, rows: Any) -> Followed:
+        """Some of the motions."""
+        kept = (self.base, self.joints, self.rates, self.cost, self.misfit, self.lost_at)
+        return Followed(self.t, *(part[rows] for part in kept))
+
 
 def follow(
     equations: TaskEquations,

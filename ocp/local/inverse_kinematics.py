@@ -17,7 +17,8 @@ from models import Machine, Surroundings
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
-from ocp.local.touching import checked_surroundings, touches
+from ocp.local.sliding import slid
+from ocp.local.touching import Touch, checked_surroundings, touches
 from ocp.tasks.checks import checked_configuration
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
@@ -35,6 +36,8 @@ REACH_TIMES = 9
 """Instants of the horizon at which a task's poses are looked for, the start among them."""
 REACH_TOLERANCE = 1e-4
 """A pose missed by less, m or rad, is not called out of reach."""
+SLID = 8
+"""Postures that touch least, slid along their self-motions where all of them touch."""
 SIMPSON_STEPS = 400
 """Over which a velocity is summed up to a position."""
 
@@ -106,7 +109,7 @@ def inverse_kinematics(
         apart: Least distance between two solutions, in the greatest joint, angles modulo full turns.
         iterations: Of each start, at most.
         surroundings: Of the machine; postures in which its bodies come nearer to each other or to obstacles than the
-            clearance are left out.
+            clearance are left out. Where that leaves none, those that touch least are slid along their self-motions.
 
     Returns:
         The solutions, at least one, by falling quality.
@@ -136,31 +139,58 @@ def inverse_kinematics(
     place = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = _starts(machine, lower, upper, int(starts), near, seed)
+    first = starts_of(machine, lower, upper, int(starts), near, seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
-    q, misfit = _gauss_newton(_residual(equations, place, targets), first, lower, upper, tolerance, int(iterations))
+    q, misfit = gauss_newton(_residual(equations, place, targets), first, lower, upper, tolerance, int(iterations))
     turns = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
     wrap = turns & ~np.isfinite(lower) & ~np.isfinite(upper)
     random = slice(len(first) - int(starts), None)  # what is near a given start stays there
     q[random, wrap] = np.remainder(q[random, wrap] + np.pi, 2 * np.pi) - np.pi
     good = misfit <= tolerance
     if not good.any():
-        raise _unreachable(machine, equations, q[int(misfit.argmin())], float(misfit.min()), lower, upper)
+        raise unreachable(machine, equations, q[int(misfit.argmin())], float(misfit.min()), lower, upper)
     jacobian = _jacobian(equations, place)
-    found: list[Posture] = []
-    for joints, off in zip(q[good], misfit[good], strict=True):
-        values = np.linalg.svd(np.array(jacobian(joints)), compute_uv=False)
-        with np.errstate(invalid="ignore"):
-            share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
-        margin = float(np.min(share[np.isfinite(upper - lower) & (upper > lower)], initial=1.0))
-        found.append(Posture(joints, float(values.prod()) * max(margin, 0.0), float(off)))
-    found.sort(key=lambda posture: -posture.quality)
-    distinct = _distinct(found, turns, apart)
-    return distinct if surroundings is None else _clear(distinct, surroundings, place, float(time))
+
+    def rated(joints: Array, misfits: Array) -> list[Posture]:
+        """Those that do the task, the best first, each once."""
+        found = []
+        for each, off in zip(joints[misfits <= tolerance], misfits[misfits <= tolerance], strict=True):
+            values = np.linalg.svd(np.array(jacobian(each)), compute_uv=False)
+            with np.errstate(invalid="ignore"):
+                share = np.minimum(each - lower, upper - each) / ((upper - lower) / 2)
+            margin = float(np.min(share[np.isfinite(upper - lower) & (upper > lower)], initial=1.0))
+            found.append(Posture(each, float(values.prod()) * max(margin, 0.0), float(off)))
+        return _distinct(sorted(found, key=lambda posture: -posture.quality), turns, apart)
+
+    distinct = rated(q, misfit)
+    if surroundings is None:
+        return distinct
+    nearest = _touching(distinct, surroundings, place, float(time))
+    if all(nearest) and equations.size < size:
+        solved = _residual(equations, place, targets)
+
+        def back(joints: Array) -> tuple[Array, Array]:
+            return gauss_newton(solved, joints, lower, upper, tolerance, int(iterations))
+
+        order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
+        least = np.array([distinct[k].joints for k in order[:SLID]])
+        moved = slid(
+            surroundings,
+            place,
+            least,
+            float(time),
+            jacobian=lambda joints: np.array(jacobian(joints)),
+            back=lambda joints: back(joints)[0],
+            lower=lower,
+            upper=upper,
+        )
+        distinct += rated(*back(moved))
+        nearest = _touching(distinct, surroundings, place, float(time))
+    return _clear(distinct, nearest, surroundings, float(time))
 
 
 def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: float, limits: bool, near: Any) -> None:
@@ -183,7 +213,7 @@ def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: f
     if machine.base_size:
         return
     for time in np.linspace(0.0, horizon, REACH_TIMES)[1:]:
-        poses = [pose for task in tasks if (pose := _as_pose(machine, task, start, float(time))) is not None]
+        poses = [pose for task in tasks if (pose := as_pose(machine, task, start, float(time))) is not None]
         if not poses:
             return
         try:
@@ -192,8 +222,13 @@ def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: f
             raise Unreachable(f"at {time:.4g} s {error}", **{**vars(error), "time": float(time)}) from error
 
 
-def _as_pose(machine: Machine, task: TipTask, start: Array, time: float) -> TipTask | None:
-    """The pose that a task has come to at a time; None where that depends on the way, or has a gap to close."""
+def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
+    """The pose that a task has come to at a time; None where that depends on the way, or has a gap to close.
+
+    Args:
+        start, base: Joints and base at the start.
+        time: s, from when the task begins.
+    """
     if task.is_pose:
         return task if task.start_gap <= REACH_TOLERANCE else None
     rows = [row for row in task.chosen if row not in ANGULAR]
@@ -207,11 +242,11 @@ def _as_pose(machine: Machine, task: TipTask, start: Array, time: float) -> TipT
     moved = np.zeros(3)
     wanted = values[[task.chosen.index(row) for row in rows]]
     moved[[row - 3 for row in rows]] = wanted @ weights * time / SIMPSON_STEPS / 3
-    first, _ = pose_in_reference(equations.bound[0], ca.DM(0, 1), ca.DM(start))
+    first, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(first)).ravel() + moved)
 
 
-def _starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
     size, rng = machine.joint_size, np.random.default_rng(seed)
     slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
     span = np.where(slides, SLIDE_SPREAD, np.pi)
@@ -242,7 +277,7 @@ def _jacobian(equations: TaskEquations, base: Array) -> Any:
     return ca.Function("jacobian", [q], [equations.jacobian(ca.SX(ca.DM(base)), q)], {"cse": True})
 
 
-def _gauss_newton(
+def gauss_newton(
     function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int
 ) -> tuple[Array, Array]:
     """Joints (K, n) and greatest misfits (K,) that the starts lead to."""
@@ -292,16 +327,18 @@ def _distinct(found: list[Posture], turns: Array, apart: float) -> list[Posture]
     return kept
 
 
-def _clear(found: list[Posture], surroundings: Surroundings, base: Array, time: float) -> list[Posture]:
+def _touching(found: list[Posture], surroundings: Surroundings, base: Array, time: float) -> list[Touch | None]:
+    """Of each posture the pair that is nearest, where it comes nearer than the clearance."""
+    touching = [touches(surroundings, base[None], posture.joints[None], np.array([time])) for posture in found]
+    return [each[0] if each else None for each in touching]
+
+
+def _clear(found: list[Posture], nearest: list[Touch | None], surroundings: Surroundings, time: float) -> list[Posture]:
     """The postures in which nothing comes nearer than the clearance.
 
     Raises:
         Unreachable: There are none.
     """
-    nearest = []
-    for posture in found:
-        touching = touches(surroundings, base[None], posture.joints[None], np.array([time]))
-        nearest.append(touching[0] if touching else None)
     clear = [posture for posture, touch in zip(found, nearest, strict=True) if touch is None]
     if clear:
         return clear
@@ -319,7 +356,7 @@ def _clear(found: list[Posture], surroundings: Surroundings, base: Array, time: 
     )
 
 
-def _unreachable(
+def unreachable(
     machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
 ) -> Unreachable:
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]

@@ -14,7 +14,7 @@ from models import Machine, Surroundings
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_instance
 from ocp.problem.formulation import Sampler
-from ocp.problem.hulls import Hull, HullPairs, frames_of, gap_along, grouped, nearest_directions
+from ocp.problem.hulls import Hull, HullPairs, frames_of, grouped
 
 __all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
 
@@ -45,14 +45,17 @@ def hulls_of(surroundings: Surroundings) -> dict[str, Hull]:
     }
 
 
-def distances_along(surroundings: Surroundings, base: Array, joints: Array, times: Array) -> Array:
+def distances_along(
+    surroundings: Surroundings, base: Array, joints: Array, times: Array, near: float = np.inf
+) -> Array:
     """Distances of all pairs at samples of a motion; where they overlap, about how deep. Shape (M, n), m.
 
     Args:
         surroundings: Of the machine that moves.
         base: Its base, shape (M, base_size) or (base_size,). joints: Shape (M, joint_size). times: s. Shape (M,).
+        near: Of pairs that are no nearer than this, m, some number is told that is no less, and no more than they are.
     """
-    return _measured(surroundings, base, joints, times, np.inf)
+    return _measured(surroundings, base, joints, times, near)
 
 
 def touches(surroundings: Surroundings, base: Array, joints: Array, times: Array) -> list[Touch]:
@@ -84,14 +87,10 @@ def _measured(surroundings: Surroundings, base: Array, joints: Array, times: Arr
     for lot in lots:
         chosen = np.flatnonzero(lot.has[pair])
         row = lot.row[pair[chosen]]
-        sides = lot.points(frames, sample[chosen], row)
-        middles = [side.mean(axis=1) for side in sides]
-        ball = np.linalg.norm(middles[1] - middles[0], axis=1) - lot.sizes[row] - lot.radii[row]
-        far = ~lot.flat[row] & (ball >= near)
-        apart[sample[chosen[far]], pair[chosen[far]]] = ball[far]
-        chosen, row, sides = chosen[~far], row[~far], [side[~far] for side in sides]
-        along = np.where(lot.flat[row, None], lot.normals[row], nearest_directions(*sides)[0])
-        apart[sample[chosen], pair[chosen]] = gap_along(along, *sides) - lot.radii[row]
+        ball = lot.balls(frames, sample[chosen], row)
+        apart[sample[chosen], pair[chosen]] = ball
+        chosen, row = chosen[~(ball >= near)], row[~(ball >= near)]
+        apart[sample[chosen], pair[chosen]] = lot.nearest(frames, sample[chosen], row)[1]
     return np.where(np.isfinite(apart), apart, -np.inf)
 
 

@@ -1,6 +1,8 @@
 """The front door: a machine and its tasks in, the cheapest motion out that passes its audit."""
 
+from ocp.planning.dead_end import DeadEnd
 from ocp.planning.motion import Candidate, Plan, PlanSample
 from ocp.planning.planner import plan
+from ocp.planning.waypoints import WaypointPlan, plan_waypoints
 
-__all__ = ["Candidate", "Plan", "PlanSample", "plan"]
+__all__ = ["Candidate", "DeadEnd", "Plan", "PlanSample", "WaypointPlan", "plan", "plan_waypoints"]

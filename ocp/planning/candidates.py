@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from typing import Any
@@ -22,16 +23,13 @@ from ocp.local.touching import Touch
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
 from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, misfits_of
-from ocp.refinement import refine
+from ocp.refinement import refine, split
 from ocp.solution import Solution
 
 __all__ = ["TOUCHES", "Maker", "coarse_motions", "fine_motions"]
 
-COARSE, FINE, FINE_APART = 2, 7, 4
-"""Degrees of collocation: smooth pieces are met to rounding by one interval of the high one. A motion along which
-bodies are held apart is less smooth where they come to it and leave it."""
-APART = 24
-"""Intervals of such a motion, where its pieces are fewer."""
+COARSE, FINE = 2, 7
+"""Degrees of collocation: smooth pieces are met to rounding by one interval of the high one."""
 NEAR_ENOUGH = 1e-6
 """m and rad: of a posture that is looked at."""
 FAILURES = 8
@@ -42,12 +40,24 @@ NOTHING = 1e-12
 """(rad/s)^2 or (m/s)^2: rates of rounding, of what stands still."""
 TIP = 1e-6
 """m and rad: how far a tip may be from its task anywhere, all rows together."""
+LOOKED_AT = 33
+"""Places at which motions are compared."""
 PLACES = 16
 """Of each interval, at which it is looked for."""
-MESHES = 4
-"""One cut where the tips stray from the one before."""
+APART = 24
+"""Intervals of a coarse mesh on which bodies are held apart, where its pieces are fewer."""
+MESHES, PIECES = 6, 4
+"""Meshes, each cut where the tips stray from the one before, into so many pieces of an interval at most."""
+BRIEF = 2
+"""Meshes, where other motions wait to be tried."""
+NEARER = 0.9
+"""Of how far tips strayed that are out of reach, for all that is known: on a finer mesh they have to stray less."""
 RESERVES = 3
 """Motions like one that does not hold that are tried in its place."""
+MOST = 400
+"""Intervals of a mesh."""
+EVERY = 8
+"""Motions that are audited, the cheapest first, where all are asked for: an audit of a large machine takes seconds."""
 FAR = 10.0
 """A local motion so many times as dear as the cheapest plan is not worth a solve."""
 SOLVER = {"max_iter": 150}
@@ -56,6 +66,7 @@ ROUGH = {"max_iter": 60, "tol": 1e-4, "mu_init": 1e-3}
 
 TOUCHES = "touches"
 """How the reason begins why a motion is not the plan whose bodies come too near."""
+DEARER = "dearer"
 ALIKE = "the same as another one, or of the same cost"
 
 
@@ -72,16 +83,20 @@ def _failing(audit: Audit) -> list[Finding]:
     return [finding for finding in audit.failures if finding.name not in audit.clearances]
 
 
-def coarse_motions(maker: Maker, followed: list[Followed], postures: Array) -> list[Candidate]:
+def coarse_motions(
+    maker: Maker, followed: list[Followed], postures: Array, fine: bool = False, others: Sequence[Candidate] = ()
+) -> list[Candidate]:
     """The motions that the postures lead to on a coarse mesh, the cheapest first; of those of one cost the first.
+
+    Or on the `fine` one; with `others` that were found on it.
 
     The start being free, postures of one family lead to one motion. Those that the tasks cannot be followed from are
     tried where they can be followed from none.
     """
-    motion, _, prepared = maker.made(maker.asked.clear, fine=False)
+    motion, _, prepared = maker.made(maker.asked.clear, fine)
     misfits, costs = np.array(misfits_of(followed)), np.sum([part.cost for part in followed], axis=0)
     follows = misfits <= max(OUT_OF_REACH, misfits.min())
-    found: list[Candidate] = []
+    found = list(others)
     least = np.inf
     for number in np.lexsort((costs, ~follows)).tolist():
         joints = postures[number]
@@ -91,7 +106,9 @@ def coarse_motions(maker: Maker, followed: list[Followed], postures: Array) -> l
         if costs[number] > FAR * least:
             found.append(Candidate(joints, float(costs[number]), "far dearer by its local motion"))
             continue
-        solution = prepared.solve(guess=motion.guess(followed, number), check=False)
+        guess = motion.guess(followed, number)
+        maker.guesses[tuple(joints)] = number, guess
+        solution = prepared.solve(guess=guess, check=False)
         if solution.success:
             least = min(least, solution.cost)
             found.append(Candidate(joints, solution.cost, "", solution))
@@ -103,18 +120,22 @@ def coarse_motions(maker: Maker, followed: list[Followed], postures: Array) -> l
 
 def _once(motion: ToolMotion, found: list[Candidate]) -> list[Candidate]:
     """The same by rising cost; of those of one cost, or that are one motion, all but the first say so."""
-    places = np.linspace(0.0, 1.0, 33)
     kept: list[tuple[float, Array]] = []
     for number, one in enumerate(found):
         if one.why or one.solution is None:
             continue
-        sample = one.solution.at_fraction(places)
-        path = np.hstack([sample[f"joints{stretch.suffix}"] for stretch in motion.stretches])
+        path = _path(motion, one.solution)
         if any(abs(one.cost - cost) <= SAME * cost or _near(path, other) for cost, other in kept):
             found[number] = replace(one, why=ALIKE)
         else:
             kept.append((one.cost, path))
     return found
+
+
+def _path(motion: ToolMotion, solution: Solution) -> Array:
+    """Joints at LOOKED_AT places of a motion. Shape (LOOKED_AT, n)."""
+    sample = solution.at_fraction(np.linspace(0.0, 1.0, LOOKED_AT))
+    return np.hstack([sample[f"joints{stretch.suffix}"] for stretch in motion.stretches])
 
 
 def _near(path: Array, other: Array) -> bool:
@@ -124,21 +145,26 @@ def _near(path: Array, other: Array) -> bool:
     return bool(np.abs(apart - turns).max() <= NEAR)
 
 
-def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Candidate]:
+def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool = False) -> list[Candidate]:
     """What becomes on the fine mesh of the motions found on a coarse one; of the `first` that passes, or of all.
 
+    With `every` of a number of those, too, that are dearer than one that passes; of those that become one, one is told.
+
     Of one that touches something, the bodies that touch are held apart on the coarse mesh first: that may cost more
-    than another motion does.
+    than another motion does. Where none is left, postures that lead to one motion without obstacles are told apart:
+    held apart, from their own local motions, they may pass on other sides.
     """
     told = [one for one in coarse if one.why and one.why != ALIKE]
     alike = [one for one in coarse if one.why == ALIKE]
     least, beyond = np.inf, 0.0  # cost of the best, and how much the coarse mesh was wrong, as a share of it
     queue = [(one, maker.asked.clear) for one in coarse if not one.why]
-    failures, barred = 0, ""
+    failures, audited, barred = 0, 0, ""
     while queue:
         candidate, clear = queue.pop(0)
-        touching = maker.touches(candidate.solution)
-        if candidate.cost > least * (1 + beyond) or (first and np.isfinite(least)):
+        held = () if clear is None else clear.margins
+        touching = [touch for touch in maker.touches(candidate.solution) if touch.pair not in held]
+        every = every and audited < EVERY and candidate.cost <= FAR * least
+        if (candidate.cost > least * (1 + beyond) and not every) or (first and np.isfinite(least)):
             why = f"{TOUCHES}: {touching[0]}" if touching else "dearer on a coarse mesh"
             told.append(replace(candidate, why=why, solution=None))
             continue
@@ -147,7 +173,7 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Can
                 why = f"{TOUCHES}: {touching[0]}{barred and f'; {barred}'}"
                 told.append(replace(candidate, why=why, solution=None))
                 continue
-            bent, clear = maker.bent(candidate, clear, touching)
+            bent, clear = maker.bent(candidate, clear, touching, candidate.solution)
             failures += bool(bent.why)
             if bent.why:
                 told.append(bent)
@@ -158,14 +184,41 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool) -> list[Can
         # where the first one of its cost does not hold, another one may
         others = (one for one in alike if one.cost >= candidate.cost and not maker.touches(one.solution))
         for one in chain((candidate,), islice(others, RESERVES)):
-            solved = maker.solved(one.start, one.solution, clear=clear)
+            solved = maker.solved(one.start, one.solution, clear=clear, most=np.inf if every else least)
+            audited += 1
+            if every and any(not own.why and abs(own.cost - solved.cost) <= SAME * own.cost for own in told):
+                break
             told.append(solved)
+            if solved.why == DEARER:
+                break
             if not solved.why:
-                beyond = max(beyond, 2 * abs(solved.cost - one.cost) / max(solved.cost, np.finfo(float).tiny))
+                assert one.solution is not None
+                assert solved.solution is not None
+                # what became another motion says nothing of the mesh
+                if _near(_path(maker.motion, one.solution), _path(maker.motion, solved.solution)):
+                    beyond = max(beyond, 2 * abs(solved.cost - one.cost) / max(solved.cost, np.finfo(float).tiny))
                 least = min(least, solved.cost)
                 break
+    if failures and not np.isfinite(least):
+        told += _other_sides(maker, alike)
     named = {tuple(one.start) for one in told}
     return told + [replace(one, solution=None) for one in alike if tuple(one.start) not in named]
+
+
+def _other_sides(maker: Maker, alike: list[Candidate]) -> list[Candidate]:
+    """What becomes of postures that lead to motions known to touch, each from its own local motion; ends with one."""
+    told: list[Candidate] = []
+    clear = maker.asked.clear
+    assert clear is not None
+    for one in sorted(alike, key=lambda one: maker.guesses[tuple(one.start)][0]):
+        if len(told) == FAILURES:
+            break
+        if touching := maker.touches(one.solution):
+            bent, held = maker.bent(one, clear, touching, maker.guesses[tuple(one.start)][1])
+            told.append(bent if bent.why else maker.solved(one.start, bent.solution, clear=held))
+            if not told[-1].why:
+                break
+    return told
 
 
 class Maker:
@@ -174,6 +227,8 @@ class Maker:
     def __init__(self, asked: Asked, start: Array, reference: Array) -> None:
         self.asked, self.start, self.reference = asked, start, reference
         self.free = bool(np.isnan(start).any())
+        self.guesses: dict[tuple[float, ...], tuple[int, Any]] = {}  # by postures: their places, the local motions
+        self.brief = False  # whether what finer meshes do not bring to its way is given up, for there are others
         self._barred: dict[float, str] = {}
         self._made: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
         self.motion = self.declared(start, asked.clear)
@@ -200,7 +255,7 @@ class Maker:
         held = () if clear is None else tuple(sorted(clear.margins.items()))
         if (held, fine) not in self._made:
             motion = self.declared(self.start, clear) if held else self.motion
-            mesh = _mesh(motion, (FINE_APART if held else FINE) if fine else COARSE, APART if held else LEAST_INTERVALS)
+            mesh = _mesh(motion, FINE if fine else COARSE, APART if held and not fine else LEAST_INTERVALS)
             prepared = mesh.prepare(motion.problem, options=SOLVER if fine else ROUGH)
             self._made[held, fine] = motion, mesh, prepared
         return self._made[held, fine]
@@ -239,53 +294,58 @@ class Maker:
                     self._barred[time] = f"at {time:.4g} s {error}"
         return self._barred[time]
 
-    def bent(self, candidate: Candidate, clear: Clear, touching: list[Touch]) -> tuple[Candidate, Clear]:
+    def bent(self, candidate: Candidate, clear: Clear, touching: list[Touch], guess: Any) -> tuple[Candidate, Clear]:
         """A motion on the coarse mesh with what touches held apart, one pair after the other, or why there is none."""
-        solution = candidate.solution
         for _ in range(LOOKS):
             clear = clear.holding([touch.pair for touch in touching])
-            solution = self.made(clear, fine=False)[2].solve(guess=solution, check=False)
+            solution = self.made(clear, fine=False)[2].solve(guess=guess, check=False)
             if not solution.success:
                 why = f"{TOUCHES}: {touching[0]}; held apart, no motion was found"
                 return replace(candidate, why=why, solution=None), clear
             again = [touch for touch in self.touches(solution) if touch.pair not in clear.margins]
             if not again:
-                return replace(candidate, cost=solution.cost, solution=solution), clear
-            touching = again
+                return replace(candidate, cost=solution.cost, why="", solution=solution), clear
+            touching, guess = again, solution
         return replace(candidate, why=f"{TOUCHES}: {touching[0]}", solution=None), clear
 
-    def solved(self, start: Array, guess: Any, thorough: bool = False, clear: Clear | None = None) -> Candidate:
+    def solved(
+        self, start: Array, guess: Any, thorough: bool = False, clear: Clear | None = None, most: float = np.inf
+    ) -> Candidate:
         """A motion from a guess, and what is wrong with it; with `thorough` from other starts, too, and why if none.
 
-        Bodies that come too near are held apart, farther each time, and it is solved again.
+        Bodies that come too near are held apart, farther each time, and it is solved again. What does not cost less
+        than `most` is not looked at any further.
         """
-        clear = clear or self.asked.clear
-        touch = ""
+        touch, apart = "", clear or self.asked.clear
         for _ in range(LOOKS):
-            candidate, audit = self._solved(start, guess, thorough, clear)
-            proofs = [] if audit is None else [proof for proof in audit.clearances.values() if proof.pairs]
-            missed = [proof.worst for proof in proofs if proof.worst is not None and proof.worst.missed > 0]
-            if clear is None or audit is None or candidate.solution is None or not missed:
+            candidate, farther = self._solved(start, guess, thorough, apart, most)
+            if farther is None:
                 break
-            worst = max(missed, key=lambda near: near.missed)
-            touch = f"{TOUCHES}: {worst}"
-            clear, guess = clear.widened(proofs), candidate.solution
-            candidate = replace(candidate, why=touch)
+            touch, apart, guess = candidate.why, farther, candidate.solution
         if touch and candidate.why and not candidate.why.startswith(touch):
             candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}")
         return candidate
 
-    def _solved(self, start: Array, guess: Any, thorough: bool, clear: Clear | None) -> tuple[Candidate, Audit | None]:
-        """As `solved`, what touches left as it is, and the audit.
+    def _solved(
+        self, start: Array, guess: Any, thorough: bool, clear: Clear | None, most: float
+    ) -> tuple[Candidate, Clear | None]:
+        """As `solved`, what touches left as it is; then how it is to be held apart, else None.
 
         Where many starts do equally well, no one of them is decided to be the best; then the motion is judged from the
         start that was found.
         """
         motion, mesh, prepared = self.made(clear, fine=True)
         try:
-            solution = prepared.solve(guess=guess, check=thorough)
+            named = clear is not None and bool(clear.margins)  # then what is in the way is named already
+            solution = prepared.solve(guess=guess, check=thorough and not named)
             if not solution.success:
                 return Candidate(start, np.nan, f"no motion was found: {solution.status.split(':')[0]}"), None
+            if solution.cost >= most * (1 - SAME):
+                return Candidate(start, solution.cost, DEARER), None
+            touching = [touch for touch in self.touches(solution) if clear and touch.pair not in clear.margins]
+            if clear is not None and touching:
+                apart = clear.holding([touch.pair for touch in touching])
+                return Candidate(start, solution.cost, f"{TOUCHES}: {touching[0]}", solution), apart
             solution, audit = self._audited(motion, mesh, solution)
             if self.free and audit.feasible and audit.optimal is None:
                 first = solution[f"joints{motion.stretches[0].suffix}"][0]
@@ -298,32 +358,48 @@ class Maker:
                 raise
             self.why = error
             return Candidate(start, np.nan, str(error).split("\n")[0], error.solution), None
+        missed = [near for proof in audit.clearances.values() for near in proof.pairs if near.missed > 0]
+        if clear is not None and missed:
+            why = f"{TOUCHES}: {max(missed, key=lambda near: near.missed)}"
+            return Candidate(start, solution.cost, why, solution), clear.widened(list(audit.clearances.values()))
         if audit.passed:
-            return Candidate(start, solution.cost, "", solution), audit
+            return Candidate(start, solution.cost, "", solution), None
         worst = audit.failures[0] if audit.failures else None
         why = f"not decided: {audit.undecided}" if worst is None else f"the audit fails, {worst.name} {worst.value:.2g}"
-        return Candidate(start, solution.cost, why, solution), audit
+        return Candidate(start, solution.cost, why, solution), None
 
     def _audited(self, motion: ToolMotion, mesh: Collocation, solution: Solution) -> tuple[Solution, Audit]:
-        """A motion, refined where its audit or the way of its tips asks for it, and its audit."""
+        """A motion, on a finer mesh where the way of its tips or its audit asks for it, and its audit."""
+        solution = self._on_its_way(motion, mesh, solution)
+        if self.brief and (stray := self._strays(motion, solution).max()) > OUT_OF_REACH:
+            words = f"the tips stray by {stray:.2g} (m or rad) on finer meshes, too"
+            raise SolveError(words, solution, name="task", value=float(stray), limit=TIP)
         audit: Audit = solution.audit()
-        for _ in range(MESHES):
-            if _failing(audit):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", RefinementWarning)
-                    solution = refine(motion.problem, _mesh_of(mesh, solution), guess=solution, options=SOLVER)
-                audit = solution.audit()
-                if _failing(audit):
-                    break
-            strays = self._strays(motion, solution)
+        if _failing(audit):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RefinementWarning)
+                solution = refine(motion.problem, _mesh_of(mesh, solution), guess=solution, options=SOLVER)
+            audit = solution.audit()
+            if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution)) is not solution:
+                solution, audit = finer, finer.audit()
+        return solution, audit
+
+    def _on_its_way(self, motion: ToolMotion, mesh: Collocation, solution: Solution) -> Solution:
+        """A motion, on a finer mesh where its tips stray, as long as that may lead them back."""
+        strays = self._strays(motion, solution)
+        for _ in range(BRIEF if self.brief else MESHES):
             if strays.max() <= TIP:
                 break
-            nodes = solution.state_interpolant.breaks
-            cut = np.flatnonzero(strays > TIP / len(strays))
-            nodes = np.union1d(nodes, (nodes[cut] + nodes[cut + 1]) / 2)
-            solution = solve(motion.problem, mesh.with_mesh(nodes), guess=solution, options=SOLVER)
-            audit = solution.audit()
-        return solution, audit
+            # where something binds or lets go it is smooth to the second order
+            finer = np.ceil(np.sqrt(strays / TIP)).clip(2, PIECES).astype(int)
+            pieces = np.where(strays > TIP / len(strays), finer, 1)
+            cut = split(solution.state_interpolant.breaks, pieces, strays, MOST)
+            found = solve(motion.problem, mesh.with_mesh(cut), guess=solution, options=SOLVER)
+            before, strays = strays.max(), self._strays(motion, found)
+            if strays.max() > max(OUT_OF_REACH, NEARER * before):
+                break
+            solution = found
+        return solution
 
     def _strays(self, motion: ToolMotion, solution: Solution) -> Array:
         """How far the tips are from their poses in each interval of the mesh, m and rad. Shape (N,)."""
@@ -357,7 +433,7 @@ class Maker:
         if not passing:
             raise failed(told, self.why)
         best = min(passing, key=lambda one: one.cost)
-        ended = [one if one is best or one.why else replace(one, why="dearer") for one in told]
+        ended = [one if one is best or one.why else replace(one, why=DEARER) for one in told]
         ended.sort(key=lambda one: (one is not best, np.inf if np.isnan(one.cost) else one.cost))
         assert best.solution is not None
         parts = parts_of(self.motion.stretches)

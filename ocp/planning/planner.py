@@ -21,6 +21,7 @@ from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.errors import (
     ProblemError,
+    SolveError,
     checked_choice,
     checked_count,
     checked_each,
@@ -28,22 +29,31 @@ from ocp.errors import (
     checked_instance,
     checked_positive,
 )
+from ocp.local.following import Followed
 from ocp.local.inverse_kinematics import LARGEST_SEED
 from ocp.planning.candidates import TOUCHES, Maker, coarse_motions, fine_motions
+from ocp.planning.cells import CellSearch, follows
+from ocp.planning.dead_end import DeadEnd
 from ocp.planning.motion import Candidate, Plan
 from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled, touches_at_the_start
 from ocp.planning.standing import plan_to_stand
+from ocp.planning.task_search import TaskSearch
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Search", "plan"]
+__all__ = ["SearchKind", "plan"]
 
-Search: TypeAlias = Literal["start", "postures"]
+SearchKind: TypeAlias = Literal["start", "postures", "global"]
 
+ROUNDED = 1e-9
+"""Share of its cost by which a plan may be cheaper than a bound of all."""
 TRIED = 8
 """Postures that are taken one after the other, the best conditioned first, before all of them are compared."""
+
+AT_ONCE = 4
+"""Ways through cells that are solved before the best of them is audited, where one that passes is enough."""
 
 
 @interruptible
@@ -57,7 +67,7 @@ def plan(
     cyclic: bool = False,
     weights: Any = None,
     limits: Limits | None = None,
-    search: Search = "postures",
+    search: SearchKind = "postures",
     seed: int = 0,
     time_cost: float = 1.0,
     obstacles: Any = (),
@@ -81,7 +91,10 @@ def plan(
         limits: Of the joints' positions and rates; the robot's own if None.
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
-            self-motion.
+            self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
+            that none falls below, for poses that leave at most two directions free, see `ocp.planning.search`; on a
+            floating one of all that a search over exact states finds, without a bound, see `ocp.planning.cells`, which
+            also goes on where local motions come to a singularity.
         seed: Of inverse kinematics.
         obstacles: Shapes in world, or `Moving` ones, that the machine's bodies stay clear of.
         clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
@@ -96,7 +109,8 @@ def plan(
     Raises:
         ProblemError: What is asked does not fit the machine, or cannot be asked at once; Unreachable, which is one,
             names the time and the place that is out of reach.
-        SolveError: No motion passes its audit; says what became of each posture.
+        SolveError: No motion passes its audit; says what became of each posture. DeadEnd, which is one: the search over
+            all motions says from where on none goes on, what stops it, and how far the tasks would have to give way.
     """
     if isinstance(machine, Standing):
         return plan_to_stand(
@@ -123,17 +137,84 @@ def plan(
         given, postures = settled(asked, postures)
     maker = Maker(asked, given, postures[0])
     told: list[Candidate] = []
-    if search == "start" or len(postures) == 1:
+    floats = machine.base_size > 0
+    if search == "start" or (search == "postures" and len(postures) == 1):
         for joints in postures[:TRIED]:
-            guess = maker.motion.guess(followed_from(asked, joints[None]), 0)
-            told.append(maker.solved(joints, guess, thorough=len(postures) == 1))
-            if not told[-1].why or len(postures) == 1:
+            followed = followed_from(asked, joints[None])
+            if floats and not follows(asked, followed)[0]:
+                continue  # what such a guess leads to takes long, and fails
+            alone = len(postures) == 1 and not floats
+            told.append(maker.solved(joints, maker.motion.guess(followed, 0), thorough=alone))
+            if not told[-1].why or alone:
                 return maker.plan(told)
     followed = followed_from(asked, postures)
+    if floats and (search == "global" or len(postures) == 1):
+        return maker.plan(told + _through_cells(maker, followed, postures, every=search == "global"))
+    searched = TaskSearch(asked, followed) if search == "global" else None
+    if searched is not None:
+        if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
+            raise end
+        found = searched.followed()
+        told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
+        if any(not one.why for one in told):
+            return _bounded(maker.plan(told), searched.bound)
+        while searched.looked_closer():
+            if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
+                raise end
     told += fine_motions(maker, coarse_motions(maker, followed, postures), first=search == "start")
     if all(one.why and not one.why.startswith(TOUCHES) for one in told):  # whatever helps a solver, and what conflicts
+        if floats:
+            return maker.plan(told + _through_cells(maker, followed, postures, every=False))
         told.append(maker.solved(postures[0], maker.motion.guess(followed, 0), thorough=True))
-    return maker.plan(told)
+    try:
+        made = maker.plan(told)
+    except SolveError as error:
+        if searched is not None and (end := searched.dead_end()) is not None:
+            raise end from error
+        raise
+    return made if searched is None else _bounded(made, searched.bound)
+
+
+def _through_cells(maker: Maker, followed: list[Followed], postures: Array, every: bool) -> list[Candidate]:
+    """The motions of a floating machine that a search over exact states leads to, with those that local ones do.
+
+    Raises:
+        Unreachable, DeadEnd: As of `CellSearch`, where no local motion leads on either.
+    """
+    sound = np.flatnonzero(follows(maker.asked, followed))
+    local, found = list[Candidate](), list[list[Followed]]()
+    stuck: DeadEnd | None = None
+    try:
+        found = CellSearch(maker.asked, postures).followed()
+    except DeadEnd as error:
+        stuck = error
+    if sound.size and (every or stuck):
+        local = coarse_motions(maker, [part.of(sound) for part in followed], postures[sound], fine=every)
+    if stuck:
+        if all(one.why for one in local):
+            raise stuck
+        return fine_motions(maker, local, first=False, every=every)
+    if every:
+        least = [float(np.sum([part.cost for part in ways], axis=0).min()) for ways in found]
+        for ways, cost in zip(found, least, strict=True):
+            if ways is found[0] or cost < least[0]:
+                local = coarse_motions(maker, ways, ways[0].joints[:, 0], True, local)
+        return fine_motions(maker, local, first=False, every=True)
+    told = list[Candidate]()
+    for brief in (True, False):
+        maker.brief = brief
+        for ways in found:
+            for begin in range(0, len(ways[0].cost), AT_ONCE):
+                some = [part.of(slice(begin, begin + AT_ONCE)) for part in ways]
+                told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
+                if any(not one.why for one in told):
+                    return told
+    return told
+
+
+def _bounded(made: Plan, bound: float) -> Plan:
+    """A plan with a bound of the cost of any motion; without, where the plan itself shows that it is none."""
+    return replace(made, bound=bound) if bound <= made.cost * (1 + ROUNDED) else made
 
 
 def clear_of(
@@ -182,7 +263,7 @@ def _checked(
     seed: Any,
     time_cost: Any,
 ) -> Asked:
-    checked_choice("search", search, get_args(Search))
+    checked_choice("search", search, get_args(SearchKind))
     checked_flag("cyclic", cyclic)
     checked_count("seed", seed, 0, LARGEST_SEED)
     given = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
@@ -191,6 +272,9 @@ def _checked(
     free = isinstance(horizon, str)
     if free:
         checked_choice("horizon", horizon, ("free",))
+        if search == "global":
+            words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
+            raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
     for what in ("acceleration", "jerk", "torque"):
         if getattr(told, what) is not None:

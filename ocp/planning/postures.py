@@ -21,7 +21,7 @@ from ocp.tasks.equations import bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Asked", "followed_from", "misfits_of", "postures_at_the_start", "settled", "touches_at_the_start"]
+__all__ = ["Asked", "followed_from", "misfits_of", "placed", "postures_at_the_start", "settled", "touches_at_the_start"]
 
 LEAST_INTERVALS = 8
 """Of a motion, where its pieces are fewer."""
@@ -77,7 +77,7 @@ def postures_at_the_start(asked: Asked) -> Array:
     try:
         found = inverse_kinematics(asked.machine, first, **options)
     except Unreachable as error:
-        raise _placed(asked, error, 0.0) from error
+        raise placed(asked, error, 0.0) from error
     joints = np.array([posture.joints for posture in found])
     touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
     return joints[np.argsort(touching, kind="stable")]
@@ -161,7 +161,7 @@ def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
     except Unreachable as error:
         if asked.machine.base_size:  # which may come nearer
             return joints
-        raise _placed(asked, error, stretch.begin) from error
+        raise placed(asked, error, stretch.begin) from error
     ways = np.array([posture.joints for posture in found])
     far = (asked.weights * (joints[:, None] - ways) ** 2).sum(axis=2)
     return np.asarray(ways[far.argmin(axis=1)])
@@ -208,10 +208,10 @@ def _check_reach(asked: Asked, followed: list[Followed]) -> None:
                     asked.machine, poses, time=time, near=near, limits=asked.limits.joints, tolerance=OUT_OF_REACH
                 )
             except Unreachable as error:
-                raise _placed(asked, error, time) from error
+                raise placed(asked, error, time) from error
 
 
-def _placed(asked: Asked, error: Unreachable, time: float) -> Unreachable:
+def placed(asked: Asked, error: Unreachable, time: float) -> Unreachable:
     """The same with its time and the places that are asked for there."""
     places = []
     for number, task in enumerate(asked.tasks):

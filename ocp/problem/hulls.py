@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +23,11 @@ CLOSE = 1e-12
 """Relative: the distance is found when the gap along its direction is no less by more."""
 FLAT = 1e-14
 """Of the squares of the edges: a triangle or tetrahedron of less content is none."""
-EDGES = tuple(combinations(range(4), 2))
-FACES = tuple(combinations(range(4), 3))
+FIRSTS, SECONDS = np.array([0, 0, 1]), np.array([1, 2, 2])
+"""Of three edges the pairs."""
+NEXT, LAST = [1, 2, 0], [2, 0, 1]
+SIGNS = np.array([-1.0, 1.0, -1.0])
+"""With the normals of pairs (1, 2), (0, 2), (0, 1): of a place among three edges (Cramer)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """The pairs whose bodies have so many points each.
+    """The pairs whose bodies have about so many points each.
 
     Attributes:
         has: Whether a pair is of this kind. row: Its place among them. Shape (n,) each.
@@ -84,14 +86,17 @@ class HullPairs:
         flat: Whether one is a half-space. Shape (K,). normals: Then, from the first to the other. Shape (K, 3).
     """
 
-    def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, members: list[int]) -> None:
+    def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, members: list[int], counts: tuple[int, int]) -> None:
         chosen = [[hulls[k] for k in pair[:2]] for pair in pairs[members]]
         self.has = np.zeros(len(pairs), dtype=bool)
         self.has[members] = True
         self.row = np.cumsum(self.has) - 1
-        self.cores = [np.array([pair[side].core for pair in chosen]) for side in (0, 1)]
-        self.riding = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
-        self.seen = pairs[members, 2]
+        self._cores = [
+            np.array([_filled(pair[side].core, count) for pair in chosen]) for side, count in enumerate(counts)
+        ]
+        self._middles = [np.array([pair[side].core.mean(axis=0) for pair in chosen]) for side in (0, 1)]
+        self._riding = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
+        self._seen = pairs[members, 2]
         self.radii = np.array([one.radius + other.radius for one, other in chosen])
         self.sizes = np.array([_size(one) + _size(other) for one, other in chosen])
         self.flat = np.array([bool(one.normal.size or other.normal.size) for one, other in chosen])
@@ -100,21 +105,58 @@ class HullPairs:
     def points(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> list[np.ndarray]:
         """Points of both bodies, from where they are seen. Shapes (K, m, 3), (K, l, 3)."""
         rotations, positions = frames
-        turn, origin = rotations[at, self.seen[row]], positions[at, self.seen[row]]
+        turn, origin = rotations[at, self._seen[row]], positions[at, self._seen[row]]
         found = []
-        for core, riding in zip(self.cores, self.riding, strict=True):
-            shift = positions[at, riding[row]] - origin
-            world = np.einsum("kij,kmj->kmi", rotations[at, riding[row]], core[row]) + shift[:, None]
-            found.append(np.einsum("kji,kmj->kmi", turn, world))
+        for core, riding in zip(self._cores, self._riding, strict=True):
+            relative = np.swapaxes(rotations[at, riding[row]], 1, 2) @ turn
+            shift = (positions[at, riding[row]] - origin)[:, None] @ turn
+            found.append(core[row] @ relative + shift)
         return found
+
+    def balls(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """How far balls about the middles of both bodies, which hold them, are apart. Shape (K,), m."""
+        rotations, positions = frames
+        one, other = (
+            (rotations[at, riding[row]] @ middle[row][:, :, None])[:, :, 0] + positions[at, riding[row]]
+            for middle, riding in zip(self._middles, self._riding, strict=True)
+        )
+        way = other - one
+        apart = np.where(self.flat[row], (way * self.normals[row]).sum(axis=1), np.linalg.norm(way, axis=1))
+        return np.asarray(apart - self.sizes[row] - self.radii[row])
+
+    def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where both bodies are nearest, seen from where they are.
+
+        Returns:
+            Unit vectors from the first to the other (K, 3), how far they are apart along these (K,), m, and the nearest
+            points of what the radii swell (K, 2, 3), m.
+        """
+        sides = self.points(frames, at, row)
+        along, here, there = nearest_directions(*sides)
+        along = np.where(self.flat[row, None], self.normals[row], along)
+        return along, gap_along(along, *sides) - self.radii[row], np.stack([here, there], axis=1)
+
+    def gaps(self, along: np.ndarray, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """How far both bodies are apart along unit vectors (K, 3). Shape (K,), m."""
+        return np.asarray(gap_along(along, *self.points(frames, at, row)) - self.radii[row])
 
 
 def grouped(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
     """Pairs of hulls and the frame that they are seen from, (n, 3), -1 for the world, by their numbers of points."""
-    sizes: dict[tuple[int, ...], list[int]] = {}
-    for i, pair in enumerate(pairs):
-        sizes.setdefault(tuple(len(hulls[k].core) for k in pair[:2]), []).append(i)
-    return [HullPairs(hulls, pairs, members) for members in sizes.values()]
+    kinds: dict[tuple[int, int], list[int]] = {}
+    for i, (one, other, _) in enumerate(pairs):
+        kinds.setdefault((_places(hulls[one]), _places(hulls[other])), []).append(i)
+    return [HullPairs(hulls, pairs, members, counts) for counts, members in kinds.items()]
+
+
+def _places(hull: Hull) -> int:
+    """For so many points there is room where hulls of about as many are looked at together."""
+    return 1 << max(1, (len(hull.core) - 1).bit_length())
+
+
+def _filled(core: np.ndarray, count: int) -> np.ndarray:
+    """Points, the last of them again and again until they are so many."""
+    return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 
 
 def frames_of(placements: np.ndarray) -> Frames:
@@ -137,8 +179,8 @@ def _normal(one: Hull, other: Hull) -> np.ndarray:
 
 def gap_along(direction: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """How far hulls of points (K, m, 3) and (K, l, 3) are apart along unit vectors (K, 3) from one to other. (K,)."""
-    near = np.einsum("kx,klx->kl", direction, other).min(axis=1)
-    return np.asarray(near - np.einsum("kx,kmx->km", direction, one).max(axis=1))
+    column = direction[:, :, None]
+    return np.asarray((other @ column).min(axis=(1, 2)) - (one @ column).max(axis=(1, 2)))
 
 
 def nearest_directions(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,40 +194,8 @@ def nearest_directions(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, 
         that overlap, as far as the search can tell, the vector is that along which they overlap least of the axes
         that were tried, and the points are one inside both.
     """
-    count = len(one)
-    here, there = one[:, 0].astype(float), other[:, 0].astype(float)
-    active = np.arange(count)
-    a = np.repeat(one[:, :1], 4, axis=1)
-    b = np.repeat(other[:, :1], 4, axis=1)
-    towards = b[:, 0] - a[:, 0]
-    for _ in range(STEPS):
-        if not active.size:
-            break
-        rows = np.arange(active.size)
-        p, q = one[active], other[active]
-        far = p[rows, np.einsum("kx,kmx->km", towards, p).argmax(axis=1)]
-        near = q[rows, np.einsum("kx,klx->kl", towards, q).argmin(axis=1)]
-        square = np.einsum("kx,kx->k", towards, towards)
-        ended = (square - np.einsum("kx,kx->k", towards, near - far) <= CLOSE * square) | (square == 0)
-        if ended.any():
-            keep = ~ended
-            active, p, q, far, near, a, b, towards = (part[keep] for part in (active, p, q, far, near, a, b, towards))
-            if not active.size:
-                break
-        # the place of a point without weight, which there is in every simplex but a full one, takes the new one
-        a[:, 3], b[:, 3] = far, near
-        weights = _weights(b - a)
-        order = np.argsort(-weights, axis=1, kind="stable")
-        weights = np.take_along_axis(weights, order, axis=1)
-        a, b = (np.take_along_axis(part, order[:, :, None], axis=1) for part in (a, b))
-        unused = weights <= 0
-        a, b = (np.where(unused[:, :, None], part[:, :1], part) for part in (a, b))
-        new = np.einsum("kj,kjx->kx", weights, b - a)
-        nearer = np.einsum("kx,kx->k", new, new) < np.einsum("kx,kx->k", towards, towards)
-        here[active], there[active] = (np.einsum("kj,kjx->kx", weights, part) for part in (a, b))
-        keep = nearer & (weights[:, 3] == 0)
-        active, a, b, towards = (part[keep] for part in (active, a, b, new))
-    found = there - here
+    lines = one.shape[1] == other.shape[1] == 2
+    here, there, found = _between_segments(one, other) if lines else _between_hulls(one, other)
     long = np.linalg.norm(found, axis=1)
     size = np.abs(one).max(initial=0.0) + np.abs(other).max(initial=0.0)
     apart = long > CLOSE * size
@@ -195,46 +205,100 @@ def nearest_directions(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, 
     return direction, here, there
 
 
-def _weights(w: np.ndarray) -> np.ndarray:
-    """Of four points (K, 4, 3), which may coincide, the weights whose mean is nearest to the origin. Shape (K, 4)."""
-    count = len(w)
-    rows = np.arange(count)
-    square = np.einsum("kjx,kjx->kj", w, w)
-    best = square.argmin(axis=1)
-    least, weights = square[rows, best], np.zeros((count, 4))
-    weights[rows, best] = 1.0
+def _between_segments(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest points of segments (K, 2, 3), and the way from the first to the other (K, 3) each.
 
-    def offer(columns: tuple[int, ...], shares: np.ndarray, valid: np.ndarray) -> None:
-        point = np.einsum("kj,kjx->kx", shares, w[:, columns])
-        length = np.einsum("kx,kx->k", point, point)
-        better = valid & (length < least)
-        least[better] = length[better]
-        weights[better] = 0.0
-        weights[np.ix_(better, columns)] = shares[better]
+    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
+    """
+    u, v, w = one[:, 1] - one[:, 0], other[:, 1] - other[:, 0], one[:, 0] - other[:, 0]
+    a, e, b = (u * u).sum(axis=1), (v * v).sum(axis=1), (u * v).sum(axis=1)
+    c, f = (u * w).sum(axis=1), (v * w).sum(axis=1)
+    short, single = np.where(a > 0, a, 1.0), np.where(e > 0, e, 1.0)
+    across = a * e - b * b
+    sound = across > FLAT * a * e
+    s = np.where(sound, np.clip((b * f - c * e) / np.where(sound, across, 1.0), 0.0, 1.0), 0.0)
+    t = np.where(e > 0, np.clip((b * s + f) / single, 0.0, 1.0), 0.0)
+    s = np.where(a > 0, np.clip((b * t - c) / short, 0.0, 1.0), 0.0)
+    here, there = one[:, 0] + s[:, None] * u, other[:, 0] + t[:, None] * v
+    return here, there, there - here
 
-    for i, j in EDGES:
-        edge = w[:, j] - w[:, i]
-        size = np.einsum("kx,kx->k", edge, edge)
-        s = -np.einsum("kx,kx->k", w[:, i], edge) / np.where(size > 0, size, 1.0)
-        offer((i, j), np.stack([1 - s, s], axis=1), (size > 0) & (s > 0) & (s < 1))
-    for i, j, k in FACES:
-        u, v = w[:, j] - w[:, i], w[:, k] - w[:, i]
-        normal = np.cross(u, v)
-        size = np.einsum("kx,kx->k", normal, normal)
-        sound = size > FLAT * np.einsum("kx,kx->k", u, u) * np.einsum("kx,kx->k", v, v)
-        size = np.where(sound, size, 1.0)
-        s = np.einsum("kx,kx->k", np.cross(v, w[:, i]), normal) / size
-        t = np.einsum("kx,kx->k", np.cross(w[:, i], u), normal) / size
-        offer((i, j, k), np.stack([1 - s - t, s, t], axis=1), sound & (s > 0) & (t > 0) & (s + t < 1))
-    edges = w[:, 1:] - w[:, :1]
-    content = np.linalg.det(edges)
-    sound = content**2 > FLAT * np.einsum("kjx,kjx->kj", edges, edges).prod(axis=1)
-    if sound.any():
-        solved = np.zeros((count, 3))
-        solved[sound] = np.linalg.solve(np.swapaxes(edges[sound], 1, 2), -w[sound, 0][:, :, None])[:, :, 0]
-        shares = np.concatenate([1 - solved.sum(axis=1, keepdims=True), solved], axis=1)
-        offer((0, 1, 2, 3), shares, sound & (shares > 0).all(axis=1))
-    return weights
+
+def _between_hulls(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `_between_segments` of hulls of points (K, m, 3), (K, l, 3), by the algorithm of Gilbert, Johnson, Keerthi."""
+    here, there = one[:, 0].astype(float), other[:, 0].astype(float)
+    active = np.arange(len(one))
+    a, b = np.repeat(here[:, None], 4, axis=1), np.repeat(there[:, None], 4, axis=1)
+    found = there - here
+    towards = found.copy()
+    for _ in range(STEPS):
+        if not active.size:
+            break
+        rows = np.arange(active.size)
+        p, q = one[active], other[active]
+        far = p[rows, (p @ towards[:, :, None])[:, :, 0].argmax(axis=1)]
+        near = q[rows, (q @ towards[:, :, None])[:, :, 0].argmin(axis=1)]
+        square = (towards * towards).sum(axis=1)
+        left = (square - (towards * (near - far)).sum(axis=1) > CLOSE * square) & (square > 0)
+        if not left.all():
+            active, a, b, towards, square = (part[left] for part in (active, a, b, towards, square))
+            far, near = far[left], near[left]
+            if not active.size:
+                break
+        # the place of a point without weight, which there is in every simplex but a full one, takes the new one
+        a[:, 3], b[:, 3] = far, near
+        weights, new = _weights(b - a)
+        order = np.argsort(-weights, axis=1, kind="stable")[:, :, None]
+        weights = np.take_along_axis(weights[:, :, None], order, axis=1)
+        a, b = np.take_along_axis(a, order, axis=1), np.take_along_axis(b, order, axis=1)
+        nearer = (new * new).sum(axis=1) < square
+        chosen = active[nearer]
+        here[chosen], there[chosen] = ((weights * part)[nearer].sum(axis=1) for part in (a, b))
+        found[chosen] = new[nearer]
+        a, b = (np.where(weights > 0, part, part[:, :1]) for part in (a, b))
+        keep = nearer & (weights[:, 3, 0] == 0)
+        active, a, b, towards = (part[keep] for part in (active, a, b, new))
+    return here, there, found
+
+
+def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of four points, which may coincide, the weights whose mean is nearest to the origin, and that mean.
+
+    Shape (K, 4, 3) to (K, 4) and (K, 3). Only simplices with the last point, which was added, are looked at.
+    """
+    last = w[:, 3]
+    edges = w[:, :3] - last[:, None]
+    squares = (edges * edges).sum(axis=2)
+    shares, valid = np.zeros((len(w), 8, 4)), np.ones((len(w), 8), dtype=bool)
+    each = np.arange(3)
+    along = -(edges @ last[:, :, None])[:, :, 0] / np.where(squares > 0, squares, 1.0)
+    shares[:, 1 + each, each], valid[:, 1:4] = along, (along > 0) & (along < 1)
+    u, v = edges[:, FIRSTS], edges[:, SECONDS]
+    normals = _cross(u, v)
+    sizes = (normals * normals).sum(axis=2)
+    sound = sizes > FLAT * squares[:, FIRSTS] * squares[:, SECONDS]
+    sizes = np.where(sound, sizes, 1.0)
+    across = _cross(normals, last[:, None])  # (v x last) normal = v (last x normal)
+    s, t = -(v * across).sum(axis=2) / sizes, (u * across).sum(axis=2) / sizes
+    shares[:, 4 + each, FIRSTS], shares[:, 4 + each, SECONDS] = s, t
+    valid[:, 4:7] = sound & (s > 0) & (t > 0) & (s + t < 1)
+    content = (edges[:, 0] * normals[:, 2]).sum(axis=1)
+    full = content**2 > FLAT * squares.prod(axis=1)
+    inside = (normals @ last[:, :, None])[:, ::-1, 0] * SIGNS / np.where(full, content, 1.0)[:, None]
+    shares[:, 7, :3], valid[:, 7] = inside, full & (inside > 0).all(axis=1) & (inside.sum(axis=1) < 1)
+    shares[:, :, 3] = 1 - shares[:, :, :3].sum(axis=2)
+    means = shares @ w
+    # however near they are, the way to an edge is across it, and that to a triangle its normal
+    astray = (means[:, 1:4] * edges).sum(axis=2) / np.where(squares > 0, squares, 1.0)
+    means[:, 1:4] -= astray[:, :, None] * edges
+    means[:, 4:7] = normals * ((normals * last[:, None]).sum(axis=2) / sizes)[:, :, None]
+    lengths = np.where(valid, (means * means).sum(axis=2), np.inf)
+    rows, least = np.arange(len(w)), lengths.argmin(axis=1)
+    return shares[rows, least], means[rows, least]
+
+
+def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Of vectors, their entries last; with less ado than numpy's own."""
+    return np.asarray(one[..., NEXT] * other[..., LAST] - one[..., LAST] * other[..., NEXT])
 
 
 def _least_overlap(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -242,17 +306,13 @@ def _least_overlap(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
     The line of the middles, and the normals of edges of both and of their pairs, edges being those from a first point.
     """
-    found = []
-    for p, q in zip(one, other, strict=True):
-        edges = [*(p[1:4] - p[0]), *(q[1:4] - q[0])]
-        tried = [
-            q.mean(axis=0) - p.mean(axis=0),
-            *edges,
-            *(np.cross(u, v) for u, v in combinations(edges, 2)),
-            *np.eye(3),
-        ]
-        units = np.array([v / n for v in tried if (n := np.linalg.norm(v)) > 0])
-        units = np.concatenate([units, -units])
-        gaps = (q @ units.T).min(axis=0) - (p @ units.T).max(axis=0)
-        found.append(units[gaps.argmax()])
-    return np.array(found)
+    edges = np.concatenate([one[:, 1:4] - one[:, :1], other[:, 1:4] - other[:, :1]], axis=1)
+    i, j = np.triu_indices(edges.shape[1], 1)
+    middles = (other.mean(axis=1) - one.mean(axis=1))[:, None]
+    axes = np.broadcast_to(np.eye(3), (len(one), 3, 3))
+    tried = np.concatenate([middles, edges, _cross(edges[:, i], edges[:, j]), axes], axis=1)
+    lengths = np.linalg.norm(tried, axis=2, keepdims=True)
+    units = np.where(lengths > 0, tried / np.where(lengths > 0, lengths, 1.0), axes[:, :1])
+    units = np.concatenate([units, -units], axis=1)
+    there, here = units @ np.swapaxes(other, 1, 2), units @ np.swapaxes(one, 1, 2)
+    return np.asarray(units[np.arange(len(one)), (there.min(axis=2) - here.max(axis=2)).argmax(axis=1)])

@@ -41,6 +41,10 @@ OF_RAMP = 1 / 20
 """...or over the time in which the top speed is reached, if that is more."""
 OF_TURN = 0.25
 """...but no more of that time than this: the speed must not change much in an interval."""
+LEAST_OF_BUILD_UP = 0.05
+"""...nor less than this share of the build-up: where jerks are low, no motion gets near the limits of acceleration."""
+PARTS = 32
+"""Most intervals that one which resolves the limits is cut into: where speeds are low, ramps are short beside it."""
 GROWTH = 1.2
 """Ratio of neighbouring distances from rest."""
 FIRST = 0.3
@@ -262,10 +266,11 @@ def _in_time(cells: _Cells, length: float) -> Array:
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(most / sharp, np.sqrt(top / sharp))
     duration = np.minimum(np.maximum(OF_BUILD_UP * build_up, OF_RAMP * ramp), OF_TURN * ramp)
+    duration = np.maximum(duration, LEAST_OF_BUILD_UP * build_up)
     speed = np.sqrt(np.maximum(np.maximum(up[:-1], up[1:]), 0.0))
     longest = np.minimum(speed * duration, length)
     # what is a whole number but for rounding is one: the unit of length must not change the nodes
-    parts = np.maximum(np.ceil(np.diff(s) / longest * (1 - ROUNDING)), 1).astype(np.intp)
+    parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING)), 1, PARTS).astype(np.intp)
     nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _count(parts), length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):

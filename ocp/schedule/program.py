@@ -15,15 +15,21 @@ programs and the way to the solution of each are one.
 x is a spline of degree 2 with a knot at every node: x'' is constant in an interval. Its B-spline coefficients are the
 unknowns; a row touches three of them and the normal equations have five diagonals, so a step costs time and memory in
 proportion to the nodes.
+
+Motions at places far from one another hardly depend on one another. So a step is not of one length, that which its
+worst row allows, but of as many as there are intervals, which change slowly along the path; the number of steps then
+hardly grows with the nodes. Where such steps lead away from the bounds, all places make the shortest from there on.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from ocp.errors import SolveError
 from ocp.schedule.profile import Array
@@ -37,8 +43,16 @@ DIVERGED = 1e12
 """Complementarity over the time that tells that no motion keeps the rows."""
 TO_BOUNDARY = 0.995
 """Share of the way to the nearest bound that a step takes at most."""
-INFEASIBLE = 1e-6
-"""What a row may miss its bound by, relative, when a solution is accepted."""
+LOST = 0.7
+"""Share of a coefficient that a step takes at most: a motion that all but stands still somewhere may be a trap."""
+ALIKE = 10
+"""Intervals on either side over which the lengths of steps are made alike."""
+LONG_ENOUGH = 256
+"""Rows that are worth an addition of their own."""
+ASTRAY, NO_MATTER = 2.0, 1e-2
+"""Ratio by which the worst miss may grow in a step, and what it may grow to, relative to the bound, in any case."""
+INFEASIBLE, MORE_SO = 1e-6, 10.0
+"""What a row may miss its bound by, relative, when a solution is accepted; or so many times the accuracy."""
 UNEVEN = 1e-3
 """Sum of the slopes that prices leave, by the logarithm of the coefficients, over the time, when it is accepted."""
 
@@ -95,17 +109,17 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """(x, x', x'') at places as linear functions of the three coefficients of their interval. Shape (M, 3, 3)."""
-        h, inside = self.h[interval], fraction * self.h[interval]
-        first, last, share = 2 / self.width[interval], 2 / self.width[interval + 1], self.share[interval]
-        out = np.zeros((len(h), 3, 3))
-        slope = np.zeros((len(h), 3))
-        slope[:, 0], slope[:, 1] = -first, first
-        out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = first / h, -(first + last) / h, last / h
-        out[:, 1] = slope + inside[:, None] * out[:, 2]
-        out[:, 0, 0], out[:, 0, 1] = 1 - share, share
-        out[:, 0] += inside[:, None] * (slope + out[:, 1]) / 2
-        return out
+        """(x, x', x'') at places as linear functions of the three coefficients of their interval. Shape (3, 3, M)."""
+        h, share = self.h[interval], self.share[interval]
+        inside = fraction * h
+        first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
+        bend = np.array([first / h, -(first + last) / h, last / h])
+        before = np.array([-first, first, 0 * h])
+        slope = before + inside * bend
+        here = inside / 2 * (before + slope)
+        here[0] += 1 - share
+        here[1] += share
+        return np.array([here, slope, bend])
 
 
 class _Ends:
@@ -182,25 +196,156 @@ class _Steps:
         return self.memory[2].copy()
 
 
-class _Group:
-    """Rows in the order of their intervals: what they are of coefficients, and sums over those of each interval."""
+class _ByInterval:
+    """Sums and least values over the rows of each interval.
+
+    Rows of one rank, the first ones of all intervals, the second ones and so on, stand together, in order of the
+    intervals that have most: few additions of long parts. Ranks with few rows are left to one reduction.
+    """
 
     def __init__(self, interval: NDArray[np.intp], count: int) -> None:
-        self.interval = interval
-        self.first = np.flatnonzero(np.diff(interval, prepend=-1))
-        self.each = np.diff(np.append(self.first, len(interval)))
-        some = interval[self.first]
-        self.present = slice(None) if len(some) == count else some
+        each = np.bincount(interval, minlength=count)
+        by_count = np.argsort(-each, kind="stable")
+        self.count, self.place = count, np.argsort(by_count, kind="stable")
+        sizes = np.cumsum(np.bincount(each)[::-1])[::-1][1:]  # of each rank
+        self.sizes = sizes[sizes >= LONG_ENOUGH].tolist()
+        order = np.argsort(interval, kind="stable")
+        inside = interval[order]
+        rank = np.arange(len(order)) - (np.cumsum(each) - each)[inside]
+        seat = self.place[inside]
+        ranked = np.where(
+            rank < len(self.sizes), rank * count + seat, len(self.sizes) * count + seat * len(order) + rank
+        )
+        self.order = order[np.argsort(ranked, kind="stable")]
+        rest = self.place[interval[self.order[sum(self.sizes) :]]]
+        self.first = np.flatnonzero(np.diff(rest, prepend=-1))
+        self.seats = rest[self.first]
 
-    def of(self, weights: Array, b: Array) -> Array:
-        """Weights (3, M) times the three coefficients of each row. Shape (M,)."""
-        near = np.repeat(np.stack([b[:-2], b[1:-1], b[2:]])[:, self.present], self.each, axis=1)
+    def reduced(self, of: np.ufunc, values: Array, none: float) -> Array:
+        """Of values in `order`, by interval. Shape (..., M) to (..., N)."""
+        out, begin = np.full((*values.shape[:-1], self.count), none), 0
+        for size in self.sizes:
+            part = out[..., :size]
+            of(part, values[..., begin : begin + size], out=part)
+            begin += size
+        if self.seats.size:
+            rest = of.reduceat(values[..., begin:], self.first, axis=-1)
+            out[..., self.seats] = of(out[..., self.seats], rest)
+        return out.take(self.place, axis=-1)
+
+
+class _Rows:
+    """All rows of a program: coefficients that are positive, and at most so much, and others as `by` orders them.
+
+    Values of rows, shape (M,), stand in this order.
+
+    Attributes:
+        count: Of intervals.
+        interval: That each lies in. Shape (M,).
+        gradients: Of the others by the three coefficients of their interval. Shape (3, M - `alone`).
+    """
+
+    def __init__(self, spline: Spline, rows: SplineRows, most: Array) -> None:
+        self.count = len(spline.h)
+        self.bounded = np.flatnonzero(np.isfinite(most))
+        self.alone = self.count + len(self.bounded)
+        self.by = _ByInterval(rows.interval, self.count)
+        order = self.by.order
+        interval = rows.interval[order]
+        self.interval = np.concatenate([np.arange(self.count), np.clip(self.bounded - 1, 0, self.count - 1), interval])
+        self.others = interval
+        bound = np.where(rows.jerk, 0.0, rows.bound)[order]
+        self.bound = np.concatenate([np.zeros(self.count), most[self.bounded], bound])
+        self.sharp = np.where(rows.jerk, rows.bound, 0.0)[order]
+        basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
+        self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
+        self.square = spline.basis(interval, rows.root[order])[0]
+        self.gradients = self.linear.copy()
+
+    def look(self, b: Array) -> tuple[Array, Array]:
+        """What rows miss their bounds by, and the size of these. Takes the tangents of the rows of jerk at b."""
+        near = self._near(b)
+        at = self._others(self.square, near)
+        root = self.sharp / np.sqrt(at)
+        gap, size = self._with(b, self._others(self.linear, near)) - self.bound, np.abs(self.bound) + 1e-300
+        gap[self.alone :] -= root
+        size[self.alone :] += root
+        np.multiply(self.square, 0.5 * root / at, out=self.gradients)
+        self.gradients += self.linear
+        return gap, size
+
+    def of(self, change: Array) -> Array:
+        """What a change of the coefficients changes. Shape (M,)."""
+        return self._with(change, self._others(self.gradients, self._near(change)))
+
+    def gathered(self, values: Array) -> Array:
+        """Sums of values times gradients, by the coefficients. Shape (N + 2,)."""
+        out = np.zeros(self.count + 2)
+        self._spread(self._sums(self.gradients * values[self.alone :]), out)
+        out[1:-1] -= values[: self.count]
+        out[self.bounded] += values[self.count : self.alone]
+        return out
+
+    def squares(self, values: Array) -> tuple[Array, Array, Array]:
+        """Diagonals of the sum of values times squares of gradients. Shape (N + 2,), (N + 1,), (N,)."""
+        g, main, beside = self.gradients, np.zeros(self.count + 2), np.zeros(self.count + 1)
+        pulled = g * values[self.alone :]
+        self._spread(self._sums(g * pulled), main)
+        main[1:-1] += values[: self.count]
+        main[self.bounded] += values[self.count : self.alone]
+        *next_to, apart = self._sums(np.stack([g[0] * pulled[1], g[1] * pulled[2], g[0] * pulled[2]]))
+        self._spread(next_to, beside)
+        return main, beside, apart
+
+    def _near(self, b: Array) -> tuple[Array, ...]:
+        """The three coefficients of the interval of each of the others."""
+        return tuple(b[k : self.count + k].take(self.others) for k in range(3))
+
+    def _with(self, b: Array, others: Array) -> Array:
+        return np.concatenate([-b[1:-1], b[self.bounded], others])
+
+    def _others(self, weights: Array, near: tuple[Array, ...]) -> Array:
         return np.asarray(weights[0] * near[0] + weights[1] * near[1] + weights[2] * near[2])
 
-    def add(self, values: Array, sums: Array) -> None:
-        """Add values (k, M) to sums (k, N) of the intervals, in place."""
-        if self.first.size:
-            sums[:, self.present] += np.add.reduceat(values, self.first, axis=1)
+    def _sums(self, values: Array) -> Array:
+        """Over the others of each interval. Shape (k, N)."""
+        return self.by.reduced(np.add, values, 0.0)
+
+    def _spread(self, sums: Iterable[Array], out: Array) -> None:
+        for k, own in enumerate(sums):
+            out[k : self.count + k] += own
+
+    def least(self, values: Array) -> Array:
+        """The least value of the rows of each interval. Shape (N,)."""
+        out = self.by.reduced(np.minimum, values[self.alone :], np.inf)
+        np.minimum(out, values[: self.count], out=out)
+        with np.errstate(invalid="ignore"):  # where a program comes to nothing
+            np.minimum.at(out, self.interval[self.count : self.alone], values[self.count : self.alone])
+        return out
+
+    def longest(self, rates: Array, positive: float) -> Array:
+        """Steps, at most 1, by which values that change at relative rates stay positive: one an interval.
+
+        Args:
+            rates: Over the share of the way to zero that a step takes at most.
+            positive: The same, once more, for those of the coefficients.
+        """
+        if positive != 1:
+            rates = rates.copy()
+            rates[: self.count] *= positive
+        return _smooth(1 / np.maximum(-self.least(rates), 1.0))
+
+
+def _smooth(steps: Array) -> Array:
+    """Steps no longer than given ones (N,) that change slowly from interval to interval."""
+    if not (steps < 1).any():
+        return steps
+    alike = minimum_filter1d(steps, 2 * ALIKE + 1, mode="nearest")
+    for _ in range(2):
+        alike = uniform_filter1d(alike, ALIKE + 1, mode="nearest")
+    return np.asarray(
+        np.clip(alike, 0.0, steps)
+    )  # its sums run along the path, and with them the rounding of the longest
 
 
 def least_time(
@@ -220,144 +365,109 @@ def least_time(
         most: Upper bounds of the coefficients; infinite for none. Shape (N + 2,).
         ends: Of the stretch.
         start: Coefficients to start from, positive; they need not keep the rows. Shape (N + 2,).
-        accuracy: Of the time, relative.
+        accuracy: Of the time, relative, and of all else where that is less accurate than what is accepted.
         center: How far from the bounds to begin: complementarity over the time.
 
     Raises:
         SolveError: No motion was found that keeps the rows, with the distance of the worst as its `time`.
     """
-    count = len(spline.h)
-    n = count + 2
-    bounded = np.flatnonzero(np.isfinite(most))
-    # linear rows: the coefficients themselves, which are positive (one an interval) and at most so much, and others
-    other = np.flatnonzero(~rows.jerk)
-    interval = np.concatenate([np.arange(count), np.clip(bounded - 1, 0, count - 1), rows.interval[other]])
-    weights = np.zeros((3, len(interval)))
-    weights[1, :count] = -1.0
-    weights[bounded - interval[count : count + len(bounded)], np.arange(count, count + len(bounded))] = 1.0
-    weights[:, count + len(bounded) :] = _weights(spline, rows, other)
-    bound = np.concatenate([np.zeros(count), most[bounded], rows.bound[other]])
-    order = np.argsort(interval, kind="stable")
-    lines, bound, linear = _Group(interval[order], count), bound[order], len(order)
-    positive = np.flatnonzero(order < count)
-    late = np.flatnonzero(rows.jerk)
-    late = late[np.argsort(rows.interval[late], kind="stable")]
-    jerks, sharp = _Group(rows.interval[late], count), rows.bound[late]
-    of_jerks = _weights(spline, rows, late)
-    square = np.ascontiguousarray(spline.basis(rows.interval[late], rows.root[late])[:, 0].T)
-    gradients = np.concatenate([weights[:, order], of_jerks], axis=1)
-    weights = gradients[:, :linear]
-
-    fixing, steps = _Ends(spline, ends), _Steps(n)
-    share, cost_weights = spline.share, spline.width / 2
+    count, every = len(spline.h), _Rows(spline, rows, most)
+    fixing, equations = _Ends(spline, ends), _Steps(count + 2)
+    cost_weights = spline.width / 2
     cost_weights[0] += 3 * ends[0].rest
     cost_weights[-1] += 3 * ends[1].rest
+    b = fixing.start(start)
+    gap, size = every.look(b)
+    slack = np.maximum(-gap, 0.1 * size)
+    slack[:count] = b[1:-1]
+    price = center * _time(spline.share, cost_weights, b)[0] / len(gap) / slack
 
-    def summed(values: Array) -> Array:
-        sums = np.zeros((len(values), count))
-        lines.add(values[:, :linear], sums)
-        jerks.add(values[:, linear:], sums)
-        return sums
+    def solved(right: Array) -> Array:
+        """Change of the coefficients."""
+        fixing.reduce(right)
+        change = equations.solve(right)
+        fixing.follow(change)
+        return change
 
-    def gathered(values: Array) -> Array:
-        sums, out = summed(gradients * values), np.zeros(n)
-        for k in range(3):
-            out[k : count + k] += sums[k]
-        return out
-
-    b, slack, price = fixing.start(start), np.zeros(0), np.zeros(0)
     found: Array | None = None
-    latest = 0
+    latest, worst, together = 0, np.inf, False
+    known: tuple[Array, ...] = ()
     for number in range(STEPS):
-        at = jerks.of(square, b)
-        root = sharp / np.sqrt(at)
-        gap = np.concatenate([lines.of(weights, b) - bound, jerks.of(of_jerks, b) - root])
-        gradients[:, linear:] = of_jerks + (0.5 * root / at) * square
-        size = np.concatenate([np.abs(bound), root]) + 1e-300
-
-        x = b[:-1] + share * np.diff(b)
-        times = cost_weights / np.sqrt(x)
-        time = float(times.sum())
-        slope, main, beside = _cost(share, -0.5 * times / x, 0.75 * times / x**2)
-        if number == 0:
-            slack = np.maximum(-gap, 0.1 * size)
-            slack[positive] = b[1:-1]
-            price = center * time / len(gap) / slack
+        lacking = _lacking(gap, slack, size, count)
+        if known and not together and not lacking.max() < max(ASTRAY * worst, NO_MATTER):
+            together = True
+            b, slack, price = known
+            gap, size = every.look(b)
         np.maximum(slack, -gap, out=slack)
-        missed = gap + slack
-        mean = float(slack @ price) / len(gap)
-        residual = slope + gathered(price)
-        fixing.reduce(residual)
-        lacking = missed / size
-        lacking[positive] = 0.0
-        worst = float(lacking.max())
+        lacking = _lacking(gap, slack, size, count)
+        time, slope, *curvature = _time(spline.share, cost_weights, b)
+        mean, worst = float(slack @ price) / len(gap), float(lacking.max())
         if not np.isfinite(mean + worst) or mean * len(gap) > DIVERGED * time:
             if found is not None:
                 return found
             break
-        uneven = float(np.abs(residual * b).sum()) / time
-        if worst < INFEASIBLE and uneven < UNEVEN and mean * len(gap) < ACCEPTED * time:
-            found = b
+        if worst < max(INFEASIBLE, MORE_SO * accuracy) and mean * len(gap) < max(ACCEPTED, accuracy) * time:
+            residual = slope + every.gathered(price)
+            fixing.reduce(residual)
+            if float(np.abs(residual * b).sum()) < max(UNEVEN, accuracy) * time:
+                found = b
         if found is not None and (mean * len(gap) < accuracy * time or number > latest):
             return found
         if found is None:
             latest = number + MORE_STEPS
 
-        pull = price / slack
-        g = gradients
-        pulled = g * pull
-        squares = summed(np.concatenate([g * pulled, g[:2] * pulled[1:], g[:1] * pulled[2:]]))
-        for k in range(3):
-            main[k : count + k] += squares[k]
-        beside[:-1] += squares[3]
-        beside[1:] += squares[4]
-        steps.matrix(fixing.band(main, beside, squares[5]))
+        pull, missed = price / slack, gap + slack
+        squares = every.squares(pull)
+        equations.matrix(fixing.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
+        base = slope + every.gathered(pull * missed)
 
-        def step(target: Any, pull: Array = pull, slope: Array = slope, missed: Array = missed) -> tuple[Array, ...]:
-            """Change of coefficients, slacks and prices towards slack x price = target."""
-            right = -(slope + gathered(target / slack + pull * missed))  # noqa: B023
-            fixing.reduce(right)
-            change = steps.solve(right)
-            fixing.follow(change)
-            of_lines = lines.of(gradients[:, :linear], change)
-            of_slack = -missed - np.concatenate([of_lines, jerks.of(gradients[:, linear:], change)])
-            return change, of_slack, target / slack - price - pull * of_slack  # noqa: B023
-
-        _, of_slack, of_price = step(0.0)
-        free, priced = _longest(slack, of_slack, 1.0), _longest(price, of_price, 1.0)
-        reached = min(free, priced)
-        after = float((slack + reached * of_slack) @ (price + reached * of_price)) / len(gap)
-        sigma = max(min((after / mean) ** 3, 1.0), (1 - reached) ** 3)
-        change, more_slack, more_price = step(sigma * mean - reached**2 * of_slack * of_price)
-        free, priced = _longest(slack, more_slack, TO_BOUNDARY), _longest(price, more_price, TO_BOUNDARY)
-        if min(free, priced) < 0.5 * reached:  # where the correction of second order leads astray
-            change, more_slack, more_price = step(max(sigma, 0.1) * mean)
-            free, priced = _longest(slack, more_slack, TO_BOUNDARY), _longest(price, more_price, TO_BOUNDARY)
-        b, slack, price = b + free * change, slack + free * more_slack, price + priced * more_price
+        # the prices' relative rates towards 0 are those of the slacks, mirrored about -1/2
+        change = solved(-base)
+        rates = -(missed + every.of(change)) / slack
+        reached = every.longest(np.minimum(rates, -1 - rates), 1.0)
+        far, product = reached[every.interval], slack * price
+        after = float((product * (1 + far * rates)) @ (1 - far - far * rates)) / len(gap)
+        left = 1 - reached
+        sigma = np.maximum(min((after / mean) ** 3, 1.0), left * left * left)
+        target = (mean * sigma)[every.interval] + far * far * product * rates * (1 + rates)
+        wanted = target / slack
+        change = solved(-(base + every.gathered(wanted)))
+        of_slack = -(missed + every.of(change))
+        of_price = wanted - price - pull * of_slack
+        taken = [
+            every.longest(of_slack / slack / TO_BOUNDARY, TO_BOUNDARY / LOST),
+            every.longest(of_price / price / TO_BOUNDARY, 1.0),
+        ]
+        shortest = [each.min() for each in taken]
+        if together:
+            taken = [np.full(count, each) for each in shortest]
+        else:
+            known = b + shortest[0] * change, slack + shortest[0] * of_slack, price + shortest[1] * of_price
+        b = b + np.concatenate([taken[0][:1], taken[0], taken[0][-1:]]) * change
+        slack = slack + taken[0][every.interval] * of_slack
+        price = price + taken[1][every.interval] * of_price
+        gap, size = every.look(b)
     row = int(lacking.argmax())
-    place = float(spline.nodes[np.append(lines.interval, jerks.interval)[row]])
+    place = float(spline.nodes[every.interval[row]])
     message = f"no motion keeps the limits near {place:g} m: they miss one another by {worst:.2g}"
     raise SolveError(message, name="limits", value=worst, limit=INFEASIBLE, time=place)
 
 
-def _weights(spline: Spline, rows: SplineRows, which: NDArray[np.intp]) -> Array:
-    """Some rows by the coefficients of their intervals. Shape (3, M)."""
-    basis = spline.basis(rows.interval[which], rows.fraction[which])
-    return np.ascontiguousarray(np.einsum("mi,mij->jm", rows.of[which], basis))
+def _lacking(gap: Array, slack: Array, size: Array, count: int) -> Array:
+    """What rows lack beside their slacks, over their bounds; none of the first so many, which are positive."""
+    lacking = (gap + slack) / size
+    lacking[:count] = 0.0
+    return np.asarray(lacking)
 
 
-def _cost(share: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Slope of the time by the coefficients, and the two diagonals of its curvature; of values at the nodes."""
-    n = len(share) + 1
-    slope, main = np.zeros(n), np.zeros(n)
+def _time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
+    """The time, its slope by the coefficients and the three diagonals of its curvature; of weights at the nodes."""
+    x = b[:-1] + share * np.diff(b)
+    times = weights / np.sqrt(x)
+    first, second = -0.5 * times / x, 0.75 * times / (x * x)
+    slope, main = np.zeros(len(b)), np.zeros(len(b))
     slope[:-1] += (1 - share) * first
     slope[1:] += share * first
     main[:-1] += (1 - share) ** 2 * second
     main[1:] += share**2 * second
-    return slope, main, share * (1 - share) * second
-
-
-def _longest(value: Array, change: Array, share: float) -> float:
-    """Longest step, at most 1, that keeps positive values so."""
-    worst = float((change / value).min())
-    return 1.0 if worst >= -share else -share / worst
+    return float(times.sum()), slope, main, share * (1 - share) * second, np.zeros(len(b) - 2)

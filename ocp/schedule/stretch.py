@@ -1,14 +1,17 @@
 """The fastest motion over a stretch of a path: its limits as rows, solved, looked at between the nodes, and tightened.
 
-Rows hold at both ends of every interval. What they are passed by inside, where joints and curvature bend, is measured
-on the motion itself; the bounds of these intervals are lowered by as much, and the stretch is solved again. Long
-stretches are solved in windows: each comes to rest at its end, so that a motion beyond the next seam is known to exist.
+A rough motion under the rows at one place of every interval tells which of them matter: few do. These are held at both
+ends of the interval, and at that of its places where they use most. The motion under them is looked at; a row that
+is passed is held there too, and where it was already, the bounds of the interval are lowered by as much. This is done
+until none is passed. Long stretches are solved in windows: each comes to rest at its end, so that a motion beyond the
+next seam is known to exist.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +22,7 @@ from ocp.schedule.passes import passes
 from ocp.schedule.profile import Array, SpeedProfile, joined
 from ocp.schedule.program import End, Spline, SplineRows, least_time
 from ocp.schedule.rows import Rows
-from ocp.schedule.window import INSIDE, ROOM, Motion, Stretch, Window, demanded, profile_of
+from ocp.schedule.window import HELD, INSIDE, ROOM, Ends, Motion, Stretch, Window, demanded, profile_of
 
 __all__ = ["fastest_over"]
 
@@ -27,70 +30,130 @@ KEPT = 1e-9
 """Limits count as kept up to this, relative."""
 ROUNDS = 20
 """Of tightening."""
-AROUND = 40
-"""Intervals on either side of one that passes a limit, which are planned again with it."""
-MOST, LEFT_OUT = 1.5, 1.02
-"""Largest ratio by which a bound is lowered in a round, by a row that was kept to and by one that was left out."""
-ROUGH, ACCURACY = 1e-3, 1e-10
-"""Of the time of a window, relative: in the first round, which is to find what the rows miss, and afterwards."""
+AROUND, FEW = 40, 1 / 6
+"""Intervals on either side of one that passes a limit, which are planned again with it; they alone if they are few."""
+MOST = 1.5
+"""Largest ratio by which a bound is lowered in a round."""
+ROUGH, SOON, ACCURACY = 0.05, 1e-5, 1e-8
+"""Of the time of a window, relative: in the first round, which is to find the rows that matter, two more, and later."""
 CENTER, CENTER_AGAIN = 1.0, 0.1
 """Where the interior point begins, the first time and from a solution."""
+LEAST_BESIDE = 0.01
+"""Squared speed inside an interval over that at its beginning at least, where the spline of a rough motion dives."""
 AGAIN = 0.9
 """Squared speed to start again from, over that of the solution."""
-START = 0.3
+START = 0.5
 """Squared speed to start from, over that of a fastest steady motion that accelerates as it may."""
-WINDOW, OVERLAP = 2000, 400
+WINDOW, OVERLAP = 2000, 200
 """Intervals of a window, and those at its end that the next one plans again."""
 SEAM = 1 - 1e-3
 """Share of the bounds that a window uses behind its seam, so that the next has room."""
 NEVER = 0.98
-"""Rows that reach less than this share of their bound whatever the motion are left out..."""
-NEAR = 0.5
-"""...and, once a motion is known, those that came less near to it in an interval or beside it."""
+"""Rows that reach less than this share of their bound whatever the motion are left out at first..."""
+NEAR = 0.8
+"""...and, once a motion is known, those that came less near to it in an interval and beside it."""
 
 
 class _Margins(NamedTuple):
-    """Share of the bounds of speed, acceleration and jerk that each interval of a stretch may use. Shape (N,) each."""
+    """Share of the bounds of speed, and of each row of acceleration and jerk, that intervals may use.
+
+    Shape (N,), (N, L) and (N, P).
+    """
 
     speed: Array
     acceleration: Array
     jerk: Array
 
+    @classmethod
+    def all_of(cls, value: float, count: int, rows: Rows) -> _Margins:
+        """The same in so many intervals, of rows like these."""
+        shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
+        return cls(*(np.full(shape, value) for shape in shapes))
 
-class _Tight(NamedTuple):
+    def of(self, part: slice) -> _Margins:
+        """Those of some intervals, which change with these."""
+        return _Margins(*(margin[part] for margin in self))
+
+    def times(self, room: Array) -> _Margins:
+        """Less by a share for each interval. Shape (N,)."""
+        return _Margins(self.speed * room, self.acceleration * room[:, None], self.jerk * room[:, None])
+
+
+@dataclass(eq=False)
+class _Tight:
     """What the intervals of a window are held to.
 
     Attributes:
-        margins: Lowered where bounds are passed between the places of the rows.
-        times: How often they were, by the kind of bound. Shape (3, N).
-        near: Rows that matter, upwards and downwards. Shape (2, N, K + L + P).
+        margins: Lowered where bounds are passed although their rows are held there.
+        times: How often they were.
+        held: Rows at the `HELD` places of each interval, upwards and downwards. Shape (4, 2, N, K + L + P).
+        speeds: At these places, over the speeds that the jerk there is proportional to. Shape (4, N).
     """
 
     margins: _Margins
-    times: Array
-    near: NDArray[np.bool_]
+    times: _Margins
+    held: NDArray[np.bool_]
+    speeds: Array
 
     @classmethod
     def of(cls, window: Window) -> _Tight:
         """What every window begins with."""
-        count = window.last - window.first
-        margins = _Margins(*np.full((3, count), 1 - ROOM))
-        return cls(margins, np.zeros((3, count)), np.ones((2, count, window.rows[0].total), dtype=bool))
+        count, rows = window.last - window.first, window.rows[0]
+        margins, times = (_Margins.all_of(value, count, rows) for value in (1 - ROOM, 0.0))
+        held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
+        return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> _Tight:
         """That of some intervals, which changes with it."""
         part = slice(first, last)
-        return _Tight(_Margins(*(margin[part] for margin in self.margins)), self.times[:, part], self.near[:, part])
+        return _Tight(self.margins.of(part), self.times.of(part), self.held[:, :, part], self.speeds[:, part])
 
-    def lower(self, used: Array, rows: Rows) -> None:
-        """Lower bounds that were passed: more, where that was not enough."""
-        most = np.where(self.near, np.minimum(used, MOST), np.minimum(used, LEFT_OUT)).max(axis=0)
+    def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
+        """Hold rows that come near their bounds, and some row of jerk in every interval.
+
+        Args:
+            used, values: What was demanded.
+            jerks: Coefficients of the jerk in the rows of it. Shape (N, P).
+        """
+        near = used > NEAR
+        near[:, 1:] |= near[:, :-1].copy()
+        near[:, :-1] |= near[:, 1:].copy()
+        self.held[[0, -1]] |= near
+        self.hold(near, values)
+        # else the second derivative could be anything there
+        first = used.shape[2] - jerks.shape[1]
+        sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
+        self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
+
+    def hold(self, which: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
+        """Hold some rows (2, N, K + L + P) where they use most; which of them are held there already."""
+        same = np.zeros(which.shape, dtype=bool)
+        sign, at, row = np.nonzero(which)
+        place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
+        same[sign, at, row] = self.held[place, sign, at, row]
+        self.held[place, sign, at, row] = True
+        return same
+
+    def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
+        """Lower bounds that were passed by rows that are held, as those of speed always are: more the next time.
+
+        Args:
+            used, held: What was demanded, by rows that are held or not. Shape (2, N, K + L + P).
+            rows: Of the window.
+            seam: Interval at which the next window begins.
+        """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
+        most = np.where(held, np.minimum(used, MOST), 0.0).max(axis=0)
+        most[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], MOST)
         for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
-            over = most[:, a:z].max(axis=1, initial=0.0)
-            at = np.flatnonzero(over > 1)
-            margin[at] /= np.minimum(1 + (over[at] - 1 + ROOM / 4) * 2.0 ** times[at], MOST)
+            over = most[:, a:z] if margin.ndim == 2 else most[:, a:z].max(axis=1, initial=0.0)
+            at = np.nonzero(over > 1)
+            margin[at] /= np.minimum(1 + (over[at] - 1 + ROOM / 2) * 2.0 ** times[at], MOST)
             times[at] += 1
+            if margin.ndim == 2:
+                # the next window begins on this motion, and has the margins: it must keep them at all places
+                inherited = at[0] >= seam
+                self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
 def fastest_over(stretch: Stretch) -> SpeedProfile:
@@ -102,40 +165,41 @@ def fastest_over(stretch: Stretch) -> SpeedProfile:
     if not np.any(stretch.grid.rows.jerk[:, :, 0]):
         return _settled(Window.of(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
     parts: list[SpeedProfile] = []
-    begin, state, margins = stretch.first, stretch.ends[0], None
+    begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
         end = stretch.last if stretch.last - begin < WINDOW + OVERLAP else begin + WINDOW
         last = end == stretch.last
         seam = end if last else end - OVERLAP
         goal = stretch.ends[1] if last else (0.0, 0.0)
         window = Window.of(stretch, begin, end, (state, goal))
-        part, state, margins = _settled(window, seam, margins)
+        part, state, behind = _settled(window, seam, behind)
         parts.append(part)
         if last:
             return joined(parts)
         begin = seam
 
 
-def _settled(window: Window, seam: int, before: _Margins | None) -> tuple[SpeedProfile, tuple[float, float], _Margins]:
+def _settled(window: Window, seam: int, before: _Tight | None) -> tuple[SpeedProfile, tuple[float, float], _Tight]:
     """The motion of a window up to its seam, tightened until it keeps all limits there and a good way behind.
 
     Args:
         window: What to plan.
         seam: Node at which the next window begins, or the last.
-        before: Margins that the window before found behind its seam.
+        before: What the window before was held to behind its seam.
 
     Returns:
-        The motion, squared speed and slope at the seam, and the margins behind it.
+        The motion, squared speed and slope at the seam, and what it is held to behind it.
     """
     tight = _Tight.of(window)
     if before is not None:
-        for margin, own in zip(tight.margins, before, strict=True):
+        for margin, own in zip(tight.margins, before.margins, strict=True):
             margin[: len(own)] = own
+        tight.held[:, :, : before.held.shape[2]] = before.held
+        tight.speeds[:, : before.held.shape[2]] = before.speeds
     kept, seen = seam - window.first, min(seam + OVERLAP // 2, window.last) - window.first
     x, slope = _tightened(window, tight, seam, seen, None)
     state = float(x[kept]), 0.0 if slope is None else float(slope[kept])
-    behind = _Margins(*(margin[kept:] for margin in tight.margins))
-    return profile_of(window, x[: kept + 1], slope), state, behind
+    return profile_of(window, x[: kept + 1], slope), state, tight.part(kept, window.last - window.first)
 
 
 def _tightened(window: Window, tight: _Tight, seam: int, seen: int, start: Motion | None) -> tuple[Array, Array | None]:
@@ -149,20 +213,26 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int, start: Motio
         seen: Intervals of the window that must keep the limits: the first so many.
         start: Squared speeds and slopes to start from, if a motion is known.
     """
-    for _ in range(ROUNDS):
-        x, slope = _solved(window, tight, seam, start)
-        used = demanded(window, profile_of(window, x, slope))
-        over = used[:, :seen].max(axis=(0, 2), initial=0.0) > 1 + KEPT
-        rough = start is None and slope is not None
-        if not over.any() and not rough:
+    accuracies = [ROUGH, SOON, SOON] if start is None and np.any(window.grid.rows.jerk[:, :, 0]) else []
+    for number in range(ROUNDS):
+        accuracy = accuracies[number] if number < len(accuracies) else ACCURACY
+        x, slope = _solved(window, tight, seam, start, accuracy)
+        used, values = demanded(window, profile_of(window, x, slope), accuracy != ROUGH)
+        used /= _room(window, seam)[:, None]
+        if accuracy == ROUGH and slope is not None:
+            tight.hold_near(used, values, window.rows[1].jerk[:, :, 0])
+            start = x, slope
+            continue
+        passed = used > 1 + KEPT
+        over = passed[:, :seen].any(axis=(0, 2))
+        if not over.any() and accuracy == ACCURACY:
             return x, slope
-        tight.lower(used, window.rows[0])
+        tight.lower(used, passed if slope is None else tight.hold(passed, values), window.rows[0], seam - window.first)
         if slope is None:
             continue
-        np.logical_or(used > NEAR, False if rough else tight.near, out=tight.near)
         start = x, slope
         parts = _about(np.flatnonzero(over), len(x) - 1)
-        if rough or 2 * sum(last - first for first, last in parts) > len(x):
+        if accuracy != ACCURACY or sum(last - first for first, last in parts) > FEW * len(x):
             continue
         try:
             for first, last in parts:
@@ -175,6 +245,11 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int, start: Motio
     place, most = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are passed by {most - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=most, limit=1.0, time=place)
+
+
+def _room(window: Window, seam: int) -> Array:
+    """Share of the limits that the intervals of a window may use. Shape (N,)."""
+    return np.where(np.arange(window.first, window.last) < seam, 1.0, SEAM)
 
 
 def _about(intervals: NDArray[np.intp], count: int) -> list[tuple[int, int]]:
@@ -190,10 +265,12 @@ def _about(intervals: NDArray[np.intp], count: int) -> list[tuple[int, int]]:
     return found
 
 
-def _solved(window: Window, tight: _Tight, seam: int, start: Motion | None) -> tuple[Array, Array | None]:
+def _solved(
+    window: Window, tight: _Tight, seam: int, start: Motion | None, accuracy: float
+) -> tuple[Array, Array | None]:
     """Squared speeds at the nodes, and their slopes where jerks are limited."""
     if np.any(window.grid.rows.jerk[:, :, 0]):
-        return _with_jerk(window, tight, seam, start)
+        return _with_jerk(window, tight, seam, start, accuracy)
     return _without_jerk(window, tight.margins), None
 
 
@@ -205,7 +282,7 @@ def _without_jerk(window: Window, margins: _Margins) -> Array:
     of = left.acceleration, right.acceleration
     p = np.concatenate([of[0][:, :, 0], of[1][:, :, 0] + 2 * h * of[1][:, :, 1]], axis=1)
     q, rest = (np.concatenate([side[:, :, seat] for side in of], axis=1) for seat in (1, 2))
-    bound = margins.acceleration[:, None]
+    bound = np.concatenate([margins.acceleration] * 2, axis=1)
     caps[[0, -1]] = 0.0
     return passes(window.nodes, caps, p, q, -bound - rest, bound - rest)
 
@@ -225,13 +302,13 @@ def _beside(of_intervals: Array) -> Array:
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
-def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None) -> Motion:
+def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None, accuracy: float) -> Motion:
     """Squared speeds and slopes at the nodes of a window."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
     left, middle, right = (window.rows[k] for k in (0, 2, 4))
     at_rest = ends[0][0] == 0, ends[1][0] == 0
-    room = np.where(np.arange(begin, end) < seam, 1.0, SEAM)
-    shares = _Margins(*(margin * room for margin in tight.margins))
+    room = _room(window, seam)
+    shares = tight.margins.times(room)
     asked = grid.asked[begin:end] ** 2 * room**2
     caps = np.minimum(_beside(asked), _by_rows(grid, begin, end) * _beside(shares.speed) ** 2)
     up, rates = reach(nodes, caps, left, right, at_rest)
@@ -251,22 +328,28 @@ def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None) -
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
     most = np.concatenate([caps[inner][:1], np.minimum(asked, between)[cells], caps[inner][-1:]])
+    held = tight.held
     if known is None:
-        start = _start(nodes, caps, up, at_rest)[inner]
+        held = held.copy()
+        start = _start(nodes, np.minimum(up, caps), left, right, ends)[inner]
         b = np.concatenate([start[:1], np.minimum(start[:-1], start[1:]), start[-1:]])
+        held[1] |= _reached(window.rows[1], np.maximum(up[1:], up[:-1]), rates, shares)
     else:
         b = spline.through(known[0][inner], known[1][inner])
-        b = AGAIN * np.maximum(b, 1e-9 * b.max())
+        b = np.maximum(b, 1e-9 * b.max())
+        tight.speeds[:, cells] = _speed_ratios(spline, b)
+        b *= AGAIN
     for side, rest in enumerate(at_rest):
         if not rest:
             most[[0, 1] if side == 0 else [-1, -2]] = np.inf
-    own_shares = _Margins(*(share[cells] for share in shares))
+    own_shares = shares.of(cells)
     moving = (not at_rest[0], not at_rest[1])
     places = tuple(rows.of(cells) for rows in window.rows)
-    jumps = np.isin(np.arange(begin + low + 1, begin + high), grid.jumps)
-    rows = _rows(places, tight.near[:, cells], jumps, caps[inner], up[inner], rates[cells], own_shares, moving)
+    with np.errstate(invalid="ignore"):
+        implied = (1 - spline.share) * most[:-1] + spline.share * most[1:]
+    rows = _rows(places, held[:, :, cells], caps[inner], implied, own_shares, tight.speeds[:, cells], moving)
     try:
-        b = _coefficients(spline, rows, most, (states[0], states[1]), b, known is not None)
+        b = _coefficients(spline, rows, most, (states[0], states[1]), b, accuracy)
     except SolveError as error:
         message = f"{error}; raise the limits, or keep the path away from singular arms"
         details = {"name": "limits", "value": error.value, "limit": error.limit, "time": error.time}
@@ -277,129 +360,139 @@ def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None) -
 
 
 def _coefficients(
-    spline: Spline, rows: SplineRows, most: Array, ends: tuple[End, End], start: Array, again: bool
+    spline: Spline, rows: SplineRows, most: Array, ends: tuple[End, End], start: Array, accuracy: float
 ) -> Array:
-    """Solve a program, from its last solution if `again`; where that leads nowhere, from further inside."""
-    if not again:
-        return least_time(spline, rows, most, ends, start, accuracy=ROUGH, center=CENTER)
+    """Solve a program, after the first round from its last solution; where that leads nowhere, from further inside."""
+    if accuracy == ROUGH:
+        return least_time(spline, rows, most, ends, start, accuracy=accuracy, center=CENTER)
     try:
-        return least_time(spline, rows, most, ends, start, accuracy=ACCURACY, center=CENTER_AGAIN)
+        return least_time(spline, rows, most, ends, start, accuracy=accuracy, center=CENTER_AGAIN)
     except SolveError:
-        return least_time(spline, rows, most, ends, 0.3 * start, accuracy=ACCURACY, center=CENTER)
+        return least_time(spline, rows, most, ends, 0.3 * start, accuracy=accuracy, center=CENTER)
 
 
-def _start(nodes: Array, caps: Array, up: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Squared speeds to start from."""
-    away = np.inf * np.ones(len(nodes))
-    for rest, s, node in ((at_rest[0], nodes - nodes[0], 1), (at_rest[1], nodes[-1] - nodes, -2)):
-        if rest:
-            away = np.minimum(away, caps[node] * (s / s[node]) ** (4 / 3))
-    start = START * np.minimum(up, np.minimum(caps, away))
+def _start(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
+    """Squared speeds to start from, below greatest ones (N + 1,), that change no faster than jerks from rest allow.
+
+    From rest x^(3/4) grows by the square root of 9/2 of the jerk times the distance; from a motion it may fall so too.
+    """
+    steady = np.minimum(left.steady()[0], right.steady()[0])
+    y = (START * np.minimum(most, _beside(steady) ** 2)) ** 0.75
+    with np.errstate(divide="ignore"):
+        sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
+    away = np.concatenate([[0.0], np.cumsum(np.sqrt(4.5 * sharp) * np.diff(nodes))])
+    y[0], y[-1] = (x**0.75 for x, _ in ends)
+    y = np.minimum.accumulate(y - away) + away
+    y = np.minimum.accumulate((y + away)[::-1])[::-1] - away
+    start = np.maximum(y, np.maximum(ends[0][0] ** 0.75 - away, ends[1][0] ** 0.75 - (away[-1] - away))) ** (4 / 3)
     return np.asarray(np.maximum(start, 1e-9 * start.max()))
 
 
 def _from_rest(near: Rows, far: Rows, width: float, side: int, shares: Array) -> float:
     """Greatest jerk of the first (side 0) or last interval, which begins or ends at rest."""
     of = [near.jerk[0], far.jerk[0]] if side == 0 else [near.jerk[-1], far.jerk[-1]]
-    sign, share = 1.0 - 2.0 * side, float(shares[0 if side == 0 else -1])
+    sign, share = 1.0 - 2.0 * side, shares[0 if side == 0 else -1]
     ratio = 0.0
     for s in (0.0, width):
         for rows in of:
             jerk = rows[:, 0] + sign * 3 * s * rows[:, 1] + 4.5 * s * s * rows[:, 2]
-            ratio = max(ratio, float(np.abs(jerk).max(initial=0.0)))
-    return share / ratio
+            ratio = max(ratio, float((np.abs(jerk) / share).max(initial=0.0)))
+    return 1 / ratio
 
 
 def _rows(
     places: tuple[Rows, ...],
-    near: NDArray[np.bool_],
-    jumps: NDArray[np.bool_],
+    held: NDArray[np.bool_],
     caps: Array,
-    up: Array,
-    rates: Array,
+    implied: Array,
     shares: _Margins,
+    speeds: Array,
     moving: tuple[bool, bool],
 ) -> SplineRows:
-    """Rows of a program: speeds at its nodes, accelerations there and before a jump, jerks at both ends of an interval.
-
-    Intervals that were tightened have them in their middle, too, and those of speed wherever they are looked at.
+    """Rows of a program: those that are held, and speeds at its nodes; inside intervals too, where they were tightened.
 
     Args:
         places: Rows where intervals begin, inside them, and where they end. Shape (N,) each.
-        near: Which of them matter, upwards and downwards. Shape (2, N, K + L + P).
-        jumps: Whether rows jump at its end. Shape (N,).
-        caps, up: Greatest squared speed at the nodes, by the rows of speed and by any motion. Shape (N + 1,).
-        rates: Greatest acceleration in the intervals. Shape (N,).
+        held: Which of them, at the `HELD` places. Shape (4, 2, N, K + L + P).
+        caps, implied: Greatest squared speed at the nodes by the rows of speed, and by what the coefficients may be.
+            Shape (N + 1,).
         shares: Of the bounds, in the intervals.
+        speeds: At the `HELD` places, see `_Tight`. Shape (4, N).
         moving: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
-    count = len(rates)
-    nodes = np.arange(count + 1)[int(moving[0]) : count + 1 - int(moving[1])]
-    nodes = nodes[np.isfinite(caps[nodes])]
-    speed = np.zeros((len(nodes), 3))
-    speed[:, 0] = 1 / caps[nodes]
-    interval, fraction = np.minimum(nodes, count - 1), (nodes == count).astype(float)
-    parts = [_part(interval, fraction, fraction, speed, np.ones(len(nodes)), False)]
+    count, first = len(caps) - 1, places[0].speed.shape[1]
+    second = first + places[0].acceleration.shape[1]
+    nodes = np.flatnonzero((caps < implied * (1 - KEPT)) & np.isfinite(caps))
+    nodes = nodes[(nodes >= int(moving[0])) & (nodes <= count - int(moving[1]))]
+    parts = [_speeds(np.minimum(nodes, count - 1), (nodes == count).astype(float), 1 / caps[nodes])]
     slow = np.flatnonzero(shares.speed < SEAM * (1 - ROOM))
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
-        speed = np.zeros((len(slow), 3))
-        speed[:, 0] = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
-        place = np.full(len(slow), inside)
-        parts.append(_part(slow, place, place, speed, np.ones(len(slow)), False))
-
-    near = near | np.roll(near, 1, axis=1) | np.roll(near, -1, axis=1)
-    first, second = places[0].speed.shape[1], places[0].speed.shape[1] + places[0].acceleration.shape[1]
-    near_a, near_j = near[:, :, first:second], near[:, :, second:]
-    rate, share = -_beside(-rates), _beside(shares.acceleration)
-    last = jumps | (np.arange(count) == count - 1)
-    for side, rows in ((0, places[0]), (1, places[-1])):
-        node = np.arange(count) + side
-        here = (last if side else np.ones(count, dtype=bool)) & ((node > 0) | (not moving[0]))
-        here &= (node < count) | (not moving[1])
-        of = here[None, :, None] & near_a
-        parts += _accelerations(rows, np.arange(count), float(side), share[node], rate[node], up[node], of)
-        parts += _jerks(rows, np.arange(count), float(side), shares.jerk, rate[node], up[node], near_j)
-    again = np.flatnonzero((shares.acceleration < SEAM * (1 - ROOM)) | (shares.jerk < SEAM * (1 - ROOM)))
-    rows, top = places[2].of(again), np.maximum(up[again], up[again + 1])
-    parts += _accelerations(rows, again, 0.5, shares.acceleration[again], rates[again], top, near_a[:, again])
-    parts += _jerks(rows, again, 0.5, shares.jerk[again], rates[again], top, near_j[:, again])
+        most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
+        parts.append(_speeds(slow, np.full(len(slow), inside), most))
+    for which, at_place, speed in zip(held, HELD, speeds, strict=True):
+        inside, rows, own = (0.0, *INSIDE, 1.0)[at_place], places[at_place], which[:, :, first:second].copy()
+        if inside in (0.0, 1.0) and moving[int(inside)]:
+            own[:, -int(inside)] = False
+        sign, at, row = np.nonzero(own)
+        p, q, r = rows.acceleration[at, row].T
+        to, place = 1.0 - 2.0 * sign, np.full(len(at), inside)
+        of = to[:, None] * np.stack([q, p / 2, np.zeros(len(at))], axis=1)
+        parts.append(
+            SplineRows(at, place, place, of, shares.acceleration[at, row] - to * r, np.zeros(len(at), dtype=bool))
+        )
+        sign, at, row = np.nonzero(which[:, :, second:])
+        p, q, r = rows.jerk[at, row].T
+        of = (1.0 - 2.0 * sign)[:, None] * np.stack([speed[at] * r, speed[at] * q / 2, p / 2], axis=1)
+        root = np.full(len(at), _jerk_of(inside))
+        parts.append(
+            SplineRows(at, np.full(len(at), inside), root, of, shares.jerk[at, row], np.ones(len(at), dtype=bool))
+        )
     return SplineRows(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
 
 
-def _part(interval: Any, fraction: Array, root: Array, of: Array, bound: Array, jerk: bool) -> SplineRows:
-    return SplineRows(interval, fraction, root, of, bound, np.full(len(interval), jerk))
+def _jerk_of(inside: float) -> float:
+    """Where in an interval x''/2 v is the jerk that the motion holds over the half of it that a place lies in.
+
+    With a = a0 + x''/2 (s - s0), two jerks of half the time T each lead to the speed and acceleration at its end where
+    they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6), but for terms of second order.
+    """
+    return 1 / 6 if inside < 0.5 else 5 / 6
 
 
-def _accelerations(
-    rows: Rows, interval: Any, fraction: float, share: Array, rate: Array, up: Array, near: NDArray[np.bool_]
-) -> list[SplineRows]:
-    """Both sides of the rows of acceleration at one place of each interval, where a motion may reach them."""
-    a = np.abs(rows.acceleration)
-    reached = a[:, :, 0] * rate[:, None] + a[:, :, 1] * up[:, None] + a[:, :, 2] > NEVER * share[:, None]
-    parts = []
-    for sign, matters in zip((1.0, -1.0), near, strict=True):
-        at, row = np.nonzero(reached & matters)
-        p, q, r = rows.acceleration[at, row].T
-        of, place = np.stack([q, p / 2, np.zeros(len(at))], axis=1), np.full(len(at), fraction)
-        parts.append(_part(interval[at], place, place, sign * of, share[at] - sign * r, False))
-    return parts
+def _speed_ratios(spline: Spline, b: Array) -> Array:
+    """Speeds at the `HELD` places over those where the jerk is taken, during a motion. Shape (4, N)."""
+    x, slope = spline.at_nodes(b)
+    bend = np.diff(slope) / spline.h
+
+    def at(inside: float) -> Array:
+        way = inside * spline.h
+        return np.asarray(np.maximum(x[:-1] + way * (slope[:-1] + way * bend / 2), LEAST_BESIDE * x[:-1]))
+
+    places = [(0.0, *INSIDE, 1.0)[k] for k in HELD]
+    return np.sqrt([at(inside) / at(_jerk_of(inside)) for inside in places])
 
 
-def _jerks(
-    rows: Rows, interval: Any, fraction: float, share: Array, rate: Array, up: Array, near: NDArray[np.bool_]
-) -> list[SplineRows]:
-    """Both sides of the rows of jerk at one place of each interval, where a motion may reach them."""
-    j, top = np.abs(rows.jerk), np.sqrt(up)
-    bent = j[:, :, 1] * (top * rate)[:, None] + j[:, :, 2] * (top**3)[:, None]
+def _speeds(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
+    """Squared speeds times so much that are at most one."""
+    every, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
+    return SplineRows(interval, fraction, fraction, every, np.ones(len(of)), none)
+
+
+def _reached(rows: Rows, up: Array, rates: Array, shares: _Margins) -> NDArray[np.bool_]:
+    """Rows of acceleration and jerk that a motion may reach. Shape (N, K + L + P).
+
+    Args:
+        rows: In N intervals.
+        up: Greatest squared speed of any motion. Shape (N,).
+        rates: Greatest acceleration. Shape (N,).
+        shares: Of the bounds.
+    """
+    a, j, top = np.abs(rows.acceleration), np.abs(rows.jerk), np.sqrt(up)
+    of_a = a[:, :, 0] * rates[:, None] + a[:, :, 1] * up[:, None] + a[:, :, 2]
+    bent = j[:, :, 1] * (top * rates)[:, None] + j[:, :, 2] * (top**3)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = np.where(j[:, :, 0] > 0, (1 + bent) / j[:, :, 0], np.inf).min(axis=1, initial=np.inf)
-        reached = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + bent > NEVER * share[:, None]
-    parts = []
-    for sign, matters in zip((1.0, -1.0), near, strict=True):
-        at, row = np.nonzero(reached & matters)
-        p, q, r = rows.jerk[at, row].T
-        of = np.stack([r, q / 2, p / 2], axis=1)
-        # the jerk that the motion holds over a half of the interval is that at its middle
-        place, root = np.full(len(at), fraction), np.full(len(at), 0.25 + 0.5 * fraction)
-        parts.append(_part(interval[at], place, root, sign * of, share[at], True))
-    return parts
+        of_j = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + bent
+    return np.concatenate(
+        [np.zeros(rows.speed.shape, dtype=bool), of_a > NEVER * shares.acceleration, of_j > NEVER * shares.jerk], axis=1
+    )

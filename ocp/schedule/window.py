@@ -13,14 +13,20 @@ from ocp.schedule.limits import JointPath, LineLimits, PathLike
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, through
 from ocp.schedule.rows import Rows, rows_at
 
-__all__ = ["INSIDE", "ROOM", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
+__all__ = ["HELD", "INSIDE", "ROOM", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
 
-ROOM = 3e-4
-"""Share of the limits that is left for what lies between the places looked at."""
+ROOM = 5e-4
+"""Share of the limits that is left for what lies between the places where rows are held."""
+BEND = 1e-4
+"""Share of the limits by which a demand may bend away from a parabola before more places are looked at."""
 INSIDE = (0.25, 0.5, 0.75)
 """Where each interval is looked at between its ends, as shares of its length."""
-BETWEEN = tuple(k / 16 for k in range(1, 16) if k % 4)
-"""Where those are looked at too whose rows bend sharply."""
+LOOKED = 0.75
+"""Share of a bound that is used at one of these places where it may be passed between them."""
+HELD = (0, 1, 3, 4)
+"""Which of the places, ends included, rows are held at: not the middle, where the jerk of the motion may change."""
+FINE = 16
+"""Parts of an interval at whose ends demands are looked at where they bend sharply; the middle is one of them."""
 
 Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 """Squared speed and its slope by the distance, at the beginning and at the end."""
@@ -54,13 +60,14 @@ class Window(Stretch):
 
     Attributes:
         rows: Where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
-        bent: Intervals in which rows bend more sharply than these show. Shape (B,).
-        between: Rows at places `BETWEEN` of those. Shape (B,) each.
+        bends: What parabolas through the rows of acceleration and of jerk at three of these places miss at most.
+            Shape (N, L, 3) and (N, P, 3).
+        close: Rows at places nearer to one another, of intervals of the grid that were looked at so. Shape (15,) each.
     """
 
     rows: tuple[Rows, ...] = ()
-    bent: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    between: tuple[Rows, ...] = ()
+    bends: tuple[Array, Array] = (np.zeros((0, 0, 3)), np.zeros((0, 0, 3)))
+    close: dict[int, Rows] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
@@ -71,23 +78,28 @@ class Window(Stretch):
         rows = rows_at(stretch.path, stretch.limits, stretch.joints, places)
         inside = [rows.of(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
         all_of_them = (left, *inside, right)
-        bent = _bent(all_of_them, stretch.grid.asked[first:last])
-        between = tuple(
-            rows_at(stretch.path, stretch.limits, stretch.joints, begin[bent] + share * h[bent]) for share in BETWEEN
-        )
-        return cls(
-            stretch.path, stretch.limits, stretch.joints, stretch.grid, first, last, ends, all_of_them, bent, between
-        )
+        bends = _bends([each.acceleration for each in all_of_them]), _bends([each.jerk for each in all_of_them])
+        return cls(stretch.path, stretch.limits, stretch.joints, stretch.grid, first, last, ends, all_of_them, bends)
 
     def part(self, first: int, last: int, x: Array, slope: Array) -> Window:
         """Its intervals between two nodes, given squared speeds and slopes at all of them. Shape (N + 1,)."""
         own = [(float(x[node]), float(slope[node])) for node in (first, last)]
         ends = (self.ends[0] if first == 0 else own[0], self.ends[1] if last == len(x) - 1 else own[1])
         rows = tuple(rows.of(slice(first, last)) for rows in self.rows)
-        here = (self.bent >= first) & (self.bent < last)
-        bent, between = self.bent[here] - first, tuple(rows.of(np.flatnonzero(here)) for rows in self.between)
-        begin, end = self.first + first, self.first + last
-        return replace(self, first=begin, last=end, ends=ends, rows=rows, bent=bent, between=between)
+        bends = self.bends[0][first:last], self.bends[1][first:last]
+        return replace(self, first=self.first + first, last=self.first + last, ends=ends, rows=rows, bends=bends)
+
+    def closely(self, intervals: NDArray[np.intp]) -> Rows:
+        """Rows at the ends of the `FINE` parts of some intervals but for their own, place by place. Shape (15 B,)."""
+        new = [at for at in intervals.tolist() if self.first + at not in self.close]
+        if new:
+            begin, h = self.nodes[new], np.diff(self.nodes)[new]
+            places = begin[:, None] + np.arange(1, FINE) / FINE * h[:, None]
+            rows = rows_at(self.path, self.limits, self.joints, places.ravel())
+            for k, at in enumerate(new):
+                self.close[self.first + at] = rows.of(slice(k * (FINE - 1), (k + 1) * (FINE - 1)))
+        found = [self.close[self.first + at] for at in intervals.tolist()]
+        return Rows(*(np.stack(kind, axis=1).reshape(-1, *kind[0].shape[1:]) for kind in zip(*found, strict=True)))
 
     @property
     def nodes(self) -> Array:
@@ -105,10 +117,13 @@ def profile_of(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
     return SpeedProfile(t, s, v, np.append(np.diff(x) / (2 * np.diff(s)), 0.0), np.zeros(len(s) - 1))
 
 
-def demanded(window: Window, profile: SpeedProfile) -> Array:
-    """Largest demands over their limits in each interval, upwards and downwards. Shape (2, N, K + L + P).
+def demanded(window: Window, profile: SpeedProfile, closely: bool = True) -> tuple[Array, Array]:
+    """Demands over their limits in each interval: the largest, upwards and downwards, and those at `HELD` places.
 
-    In either half of an interval each demand is a parabola through three places; its vertex counts too.
+    Shape (2, N, K + L + P) and (4, N, K + L + P).
+
+    In either half of an interval each demand is a parabola through three places; its vertex counts too. Where that may
+    miss what matters, and they are looked at `closely`, more places count.
     """
     begin, before, here, after, end = window.rows
     nodes, h = window.nodes, np.diff(window.nodes)
@@ -133,45 +148,87 @@ def demanded(window: Window, profile: SpeedProfile) -> Array:
     last = states(slice(each, None, each), profile.jerk[each - 1 :: each])
     if each == 1:  # the acceleration jumps at nodes: it is that before them
         last = last._replace(acceleration=first.acceleration)
-    met = profile.at_distance(at)
-    zero, one = np.zeros(count), np.ones(count)
+    zero = np.zeros(count)
+    places = np.concatenate([nodes[:-1] + INSIDE[0] * h, at, nodes[:-1] + INSIDE[2] * h])
+    inside = profile.at_distance(places)
+    quarter, met, far = (LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3))
     halves = (
-        ((begin, first, zero), (before, profile.at_distance(nodes[:-1] + INSIDE[0] * h), INSIDE[0] * one), first.jerk),
-        ((end, last, one), (after, profile.at_distance(nodes[:-1] + INSIDE[2] * h), INSIDE[2] * one), last.jerk),
+        ((begin, first), (before, quarter), (middle, met._replace(jerk=first.jerk))),
+        ((middle, met._replace(jerk=last.jerk)), (after, far), (end, last)),
     )
-    used = np.full((2, count, begin.total), -np.inf)
-    for outer, inner, jerk in halves:
-        places = (outer, inner, (middle, met._replace(jerk=jerk), f))
-        values = [rows.demands(motion) for rows, motion, _ in places]
-        _add_extremes(used, values, [place[:, None] for *_, place in places])
-    for share, rows in zip(BETWEEN, window.between, strict=True):
-        value = rows.demands(profile.at_distance(nodes[window.bent] + share * h[window.bent]))
-        used[:, window.bent] = np.maximum(used[:, window.bent], [value, -value])
+    values = np.stack([rows.demands(motion) for half in halves for rows, motion in half])
+    used = np.stack([values.max(axis=0), -values.min(axis=0)])
+    # a parabola is beyond the greatest of three of its values by at most a quarter of these
+    at_row = np.nonzero(np.maximum(*used) > LOOKED)
+    high = np.stack([value[at_row] for value in values])
+    shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
+    places_of = [place[at_row[0]] for place in shares]
+    for three in (slice(0, 3), slice(3, 6)):
+        peak = _vertex(high[three], places_of[three])
+        for side, value in zip(used, (peak, -peak), strict=True):
+            side[at_row] = np.maximum(side[at_row], value)
+    bent = np.flatnonzero(_missed(window, used, (first, met, last))) if closely else np.zeros(0, dtype=np.intp)
+    if bent.size:
+        used[:, bent] = _closely(window, profile, bent, f[bent], values[[0, 2, 3, 5]][:, bent])
+    return used, values[[0, 1, 4, 5]]
+
+
+def _bends(rows: list[Array]) -> Array:
+    """What parabolas through rows at three of five places in a line miss at most. Shape (N, L, 3) of five of them."""
+    a, b, c, d, e = rows
+    # the third difference tells the cubic that a parabola leaves, at most 1/(9 sqrt 3) of it
+    return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
+
+
+def _missed(window: Window, used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
+    """Intervals in which a demand that seems to be kept may be passed between three places. Shape (N,)."""
+    v, a, j = (
+        np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
+        for kind in ("speed", "acceleration", "jerk")
+    )
+    of_a, of_j = window.bends
+    miss = [
+        np.zeros((len(v), used.shape[2] - of_a.shape[1] - of_j.shape[1])),
+        of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2],
+        of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
+    ]
+    missed = np.concatenate(miss, axis=1)
+    return np.asarray(((missed > BEND) & (used.max(axis=0) + missed > 1)).any(axis=1))
+
+
+def _closely(window: Window, profile: SpeedProfile, bent: NDArray[np.intp], f: Array, known: Array) -> Array:
+    """Largest demands, upwards and downwards, of some intervals by places near one another. Shape (2, B, R).
+
+    Args:
+        window, profile: As of `demanded`.
+        bent: The intervals. Shape (B,).
+        f: Where in them the jerk changes. Shape (B,).
+        known: Demands at their beginning, before and after that change, and at their end. Shape (4, B, R).
+    """
+    half = FINE // 2
+    places = window.nodes[bent] + np.arange(1, FINE)[:, None] / FINE * np.diff(window.nodes)[bent]
+    demands = window.closely(bent).demands(profile.at_distance(places.ravel())).reshape(FINE - 1, len(bent), -1)
+    fine = np.arange(FINE + 1)[:, None] / FINE + np.zeros(len(bent))
+    fine[half] = f
+    begin, before, after, end = known[:, None]
+    used = np.zeros((2, *begin.shape[1:]))
+    for values, at in (
+        (np.concatenate([begin, demands[: half - 1], before]), fine[: half + 1]),
+        (np.concatenate([after, demands[half:], end]), fine[half:]),
+    ):
+        used = np.maximum(used, [values.max(axis=0), -values.min(axis=0)])
+        for k in range(0, half, 2):
+            peak = _vertex(values[k : k + 3], [place[:, None] for place in at[k : k + 3]])
+            used = np.maximum(used, [peak, -peak])
     return used
 
 
-def _bent(rows: tuple[Rows, ...], asked: Array) -> NDArray[np.intp]:
-    """Intervals in which parabolas through three of five places miss what lies between them, at the top speed."""
-    top = np.minimum(asked, np.minimum(rows[0].steady()[0], rows[-1].steady()[0]))
-    kinds = ([each.acceleration[:, :, 1] for each in rows], [each.jerk[:, :, 2] for each in rows])
-    sharp = np.zeros(len(asked), dtype=bool)
-    for values, scale in zip(kinds, (top**2, top**3), strict=True):
-        for a, b, c, d in (values[:4], values[1:]):
-            # the third difference tells the cubic that a parabola leaves, at most 1/(9 sqrt 3) of it
-            miss = np.abs(d - a + 3 * (b - c)).max(axis=1, initial=0.0) / (9 * np.sqrt(3))
-            sharp |= miss * scale > ROOM
-    return np.flatnonzero(sharp)
-
-
-def _add_extremes(used: Array, values: list[Array], places: list[Array]) -> None:
-    """Raise what is used to the greatest and the least value of parabolas through three values, in place."""
+def _vertex(values: Array, places: list[Array]) -> Array:
+    """The vertex of parabolas through three values where it lies between the first and the last, else the first."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):
         bend = ((c - b) / (end - inside) - slope) / (end - at)
         vertex = (at + inside) / 2 - slope / (2 * bend)
         within = (vertex - at) * (vertex - end) < 0
-        peak = np.where(within, a + (vertex - at) * (slope + bend * (vertex - inside)), a)
-    for value in (a, b, c, peak):
-        np.maximum(used[0], value, out=used[0])
-        np.maximum(used[1], -value, out=used[1])
+        return np.asarray(np.where(within, a + (vertex - at) * (slope + bend * (vertex - inside)), a))

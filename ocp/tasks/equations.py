@@ -177,7 +177,7 @@ class TaskEquations:
             (False, False, "task way", "m"),
             (False, True, "task turn", "rad"),
         ):
-            rows = np.flatnonzero((self.posed == posed) & (self._turning == turning)).tolist()
+            rows = np.flatnonzero((self.posed == posed) & (self.turning == turning)).tolist()
             if rows:
                 what = (error if posed else missed)[rows]
                 off = gaps[rows] if posed else 0.0
@@ -186,7 +186,7 @@ class TaskEquations:
         return found
 
     @property
-    def _turning(self) -> NDArray[np.bool_]:
+    def turning(self) -> NDArray[np.bool_]:
         """Which rows turn, rather than move. Shape (size,), bool."""
         found: list[bool] = []
         for task in (part.task for part in self.bound):

@@ -23,6 +23,7 @@ EXAMPLES: Mapping[str, str] = {
     "space_arm": SPACE_ARM.package,
     "panda": PANDA.package,
     "ur5": UR5.package,
+    "posture_set": UR5.package,
     "mobile_manipulator": "example-robot-data",
     "pushing": "example-robot-data",
 }

@@ -12,7 +12,7 @@ import models
 from models import FixedBase, Machine, Robot, smooth
 from models.arrays import Array
 from ocp import Plan, TipTask, plan
-from ocp.planning.planner import Search
+from ocp.planning.planner import SearchKind
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.robots import PANDA, SPACE_ARM, UR5
@@ -68,13 +68,13 @@ def run(repeats: int = 5) -> dict[str, Any]:
     return {"rows": [row(case, search, repeats) for case, search in progress(pairs(), "planning")]}
 
 
-def pairs() -> list[tuple[str, Search]]:
+def pairs() -> list[tuple[str, SearchKind]]:
     """Cases and how their start is searched; given starts are not."""
-    searches: tuple[Search, ...] = ("start", "postures")
+    searches: tuple[SearchKind, ...] = ("start", "postures")
     return [(case, search) for case in CASES for search in searches if search == "start" or "space" not in case]
 
 
-def row(case: str, search: Search, repeats: int) -> dict[str, Any]:
+def row(case: str, search: SearchKind, repeats: int) -> dict[str, Any]:
     """One row: the least time of some runs, as a user would call it."""
     machine, task, start = CASES[case]()
     runs = [timed(lambda: plan(machine, task, start=start, search=search)) for _ in range(max(1, min(repeats, 3)))]

@@ -14,6 +14,8 @@ from .cases import CASES
 from .principle import Principle, stack
 from .test_conformance import known, largest_error
 
+pytestmark = pytest.mark.xdist_group("indirect conformance")  # one process, so that every problem is solved once
+
 # what stands in the way of the others: the error, and the word for it
 REFUSED: dict[str, tuple[type[Exception], str]] = {
     "Bryson-Denham": (ProblemError, r"bounds of state 'q'"),

@@ -80,6 +80,7 @@ def interrupted(name, call, after=0.3):
     try:
         call()
         word = "returned"
+        timer.cancel()
     except KeyboardInterrupt as error:
         word = "KeyboardInterrupt" + (" with a plan" if getattr(error, "solution", None) is not None else "")
     except BaseException as error:
@@ -97,15 +98,15 @@ long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
 ipopt = prepare(long, Collocation(1000, 4), options=NEVER)
 interrupted("ipopt", ipopt.solve)
 interrupted("ipopt without check", lambda: ipopt.solve(check=False))
-fatrop = prepare(long, Collocation(1000, 4), solver="fatrop", options={"max_iter": 1000000})
-interrupted("fatrop", fatrop.solve, 0.5)
-again = prepare(solved_from_zeros(), Collocation(4000, 4))
+fatrop = prepare(long, Collocation(1500, 4), solver="fatrop", options={"max_iter": 1000000})
+interrupted("fatrop", fatrop.solve, 0.2)
+again = prepare(solved_from_zeros(), Collocation(8000, 4))
 interrupted("second start", again.solve)
 stuck = van_der_pol(horizon=20.0, terminal=[9.0, 9.0], upper=0.1)
 conflicts = prepare(stuck, Collocation(3000, 4), options={"max_iter": 1})
 interrupted("what conflicts", conflicts.solve, 1.0)
-sleqp = prepare(long, Collocation(60, 4), solver="sleqp")
-interrupted("sleqp", sleqp.solve, 0.3)
+sleqp = prepare(long, Collocation(120, 4), solver="sleqp")
+interrupted("sleqp", sleqp.solve, 0.2)
 interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
 interrupted("refine", lambda: refine(long, Collocation(150), tolerance=1e-13, max_intervals=4000))
 interrupted("tighten", lambda: tighten(long, Collocation(1500)))
@@ -115,14 +116,14 @@ print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success
 
 CHECKS = """
 long = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
-plan = solve(long, Collocation(4000))
+plan = solve(long, Collocation(16000))
 interrupted("audit", lambda: plan.audit(), 0.1)
 interrupted("audit again", lambda: plan.audit(), 0.3)
 interrupted("certificate", lambda: certificate(long, [plan, plan]))
 indirect = prepare(van_der_pol(horizon=6.0), Indirect(segments=800))
 seed = solve(van_der_pol(horizon=6.0), Collocation(20))
 interrupted("indirect", lambda: indirect.solve(guess=seed), 0.2)
-interrupted("indirect with its own seed", lambda: Indirect(seed=Collocation(300)).prepare(long).solve())
+interrupted("indirect with its own seed", lambda: Indirect(seed=Collocation(8000)).prepare(long).solve())
 """
 
 MACHINES = """

@@ -39,6 +39,8 @@ from tests.ocp.problems import (
     van_der_pol,
 )
 
+pytestmark = pytest.mark.xdist_group("refinement")  # one process, so that every plan is solved once
+
 START: dict[str, Method] = {
     "radau": Collocation(3),
     "radau-held": Collocation(3, control="held"),

@@ -14,7 +14,7 @@ OPTIONS = {
     "standing": ["--out"],
     "blend": ["--out"],
     "cts": ["--out"],
-    "gallery": ["--out", "--only", "space_arm", "panda", "ur5", "mobile_manipulator", "pushing"],
+    "gallery": ["--out", "--only", "space_arm", "panda", "ur5", "posture_set", "mobile_manipulator", "pushing"],
     "view": ["--lock NAME=VALUE", "--mesh-dir"],
     "benchmark": ["--out", "--only", "--repeats", "costate_rate"],
     "reproduce": ["--out", "--only", "free_floating"],

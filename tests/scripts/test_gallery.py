@@ -15,10 +15,11 @@ import pinocchio
 import pytest
 from PIL import Image
 
+from models import FixedBase
 from models.arrays import Array
 from ocp import Solution, SolveError, resolve_accelerations
 from scripts import gallery
-from scripts.robots import panda, pushing, robots, ur5
+from scripts.robots import panda, posture_set, pushing, robots, ur5
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.frames import TIP, Frames, frames_along
@@ -27,8 +28,8 @@ from scripts.viewer.plan import play
 
 pytestmark = pytest.mark.xdist_group("gallery")
 
-NAMES = ["space_arm", "panda", "ur5", "mobile_manipulator", "pushing"]
-LOCAL = ["space_arm", "panda", "ur5"]
+NAMES = ["space_arm", "panda", "ur5", "posture_set", "mobile_manipulator", "pushing"]
+LOCAL = ["space_arm", "panda", "ur5", "posture_set"]
 """Those that are compared with the pseudo-inverse by cost."""
 
 
@@ -79,6 +80,24 @@ def test_the_cyclic_plan_returns_within_the_limits_where_the_pseudo_inverse_drif
     assert ((plan["joints"] >= robot.lower) & (plan["joints"] <= robot.upper)).all()
     drift = np.array(row["drift_by_lap_local_rad"])
     assert (np.diff(drift) > 0.1).all()
+
+
+def test_the_cheapest_of_all_postures_lies_in_another_family_than_the_best_conditioned_start(coarse: Gallery) -> None:
+    row = coarse.rows["posture_set"]
+    assert 0.98 * row["cost_optimal"] <= row["bound"] <= row["cost_optimal"]
+    assert row["cost_optimal"] < 0.8 * row["cost_from_the_best_conditioned_start"]
+    machine, task = FixedBase(robots.UR5.read()), posture_set.seam()
+    charts, through, family = posture_set.landscape(machine, task, 9, row["cost_optimal"])
+    assert through.min() <= row["cost_optimal"]  # on any instants
+    plan = coarse.plan("posture_set")
+    times = np.linspace(0.0, plan.horizon, 9)
+    homes = []
+    for k, joints in enumerate(plan.at(times)["joints"]):
+        own = np.flatnonzero(charts.layer == k)
+        far = np.abs(np.angle(np.exp(1j * (charts.centers[own] - joints)))).max(axis=1)
+        assert far.min() < 0.05  # it runs through the postures that were found
+        homes.append(family[own[far.argmin()]])
+    assert len(set(homes)) == 1
 
 
 def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Gallery) -> None:

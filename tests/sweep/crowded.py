@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     solved = hits = tried = lost = 0
     for number in range(given.first, given.first + given.count):
         robot, seed = robots[number % len(robots)], number // len(robots)
-        began, task = time.time(), crowd(robot, seed)
+        task, began = crowd(robot, seed), time.time()
         result = planned(task)
         took = time.time() - began
         tried += 1

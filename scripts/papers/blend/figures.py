@@ -365,6 +365,6 @@ def _animation(folder: Path, results: Results) -> None:
                 dot.set_data([time], [np.interp(time, fine.t, values)])
             title.set_text(f"t = {time:.2f} s")
             yield figure
-            figure.set_layout_engine("none")  # laid out by the first drawing, costly in each
 
-    gif(folder / "motion.gif", frames(), seconds=FRAME)
+    artists = [drawn, arm, *(dot for dot, _ in moving), title]
+    gif(folder / "motion.gif", frames(), seconds=FRAME, moving=artists)

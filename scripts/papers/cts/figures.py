@@ -151,6 +151,7 @@ def _animate(path: Path, results: Results) -> None:
         axes[0, 0].set_title("store release, from the side (blue: $P_G$)")
         axes[0, 1].set_title("from the front")
         chosen = "Store, ejectors, air, walls, wing and link lengths chosen."
+        title = figure.suptitle(" ", fontsize=9)  # room for the time
         figure.supxlabel(chosen, x=0.01, ha="left", fontsize=6, color=COLORS["grey"])
         yaw, pitch = found.table.targets[:, 3:].T
         axis = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
@@ -164,8 +165,8 @@ def _animate(path: Path, results: Results) -> None:
                     store.set_data(ends[row, :, i], ends[row, :, k])
                     trail.set_data(places[: row + 1, i], places[: row + 1, k])
                     spot.set_data(places[row : row + 1, i], places[row : row + 1, k])
-                figure.suptitle(f"{time:.2f} s, slowed down", fontsize=9)
+                title.set_text(f"{time:.2f} s, slowed down")
                 yield figure
-                figure.set_layout_engine("none")  # as it was laid out for the first frame
 
-        gif(path, frames(), seconds=0.08)
+        artists = [artist for rig, store, trail, spot, *_ in drawn for artist in (rig, store, trail, spot)]
+        gif(path, frames(), seconds=0.08, moving=[*artists, title])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from models import FreeFloating
@@ -276,12 +277,13 @@ def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Moti
 
         def frames() -> Iterator[Figure]:
             for time in progress(times.tolist(), "animation"):
-                for show in moving:
+                for _, show in moving:
                     show(time)
                 title.set_text(f"time {time:.2f} s")
                 yield figure
 
-        gif(folder / "motion.gif", frames(), seconds=FRAME)
+        artists = [artist for mine, _ in moving for artist in mine]
+        gif(folder / "motion.gif", frames(), seconds=FRAME, moving=[*artists, title])
 
 
 def _pair(
@@ -320,8 +322,10 @@ def _strobe(ax: Any, machine: FreeFloating, motion: Motion) -> None:
     ax.set_aspect("equal")
 
 
-def _animated(column: Any, machine: FreeFloating, motion: Motion, name: str) -> Callable[[float], None]:
-    """Draw one motion's still parts; the returned function moves the others to a time."""
+def _animated(
+    column: Any, machine: FreeFloating, motion: Motion, name: str
+) -> tuple[list[Artist], Callable[[float], None]]:
+    """Draw one motion's still parts; the others, from back to front, and a function that moves them to a time."""
     above, below = column
     shape = outline(machine, PLATE)
     corners = [shape(b, q) for b, q in zip(motion.base[::50], motion.joints[::50], strict=True)]
@@ -345,4 +349,4 @@ def _animated(column: Any, machine: FreeFloating, motion: Motion, name: str) -> 
         trace.set_data(*motion.tip_in_world[: k + 1].T)
         cursor.set_xdata([motion.t[k]])
 
-    return show
+    return [trace, plate, links, cursor], show

@@ -256,7 +256,7 @@ def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
     )
     with sheet(folder / "convergence.png", (1, 1), (8.4, 3.9), note) as (_, axes):
         ax = axes[0, 0]
-        for (task, plan), color in zip(names, colors, strict=True):
+        for (task, plan), color in zip(names, colors, strict=False):
             for marker, dash, method in (("o", "-", "held"), ("s", "--", "points"), ("^", ":", "linear")):
                 mine = [
                     (row["intervals"], abs(row["percent"]))

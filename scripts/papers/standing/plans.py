@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -136,11 +137,14 @@ PLANS: Mapping[str, Mapping[str, Request]] = {
 }
 """Plans by summary key."""
 
-CONVERGING = (
+CONVERGING: tuple[tuple[str, str], ...] = (
     ("table1", "optimal_range"),
     ("table1", "optimal_index_nine_tenths"),
     ("table1", "optimal_pinned"),
     ("table2", "optimal_spring"),
+    ("minimum_time", "free"),
+    ("minimum_time", "in_foot"),
+    ("minimum_time", "index_nine_tenths"),
 )
 MESHES: Mapping[Transcription, tuple[int, ...]] = {"held": (40, 80, 160), "points": (10, 20, 40)}
 LIFT_MESHES: Mapping[Transcription, tuple[int, ...]] = {"held": (25, 50, 100), "linear": (25, 50, 100)}
@@ -151,25 +155,28 @@ METHOD_NAMES: Mapping[Transcription, str] = {
 }
 
 
-def task_of(request: Request) -> TipTask:
+def task_of(task: Task) -> TipTask:
     """Over time, or over the path parameter for the lift."""
     _, y, z = start_tip(1)
-    if request.task == "minimum_time":
+    if task == "minimum_time":
         return led(lambda s: [y, z + LIFT * s])
-    return table_task(1 if request.task == "table1" else 2)
+    return table_task(1 if task == "table1" else 2)
 
 
 def plan_problem(request: Request) -> Problem:
     """The problem of a request."""
-    settings: dict[str, Any] = {"zmp": request.rule}
-    if request.transcription == "points":
-        settings["tip_level"] = "acceleration"
-    if request.task == "minimum_time":
+    return _problem(request.task, request.rule, "acceleration" if request.transcription == "points" else "position")
+
+
+@cache  # the same for every mesh
+def _problem(task: Task, rule: ZmpRule, tip_level: Literal["position", "acceleration"]) -> Problem:
+    settings: dict[str, Any] = {"zmp": rule, "tip_level": tip_level}
+    if task == "minimum_time":
         settings |= {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter"}
-        return standing_problem(machine(), task_of(request), STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
-    table = 1 if request.task == "table1" else 2
+        return standing_problem(machine(), task_of(task), STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
+    table = 1 if task == "table1" else 2
     settings |= {"limits": LIMITS, "external": spring() if table == 2 else None}
-    return standing_problem(machine(), task_of(request), STANDING_STARTS[table], HORIZON, **settings)
+    return standing_problem(machine(), task_of(task), STANDING_STARTS[table], HORIZON, **settings)
 
 
 def method(transcription: Transcription, intervals: int) -> Any:
@@ -190,7 +197,7 @@ def make(request: Request) -> Plan:
     """Solve, evaluate between the nodes and audit."""
     solution = solved(request)
     motion, progress = fine_motion(request, solution)
-    errors = task_errors(machine(), task_of(request), progress, None, motion.joints)
+    errors = task_errors(machine(), task_of(request.task), progress, None, motion.joints)
     error = float(np.linalg.norm(errors, axis=1).max())
     limits = {"joints": 1e-6, "velocities": 1e-6, "accelerations": 1e-6}
     if not isinstance(request.rule, Anywhere):
@@ -236,9 +243,8 @@ def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str,
     """Cost by mesh and transcription, and its distance from that of the finest mesh of the better transcription."""
     work: list[tuple[str, str, Transcription, int]] = []
     for task, key in CONVERGING:
-        work += [(task, key, kind, n) for kind, meshes in MESHES.items() for n in meshes]
-    for key in PLANS["minimum_time"]:
-        work += [("minimum_time", key, kind, n) for kind, meshes in LIFT_MESHES.items() for n in meshes]
+        meshes_of = LIFT_MESHES if task == "minimum_time" else MESHES
+        work += [(task, key, kind, n) for kind, meshes in meshes_of.items() for n in meshes]
     known: dict[tuple[str, str, Transcription, int], Solution] = {}
     for task, group in plans.items():
         for key, plan in group.items():

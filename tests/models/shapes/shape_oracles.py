@@ -76,10 +76,11 @@ def by_differences(one: Shape, other: Shape) -> float:
     """Signed distance from the hull of all differences of points of two cores: its depth, or its point nearest 0."""
     differences = (one.core[:, None] - other.core[None]).reshape(-1, 3)
     swelling = one.swelling + other.swelling
-    depth = float(ConvexHull(differences, qhull_options="QJ1e-12").equations[:, 3].max())
+    hull = ConvexHull(differences, qhull_options="QJ1e-12")
+    depth = float(hull.equations[:, 3].max())
     if depth < 0:
         return depth - swelling
-    weight = 1e3
+    differences, weight = differences[hull.vertices], 1e3
     shares, _ = nnls(np.vstack([differences.T, np.full(len(differences), weight)]), np.array([0, 0, 0, weight]))
     return float(np.linalg.norm(differences.T @ (shares / shares.sum()))) - swelling
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from models.shapes.covering import Cover, cover, cut, fitted, inside
 from models.shapes.hull import convex_hull
 from models.shapes.mesh_files import Faces
 from models.shapes.shapes import Box, Capsule
+
+pytestmark = pytest.mark.xdist_group("covers")  # one process, so that the plate is covered once
 
 ROUNDING = 1e-12
 
@@ -201,11 +204,18 @@ def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.Mo
     assert same(cover(vertices.tolist(), faces.tolist()), first)
 
 
+@functools.cache
+def covers_of_plate() -> tuple[Cover, ...]:
+    vertices, faces = plate()
+    return fitted(vertices[faces])
+
+
 @pytest.mark.parametrize(
     "contents", ["", "{", "null", "[]", '[{"radius": 1}]', "[3]", "[[[[", '{"a": 1}', '[{"radius": "x"}]']
 )
-def test_a_broken_cache_is_no_error(own_cache: Path, contents: str) -> None:
+def test_a_broken_cache_is_no_error(own_cache: Path, contents: str, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = plate()
+    monkeypatch.setattr(covering, "fitted", lambda triangles: covers_of_plate())
     first = cover(vertices, faces)
     (file,) = own_cache.iterdir()
     file.write_text(contents, encoding="utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from itertools import combinations
 from pathlib import Path
@@ -19,9 +18,8 @@ from models.shapes.bodies import Body, bodies_of
 from models.shapes.distance import distance
 from models.shapes.pairs import ALWAYS, COVERED, NEIGHBOURS, NEVER, RIGID, SRDF, TOLD, Pairs, checked_pairs
 from models.shapes.shapes import Box, Capsule, Sphere
+from tests import redundancy_benchmark
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
-
-DATA = Path(__file__).resolve().parents[2] / "data" / "redundancy"
 
 
 def chain(*lengths: float, radius: float = 0.02, limit: float = np.pi) -> tuple[Robot, tuple[Body, ...]]:
@@ -200,15 +198,11 @@ def test_a_follower_counts_as_it_moves() -> None:
         assert pairs.left.get(("left", "right")) == reason
 
 
-@pytest.mark.parametrize("name", ["fetch", "fetch_arm", "panda"])
+@pytest.mark.parametrize("name", redundancy_benchmark.ROBOTS)
 def test_the_benchmark_of_redundant_arms(name: str) -> None:
     """Capsules and pairs as given: distances at random postures as an own formula and coal have them."""
-    given = json.loads((DATA / "robots.json").read_text(encoding="utf-8"))[name]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)
-        robot = Robot.from_urdf(DATA / given["urdf"], tip=given["tip"])
-    bodies = tuple(Body(link, Capsule(c[6], c[:3], c[3:6])) for link, c in given["capsules"].items())
-    ignored = [tuple(pair) for pair in given["ignored_pairs"]]
+    robot, ignored = redundancy_benchmark.robot_of(name), redundancy_benchmark.ignored_pairs(name)
+    bodies = bodies_of(robot)
     pairs = checked_pairs(robot, bodies, ignored=ignored)
     for pair in ignored:
         assert frozenset(pair) not in by_links(bodies, pairs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from models import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
-from models.shapes.hull import convex_hull
+from models.shapes.hull import convex_hull, kept_hull
 from tests.models.shapes.shape_oracles import random_frame, random_shape
 
 KINDS = (Sphere, Capsule, Cylinder, Box, Mesh)
@@ -43,6 +44,29 @@ def test_reach_is_the_distance_of_the_farthest_point(kind: type) -> None:
     farthest = np.linalg.norm(drawn - point, axis=1).max()
     assert farthest <= shape.reach(point) + 1e-9
     assert farthest >= 0.95 * shape.reach(point)
+
+
+@pytest.mark.parametrize("broken", ["", "null", "[3]", "[[], [], [], []]", '{"a": 1}', "small", "of others"])
+def test_a_hull_is_kept_and_a_broken_file_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    points = np.random.default_rng(3).normal(size=(50, 3))
+    first, again = kept_hull(points), kept_hull(points)
+    (file,) = (tmp_path / "selfmotion").iterdir()
+    vertices, *others = json.loads(file.read_text(encoding="utf-8"))
+    told = {
+        "small": [(0.9 * np.array(vertices)).tolist(), *others],
+        "of others": [vertices, *others[:2], others[2][1:]],
+    }
+    file.write_text(json.dumps(told[broken]) if broken in told else broken, encoding="utf-8")
+    for found in (again, kept_hull(points)):
+        for what in ("vertices", "faces", "normals", "offsets"):
+            np.testing.assert_array_equal(getattr(found, what), getattr(first, what))
+    mesh = Mesh.around(first)
+    np.testing.assert_array_equal(mesh.core, Mesh(points).core)
+    turn, shift = random_frame(np.random.default_rng(4)).rotation, (1.0, 2.0, 3.0)
+    np.testing.assert_array_equal(mesh.placed(turn, shift).core, Mesh(points).placed(turn, shift).core)
 
 
 def test_what_has_no_end_is_out_of_reach() -> None:

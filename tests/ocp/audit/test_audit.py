@@ -28,6 +28,8 @@ from tests.ocp.problems import (
     van_der_pol,
 )
 
+pytestmark = pytest.mark.xdist_group("audits")  # one process, so that every plan is solved once
+
 FINE: dict[str, Method] = {
     "radau": Collocation(20),
     "radau-held": Collocation(60, control="held"),

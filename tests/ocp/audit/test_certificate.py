@@ -27,6 +27,8 @@ from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, plant, van_der_pol
 
+pytestmark = pytest.mark.xdist_group("certificates")  # one process, so that every plan is solved once
+
 NAMES: dict[str, Any] = {
     "Collocation": Collocation(50, 3, "legendre"),
     "MultipleShooting": MultipleShooting(100, control="linear"),

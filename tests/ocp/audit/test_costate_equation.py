@@ -15,6 +15,8 @@ from ocp.curves import PiecewisePolynomial
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import SOLVERS, Method, energy, plant, started_anywhere, van_der_pol
 
+pytestmark = pytest.mark.xdist_group("costate equation")  # one process, so that every plan is solved once
+
 LOST, EQUATION, ENDS, HORIZON = (
     "cost lost, relative",
     "costate equation, relative",

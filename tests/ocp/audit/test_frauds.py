@@ -25,6 +25,8 @@ from ocp.curves import PiecewisePolynomial
 from tests.ocp.audit.drawn import holds
 from tests.ocp.problems import Array, double_integrator
 
+pytestmark = pytest.mark.xdist_group("frauds")  # one process, so that every plan is solved once
+
 FRAUD = {"states": 0.05, "controls": 0.05, "costates": 0.2}
 """Of the spread of each thing. Costates move nothing: what they are off by counts by the cost that they misjudge."""
 ROUNDING = 1e-9

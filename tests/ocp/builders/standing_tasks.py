@@ -61,6 +61,7 @@ def spring() -> External:
     return tip_spring(machine(), (0, 150, 0), tip_at(machine(), STANDING_STARTS[2]))
 
 
+@cache
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
     settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
     return standing_problem(machine(), table_task(table), STANDING_STARTS[table], HORIZON, **settings)
@@ -72,6 +73,7 @@ def straight(forward: float, up: float) -> TipTask:
     return led(lambda s: [y + forward * s, z + up * s])
 
 
+@cache
 def lift_plan(zmp: Any, **changes: Any) -> Problem:
     """The tip 0.8 m straight up in the least time."""
     settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -14,6 +15,7 @@ from models.machines.standing_motion import standing_motion
 from ocp import (
     Collocation,
     MultipleShooting,
+    Problem,
     ProblemError,
     Solution,
     SolveError,
@@ -67,15 +69,19 @@ from tests.ocp.builders.standing_tasks import (
     tool,
 )
 
+pytestmark = pytest.mark.xdist_group("standing problems")  # one process, so that every plan is solved once
+
 IN_RANGE = InFoot(0.02)  # -0.08 .. 0.18 m
 MILLIMETRE = 1e-3
 
 
-def held(problem: Any, intervals: int = 80, **settings: Any) -> Solution:
-    return solve(problem, MultipleShooting(intervals, control="held"), **settings)
+@cache
+def held(problem: Problem, intervals: int = 80) -> Solution:
+    return solve(problem, MultipleShooting(intervals, control="held"))
 
 
-def points(problem: Any, intervals: int) -> Solution:
+@cache
+def points(problem: Problem, intervals: int) -> Solution:
     return solve(problem, Collocation(intervals, degree=3, scheme="legendre"))
 
 
@@ -204,7 +210,9 @@ def test_the_fastest_lift_takes_longer_the_less_the_zero_moment_point_may_move(z
 def test_the_fastest_lift_does_not_depend_on_the_first_guess() -> None:
     problem = lift_plan(IN_RANGE)
     slow = held(lift_plan(IN_RANGE, horizon=2.0, weights=None), 50)
-    assert held(problem, 50, guess=slow).horizon == pytest.approx(held(problem, 50).horizon, rel=1e-6)
+    assert solve(problem, MultipleShooting(50), guess=slow).horizon == pytest.approx(
+        held(problem, 50).horizon, rel=1e-6
+    )
 
 
 def test_the_zero_moment_point_follows_a_reference() -> None:
@@ -242,7 +250,7 @@ def test_free_ends_cost_less_than_rest_and_a_given_end_posture_more() -> None:
     free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end="free"), 12)
     loose = points(table_plan(1, IN_RANGE, tip_level="acceleration", start="free", end="free"), 12)
     assert loose.cost < free.cost < rest.cost
-    posture = np.append(rest["joints"][-1, :2] + [0.05, -0.05], [np.nan] * 3)
+    posture = (*(rest["joints"][-1, :2] + [0.05, -0.05]), np.nan, np.nan, np.nan)
     given = held(table_plan(1, IN_RANGE, end_joints=posture), 30)
     np.testing.assert_allclose(given["joints"][-1, :2], posture[:2], atol=1e-8)
     assert given.cost > held(table_plan(1, IN_RANGE), 30).cost

@@ -166,7 +166,7 @@ def test_speeds_of_segments_are_kept() -> None:
     assert motion.speed[np.argmin(np.abs(motion.distance - 0.7))] == pytest.approx(0.4, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_paths_are_solved_and_bracketed(seed: int) -> None:
     path, limits = random_path(seed)
     solved = case(path, limits, intervals=60)

@@ -14,6 +14,8 @@ from ocp import Collocation, Indirect, MultipleShooting, Problem, ProblemError, 
 from tests.ocp.indirect.extremals import EXTREMA, regulator
 from tests.ocp.problems import EVERY_METHOD, SOLVERS, SWING, Array, plant, swing
 
+pytestmark = pytest.mark.xdist_group("cost gradients")  # one process, so that every plan is solved once
+
 STEP = 1e-4
 
 METHODS: dict[str, Any] = {

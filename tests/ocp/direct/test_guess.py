@@ -16,6 +16,8 @@ from ocp.direct.guess import initial_point
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import EVERY_METHOD, METHODS, SOLVERS, Array, Method, energy, van_der_pol
 
+pytestmark = pytest.mark.xdist_group("guesses")  # one process, so that every plan is solved once
+
 
 def free_time(guess: float | None = None) -> Problem:
     """x (2) and u (1) over a free time."""

@@ -12,7 +12,7 @@ import pytest
 
 from models import Path
 from models.paths import chains
-from ocp.files import Program, TimedProgram, Waypoints, read_gcode, read_waypoints
+from ocp.files import Program, RawTrajectory, TimedProgram, Waypoints, read_gcode, read_trajectory, read_waypoints
 from ocp.schedule import LineLimits
 from tests.bad_values import (
     CHOICE,
@@ -67,6 +67,12 @@ def read_table(**given: Any) -> Waypoints:
         return read_waypoints(**{"file": File(folder) / "table.csv", **given})
 
 
+def read_motion(**given: Any) -> RawTrajectory:
+    with TemporaryDirectory() as folder:
+        (File(folder) / "motion.csv").write_text("time,a,b\n0,1,2\n1,2,3\n")
+        return read_trajectory(**{"file": File(folder) / "motion.csv", **given})
+
+
 CASES = [
     Case(
         "read_gcode",
@@ -91,6 +97,19 @@ CASES = [
             "file": FILE,
             "unit": but(CHOICE, "None"),
             "columns": SEQUENCE | {"few": ("x", "y", "z"), "other": ("a", "b", "c", "d", "e", "f")},
+        },
+    ),
+    Case(
+        "read_trajectory",
+        read_motion,
+        {},
+        {
+            "file": FILE,
+            "columns": SEQUENCE | {"few": ("time", "a"), "no time": ("a", "b", "c")},
+            "period": POSITIVE,
+            "topic": but(NAME, "None", "empty"),
+            "joints": SEQUENCE,
+            "kind": but(CHOICE, "None"),
         },
     ),
     method(path, "placed", {}, position=array(3) | NOTHING, orientation=QUATERNION | NOTHING),

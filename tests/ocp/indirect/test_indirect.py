@@ -18,6 +18,8 @@ from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import Array, energy, plant
 
+pytestmark = pytest.mark.xdist_group("indirect")  # one process, so that every problem is solved once
+
 PAPER_COST = 1.735114311245  # two independent methods, to twelve digits
 PAPER_START = np.deg2rad([45.0, 60.0, -60.0])
 FORMULATIONS = ("rates", "null_space")

@@ -15,7 +15,7 @@ import pytest
 from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
 from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.files import write_mcap
-from ocp.planning import Plan, plan
+from ocp.planning import Plan, plan, plan_waypoints
 from ocp.schedule import LineLimits, schedule
 from ocp.tasks.tracks import along
 from tests.bad_values import (
@@ -41,7 +41,7 @@ from tests.bad_values import (
 from tests.models.machines.armoured import armoured_arm
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.planning.motions import DOWN, angled_ur5
-from tests.ocp.tasks.space_tasks import ur5
+from tests.ocp.tasks.space_tasks import panda, ur5
 
 CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3)
 ARM = FixedBase(CHAIN)
@@ -52,6 +52,8 @@ GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
 assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
 AROUND = Surroundings(FixedBase(armoured_arm()))
+POSES = ([[0.4, 0.0, 0.5], [0.4, 0.02, 0.5], [0.4, 0.04, 0.5]], [[0.0, 1.0, 0.0, 0.0]] * 3)
+WAYPOINTS: dict[str, Any] = {"machine": panda(), "positions": POSES[0], "quaternions": POSES[1], "clearance": None}
 ENDLESS = replace(GOOD, duration=None, breaks=())
 
 
@@ -89,6 +91,25 @@ CASES = [
             "search": CHOICE,
             "seed": WHOLE,
             "time_cost": POSITIVE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case(
+        "plan_waypoints",
+        plan_waypoints,
+        WAYPOINTS,
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "positions": array(3, 3) | {"one": POSES[0][:1], "fewer": POSES[0][:2]},
+            "quaternions": array(3, 4) | {"zero": np.zeros((3, 4)), "fewer": POSES[1][:2]},
+            "cost": CHOICE,
+            "step": but(array(7), "inf") | {"zero": 0.0, "negative": -1.0, "one zero": [1.0] * 6 + [0.0]},
+            "weights": array(7) | {"zero": np.zeros(7), "negative": [1.0] * 6 + [-1.0]},
+            "limits": but(INSTANCE, "None") | {"class": Limits, "velocity": Limits(velocity=1.0)},
+            "seed": WHOLE,
             "obstacles": SEQUENCE | {"array": np.ones(3)},
             "clearance": but(NONNEGATIVE, "None"),
             "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},

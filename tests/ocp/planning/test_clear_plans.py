@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import Box, CollisionShape, FixedBase, FreeFloating, Moving, Sphere, Surroundings
+from models import Box, CollisionShape, FixedBase, FreeFloating, Moving, Sphere, Surroundings, link_frames
 from ocp import (
     Clear,
     Collocation,
@@ -33,6 +33,8 @@ from ocp.local.touching import distances_along
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.planning.motions import DOWN, bent_seam
 from tests.ocp.tasks.space_tasks import ur5
+
+pytestmark = pytest.mark.xdist_group("clear plans")  # one process, so that every motion is planned once
 
 ARM = FixedBase(armoured_arm())
 START = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
@@ -308,3 +310,16 @@ def test_what_is_refused(case: str) -> None:
 def test_an_obstacle_without_a_place() -> None:
     with pytest.raises(Exception, match="position"):
         Box(size=(0.1, 0.1, 0.1), position=None)
+
+
+def test_a_posture_that_touches_slides_along_its_self_motion_until_it_is_clear() -> None:
+    """From it alone; the tip stays where it is. What is around the tip's own place leaves none."""
+    elbow = np.array(ca.DM(link_frames(ARM.robot, START)["link4"].position)).ravel()
+    around = Surroundings(ARM, [Sphere(0.1, elbow)], 0.01)
+    assert distances_along(around, np.zeros(0), START[None], np.zeros(1)).min() < -0.05
+    found = inverse_kinematics(ARM, line(), starts=0, near=START, surroundings=around)
+    assert_allclose(tip_at(ARM, found[0].joints), FIRST, atol=1e-9)
+    assert distances_along(around, np.zeros(0), found[0].joints[None], np.zeros(1)).min() >= 0.01
+    buried = Surroundings(ARM, [Sphere(0.1, FIRST)])
+    with pytest.raises(Unreachable, match="touches"):
+        inverse_kinematics(ARM, line(), starts=0, near=START, surroundings=buried)

@@ -16,20 +16,28 @@ from scipy.optimize import linprog
 from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara_path import ScaraPath
 from ocp import ProblemError, plan_minimum_time
+from ocp.builders.joint_spline import PlannedJoints
 from ocp.schedule import JointLimits, LineLimits, Schedule, ToolLimits, joint_motion, ramp_distance, ramp_time, schedule
 from ocp.schedule import grid as grids
 from ocp.schedule import stretch as stretches
 from ocp.schedule.passes import passes
 from ocp.schedule.profile import advanced, through
+from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
 from tests.models.paths.test_paths import example
 from tests.ocp.problems import Array
 from tests.ocp.schedule.check import dense, largest
 
-pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:overlap='shrink'"),  # blends of random paths may overlap
+    pytest.mark.xdist_group("fastest"),  # one process, so that the Panda is scheduled once
+]
 
 Curve = Callable[[int, Array], Array]
 """(n, distances) -> n-th derivative of a joint by the distance."""
+TORQUE = 0.42 * np.asarray(JOINTS.torque)
+PANDA = replace(JOINTS, velocity=0.3 * np.asarray(JOINTS.velocity), torque=TORQUE)
+"""Limits of its joints, slow and weak so that every kind binds."""
 LENGTH, LINE = 2.0, LineLimits(1.0, 5.0, 200.0)
 
 
@@ -223,6 +231,34 @@ def test_windows_change_the_time_by_next_to_nothing(monkeypatch: pytest.MonkeyPa
     cut = schedule(straight(), replace(LINE, joints=limits), joints=joints)
     assert cut.duration == pytest.approx(whole.duration, rel=2e-3)
     assert largest(cut, joints).max() <= 1.001
+
+
+@pytest.fixture(scope="module")
+def panda() -> tuple[SmoothPath, PlannedJoints, Schedule]:
+    """Short lines with rounded corners, the joints along them, and their schedule in one window."""
+    path, joints = panda_path(20)
+    plan = schedule(path, LineLimits(0.5, 5.0, 200.0, 5.0, PANDA), joints=joints)
+    assert len(plan.profile.jerk) < stretches.WINDOW
+    return path, joints, plan
+
+
+@pytest.mark.parametrize(("window", "overlap"), [(120, 40), (60, 30)])
+def test_seam_after_seam_a_panda_keeps_limits_of_all_kinds_and_loses_no_time(
+    panda: tuple[SmoothPath, PlannedJoints, Schedule], window: int, overlap: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the line, and of the joints' velocity, acceleration, jerk and torque, each of which binds somewhere."""
+    path, joints, whole = panda
+    monkeypatch.setattr(stretches, "WINDOW", window)
+    monkeypatch.setattr(stretches, "OVERLAP", overlap)
+    plan = schedule(path, whole.limits, joints=joints)
+    assert len(plan.profile.jerk) > 10 * window
+    assert plan.duration == pytest.approx(whole.duration, rel=0.01)
+    motion, demand = dense(plan), largest(plan, joints)
+    torque = joints.torques(motion.distance)
+    used = torque.inertia * motion.acceleration[:, None] + torque.drag * motion.speed[:, None] ** 2 + torque.rest
+    of_joints = [*demand[:3], np.abs(used / TORQUE).max()]
+    assert max(*demand, *of_joints) <= 1.001
+    assert min(of_joints) > 0.99
 
 
 def test_without_a_jerk_limit_the_time_is_the_limit_of_high_jerks() -> None:

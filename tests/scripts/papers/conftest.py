@@ -17,10 +17,10 @@ def runs() -> dict[str, Run[Any]]:
 
 @pytest.fixture(scope="module")
 def run(request: pytest.FixtureRequest, runs: dict[str, Run[Any]], tmp_path_factory: Any) -> Run[Any]:
-    """The script of the module's PAPER, run into a temporary folder."""
+    """The script of the module's PAPER, run into a temporary folder; on the module's SAMPLE of its cases, if any."""
     paper = request.module.PAPER
     if paper.name not in runs:
-        runs[paper.name] = run_script(paper, tmp_path_factory.mktemp("results"))
+        runs[paper.name] = run_script(paper, tmp_path_factory.mktemp("results"), getattr(request.module, "SAMPLE", {}))
     return runs[paper.name]
 
 

@@ -5,23 +5,27 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeAlias, TypeVar
+from unittest.mock import patch
 
 import numpy as np
 from PIL import Image
 
 from scripts.papers.run import Paper
 
-__all__ = ["Run", "Summary", "Table", "assert_whole_picture", "column", "run_script"]
+__all__ = ["Run", "Sample", "Summary", "Table", "assert_whole_picture", "column", "run_script"]
 
 Results = TypeVar("Results")
 Table: TypeAlias = list[dict[str, str]]
 Summary: TypeAlias = Mapping[str, Any]
+Sample: TypeAlias = Mapping[tuple[ModuleType, str], Any]
+"""Constants of a script that are smaller in the tests, by module and name: a sample of its meshes, guesses, cases."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class Run(Generic[Results]):
         return {path.name for path in self.folder.iterdir()}
 
 
-def run_script(paper: Paper[Results], out: Path) -> Run[Results]:
+def run_script(paper: Paper[Results], out: Path, sample: Sample) -> Run[Results]:
     """The script, run into a folder."""
     computed: list[Results] = []
 
@@ -56,7 +60,9 @@ def run_script(paper: Paper[Results], out: Path) -> Run[Results]:
         computed.append(paper.compute())
         return computed[-1]
 
-    with redirect_stdout(StringIO()) as printed:
+    with ExitStack() as stack, redirect_stdout(StringIO()) as printed:
+        for (module, name), value in sample.items():
+            stack.enter_context(patch.object(module, name, value))
         status = replace(paper, compute=compute).main(["--out", str(out)])
     return Run(out / paper.name, printed.getvalue(), status, computed[0])
 

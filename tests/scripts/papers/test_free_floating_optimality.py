@@ -10,7 +10,7 @@ import pytest
 
 from models import paper_example
 from scripts import free_floating
-from scripts.papers.free_floating.extremals import CONFIRMED, HORIZONS, NOT_GLOBAL, STARTS
+from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL
 from scripts.papers.free_floating.false_optima import first_guess
 from scripts.papers.free_floating.optimality import costate_difference, costates, hamiltonians
 from scripts.papers.free_floating.results import (
@@ -23,7 +23,9 @@ from scripts.papers.free_floating.results import (
     Results,
 )
 from tests.scripts.papers.script_run import Run, column
-from tests.scripts.papers.test_free_floating import REFERENCE
+from tests.scripts.papers.test_free_floating import HORIZONS, REFERENCE, SAMPLE, STARTS
+
+__all__ = ["SAMPLE"]  # read by the fixture that runs the script
 
 PAPER = free_floating.PAPER
 pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once

@@ -16,6 +16,7 @@ from models.machines.standing_motion import StandingMotion
 from ocp import MultipleShooting, resolve_accelerations, solve
 from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from scripts import standing
+from scripts.papers.standing import plans
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task
 from scripts.papers.standing.checks import ALLOWED, check, failures, region_excess
 from scripts.papers.standing.drawing import arm_points
@@ -26,6 +27,8 @@ from scripts.papers.standing.tables import CAVEATS, sound
 from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 
 PAPER = standing.PAPER
+CONVERGING = (("table1", "optimal_range"), ("table2", "optimal_spring"), ("minimum_time", "in_foot"))
+SAMPLE = {(plans, "CONVERGING"): CONVERGING}  # one of every task
 pytestmark = pytest.mark.xdist_group("standing")  # one process, so that the script runs once
 
 PICTURES = (
@@ -297,8 +300,7 @@ def test_regions_of_the_zero_moment_point(run: Run[Results]) -> None:
 def test_costs_converge_with_the_intervals(run: Run[Results]) -> None:
     rows = run.table("convergence.csv")
     names = {(row["task"], row["plan"]) for row in rows}
-    assert ("table1", "optimal_range") in names
-    assert ("table2", "optimal_spring") in names
+    assert names == set(CONVERGING)
     for task, plan in names:
         mine = [row for row in rows if (row["task"], row["plan"]) == (task, plan)]
         held = {int(row["intervals"]): float(row["difference"]) for row in mine if "held" in row["method"]}
@@ -311,8 +313,7 @@ def test_costs_converge_with_the_intervals(run: Run[Results]) -> None:
             assert all(linear[n] < held[n] for n in (50, 100))
             continue
         assert held[40] > 1.8 * held[80] > 3.2 * held[160] > 0
-        if "pinned" not in plan:
-            assert abs(percent[80]) < 1  # a pinned point needs a denser grid
+        assert abs(percent[80]) < 1
         points = {int(row["intervals"]): abs(float(row["percent"])) for row in mine if "points" in row["method"]}
         assert points[20] < 0.1
         assert points[10] > 10 * points[20]

@@ -14,6 +14,8 @@ from PIL import Image
 from scripts import benchmark
 from scripts.timing import audit as benchmark_audit
 
+pytestmark = pytest.mark.xdist_group("benchmark_audit")  # one process, so that the cases are timed once
+
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:

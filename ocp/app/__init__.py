@@ -1,0 +1,9 @@
+"""The command `selfmotion`: plan from a task file, check anybody's trajectory, export, report.
+
+The only part of the packages that draws.
+"""
+
+from ocp.app.command import main
+from ocp.app.verdict import Check, Fault, Row, check_trajectory
+
+__all__ = ["Check", "Fault", "Row", "check_trajectory", "main"]

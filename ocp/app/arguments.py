@@ -1,0 +1,347 @@
+"""Options of each command, and what is done with them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from models import FixedBase, FreeFloating, HalfSpace, Robot, locked, rectangle, with_load
+from models.arrays import Array
+from models.shapes import cache
+from models.spatial import rotation_from_rpy
+from ocp.app.planned import WRITERS, check_period, export, run_task
+from ocp.app.progress import Progress
+from ocp.app.verdict import SHARE, bounds_of, check_trajectory
+from ocp.errors import ProblemError
+from ocp.files import read_trajectory, read_waypoints
+from ocp.files.obstacles import read_obstacles
+from ocp.files.task_file import read_task
+from ocp.planning import Plan
+from ocp.storage import write_text
+
+__all__ = ["Words", "subcommands"]
+
+Words: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
+"""What a command does: options and progress to exit status, text and what JSON shows."""
+
+CHECK = """Check anybody's trajectory for a robot: limits, jumps, units, clearance proven between the samples.
+
+TRAJECTORY is a CSV with a head (time, and the joints by name; NAME.velocity, NAME.acceleration if there are; a unit
+may stand in brackets: `elbow [deg]`), a JointTrajectory as JSON or YAML, or an MCAP. Between samples the motion is
+what a controller makes of it: straight lines from positions alone, cubics with velocities, quintics with
+accelerations."""
+CHECK_EXAMPLES = """examples:
+  selfmotion check panda.urdf motion.csv
+  selfmotion check panda.urdf motion.csv --acceleration 15 --jerk 7500 --acceleration panda_joint1=10
+  selfmotion check ur5.urdf log.mcap --tip tool0 --path seam.csv --path-tolerance 0.002 --obstacles cell.toml
+  selfmotion check tiago.urdf reach.json --lock gripper_finger_joint=0.02 --standing
+  selfmotion check motion.urdf motion.csv --json | jq .faults"""
+
+
+PLAN = """Plan the cheapest motion that a task file asks for, audit it, and write what the file says.
+
+The task file is TOML: [robot] urdf, tip; [path] file or points, speed; and if wanted [limits], [cost], [search],
+[surroundings], [[obstacle]], [output]. What is wrong in it is said with its line and what was expected."""
+PLAN_EXAMPLES = """examples:
+  selfmotion plan seam.toml -o seam.npz
+  selfmotion plan seam.toml --json | jq .cost
+
+seam.toml:
+  [robot]
+  urdf = "ur5_robot.urdf"
+  tip = "tool0"
+  [path]
+  points = [[0.4, -0.2, 0.3], [0.4, 0.2, 0.3]]    # m; or file = "seam.csv"
+  speed = 0.05                                    # m/s
+  direction = [0, 0, -1]                          # of the tool's z axis; its roll is free
+  [[obstacle]]
+  shape = "halfspace"
+  normal = [0, 0, 1]
+  point = [0, 0, -0.05]
+  [output]
+  plan = "seam.npz"
+  csv = "seam.csv"
+  report = "seam.html\""""
+EXPORT = """Write a plan in another format, by the end of the file's name: .csv, .json and .yaml (the fields of a ROS 2
+JointTrajectory), .mcap (joint states and the tip's path, for ROS 2 and Foxglove), .urdf (the robot as it was planned
+with)."""
+EXPORT_EXAMPLES = """examples:
+  selfmotion export seam.npz seam.csv --period 0.004
+  selfmotion export seam.npz seam.mcap"""
+REPORT = """One HTML file about a plan: the verdict in a sentence, pictures, curves with limits, the audit with units.
+It asks nothing from another host."""
+REPORT_EXAMPLES = """examples:
+  selfmotion report seam.npz seam.html --title "Seam 4, cell 2\""""
+CACHE = """What is dear to compute and depends on nothing but its input (covers of meshes, pairs that never touch) is
+kept in $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. Cleared, it is computed again."""
+CACHE_EXAMPLES = """examples:
+  selfmotion cache
+  selfmotion cache clear"""
+COMPLETION = """Print a script that completes commands, options and file names.
+
+It is made once, so that no tab starts Python:
+
+  selfmotion completion bash > ~/.local/share/bash-completion/completions/selfmotion
+  selfmotion completion zsh  > ~/.zsh/functions/_selfmotion        # a folder of $fpath"""
+
+
+def subcommands(parser: argparse.ArgumentParser) -> None:
+    """Add all commands to a parser."""
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    check = _command(commands, "check", "check anybody's trajectory", CHECK, CHECK_EXAMPLES, run_check)
+    _file(check, "robot", "URDF file of the robot")
+    _file(check, "trajectory", "CSV, JointTrajectory as JSON or YAML, or MCAP")
+    check.set_defaults(
+        called={
+            "folders=[FOLDER]": "--folder FOLDER",
+            "missing='skip'": "--no-meshes",
+            "models.rectangle(...)": "--foot",
+        }
+    )
+    robot_options(check)
+    check_options(check)
+    _file(check, "--report", "write one HTML file, too: pictures, curves with limits, every row")
+    plan = _command(commands, "plan", "plan what a task file asks for", PLAN, PLAN_EXAMPLES, run_plan)
+    plan.set_defaults(
+        called={"missing='skip'": '[surroundings] meshes = "skip"', "folders=[": "[surroundings] folders = ["}
+    )
+    _file(plan, "task", "TOML file")
+    _file(plan, "--output", "the plan (.npz), whatever the task file says", short="-o")
+    other = _command(commands, "export", "write a plan in another format", EXPORT, EXPORT_EXAMPLES, run_export)
+    _file(other, "plan", "file of a plan (.npz)")
+    _file(other, "file", f"to write: {', '.join(WRITERS)}")
+    other.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
+    report = _command(commands, "report", "one HTML file about a plan", REPORT, REPORT_EXAMPLES, run_report)
+    _file(report, "plan", "file of a plan (.npz)")
+    _file(report, "file", "HTML file to write")
+    report.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
+    report.add_argument("--title", help="of the report; the plan's file if not told")
+    kept = _command(commands, "cache", "show or clear what is kept between runs", CACHE, CACHE_EXAMPLES, run_cache)
+    kept.add_argument("action", nargs="?", choices=("show", "clear"), default="show", help="(default: show)")
+    shell = _command(commands, "completion", "print a script of shell completion", COMPLETION, "", run_completion)
+    shell.add_argument("shell", choices=("bash", "zsh"))
+    shell.set_defaults(whole=parser, quiet=True)
+
+
+def _command(commands: Any, name: str, short: str, about: str, examples: str, run: Words) -> argparse.ArgumentParser:
+    made: argparse.ArgumentParser = commands.add_parser(
+        name, help=short, description=about, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument("--json", action="store_true", help="print JSON")
+    made.add_argument("--quiet", action="store_true", help="say nothing of progress")
+    made.set_defaults(run=run, called={})
+    return made
+
+
+def _file(parser: Any, name: str, words: str, short: str = "", **more: Any) -> None:
+    if name.startswith("-"):
+        more.setdefault("metavar", "FILE")
+    action = parser.add_argument(*([short] if short else []), name, type=Path, help=words, **more)
+    action.complete = {"bash": "_shtab_compgen_files", "zsh": "_files"}  # for shtab
+
+
+def robot_options(parser: argparse.ArgumentParser) -> None:
+    """How a URDF is read."""
+    group = parser.add_argument_group("the robot")
+    group.add_argument("--tip", metavar="LINK", help="link that carries the tip")
+    group.add_argument(
+        "--lock", type=_named_number, action="append", default=[], metavar="JOINT=VALUE", help="joint held at rad or m"
+    )
+    group.add_argument("--load", type=float, metavar="KG", help="mass that the tip carries at its origin")
+    pose = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
+    group.add_argument("--mount", nargs=6, type=float, metavar=pose, help="of the base in world, m and rad")
+    _file(group, "--folder", "where package://NAME/... and meshes are; repeatable", action="append", default=[])
+    group.add_argument("--no-meshes", action="store_true", help="go on without meshes that are not found")
+
+
+def check_options(parser: argparse.ArgumentParser) -> None:
+    """What is looked at."""
+    file = parser.add_argument_group("the file")
+    file.add_argument("--columns", metavar="NAMES", help="of a table without a head: time,joint1,...")
+    file.add_argument("--period", type=float, metavar="S", help="of the samples, where there is no time")
+    rules = ("linear", "cubic", "quintic")
+    file.add_argument("--rule", choices=rules, help="how the controller joins samples (default: by what the file has)")
+    file.add_argument("--topic", help="of an MCAP with several")
+    limits = parser.add_argument_group(
+        "limits, beside those of the robot; rad, m, s, N; repeatable, one joint at a time"
+    )
+    for what in ("velocity", "acceleration", "jerk", "torque"):
+        limits.add_argument(
+            f"--{what}", type=_limit, action="append", default=[], metavar="[JOINT=]MOST", help=f"greatest {what}"
+        )
+    limits.add_argument(
+        "--share", type=float, default=SHARE, metavar="S", help="of a limit, by which it may be passed (default: 0.001)"
+    )
+    stands = parser.add_argument_group("the base")
+    base = stands.add_mutually_exclusive_group()
+    base.add_argument("--standing", action="store_true", help="it stands unfastened: look at its zero moment point")
+    base.add_argument("--floating", action="store_true", help="it floats in space: look at its momentum")
+    corners = ("X0", "X1", "Y0", "Y1")
+    stands.add_argument("--foot", nargs=4, type=float, metavar=corners, help="what it stands on, m; else its shapes")
+    stands.add_argument("--friction", type=float, default=np.inf, help="of the ground (default: no limit)")
+    around = parser.add_argument_group("surroundings")
+    _file(around, "--obstacles", "TOML of [[obstacle]] tables: shape, size, position, ...")
+    around.add_argument("--clearance", type=float, default=0.0, metavar="M", help="least distance, m (default: 0)")
+    around.add_argument("--no-clearance", action="store_true", help="do not look at distances")
+    around.add_argument(
+        "--ignore", type=_pair, action="append", default=[], metavar="LINK,LINK", help="pair that may touch; repeatable"
+    )
+    _file(around, "--srdf", "SRDF file whose disabled pairs may touch")
+    path = parser.add_argument_group("the tip's path")
+    _file(path, "--path", "waypoints (CSV: x, y, z) that the tip is to pass on straight lines")
+    path.add_argument(
+        "--path-tolerance", type=float, default=1e-3, metavar="M", help="that it may be off, m (default: 0.001)"
+    )
+    path.add_argument(
+        "--path-angle", type=float, default=np.inf, metavar="RAD", help="that its z axis may lean from the file's"
+    )
+
+
+def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `check`."""
+    progress("reading the robot")
+    robot = read_robot(options)
+    place, turn = mount_of(options)
+    progress("reading the trajectory")
+    moving = [joint.name for joint in robot.joints if joint.moves]
+    columns = None if options.columns is None else [name.strip() for name in options.columns.split(",")]
+    raw = read_trajectory(
+        options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=moving
+    )
+    foot = rectangle(options.foot[:2], options.foot[2:]) if options.foot else None
+    limits: dict[str, Any] = {
+        what: dict(getattr(options, what)) or None for what in ("velocity", "acceleration", "jerk", "torque")
+    }
+    obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
+    found = check_trajectory(
+        robot,
+        raw,
+        **limits,
+        base="standing" if options.standing else "floating" if options.floating else "fixed",
+        translation=place,
+        rotation=turn,
+        foot=foot,
+        friction=options.friction,
+        obstacles=obstacles,
+        clearance=None if options.no_clearance else options.clearance,
+        ignored=tuple(options.ignore),
+        srdf=options.srdf,
+        folders=tuple(options.folder),
+        missing="skip" if options.no_meshes else "raise",
+        path=read_waypoints(options.path) if options.path else None,
+        path_tolerance=options.path_tolerance,
+        path_angle=options.path_angle,
+        share=options.share,
+        rule=options.rule,
+        told=progress,
+    )
+    if options.report is not None:
+        progress("report")
+        from ocp.app.report import report_of_check  # draws, which takes a while to import
+
+        machine = FreeFloating(robot) if options.floating else FixedBase(robot, place, turn)
+        around = solids_of(obstacles)
+        report = report_of_check(found, machine, bounds_of(robot, **limits), around, tuple(options.folder))
+        write_text(options.report, report.html())
+    return (0 if found.passed else 1), str(found), found.to_dict()
+
+
+def solids_of(obstacles: Any) -> list[Any]:
+    """Obstacles to draw; no half-spaces."""
+    from ocp.app.pictures import solid_of
+
+    return [solid_of(one.core, one.swelling) for one in obstacles if not isinstance(one, HalfSpace)]
+
+
+def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `plan`."""
+    progress("reading the task")
+    task = read_task(options.task)
+    progress("planning")
+    return run_task(task, options.output, progress)
+
+
+def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `export`."""
+    made = Plan.load(options.plan)
+    progress("writing")
+    export(made, options.file, options.period)
+    return 0, f"written: {options.file}", {"written": str(options.file)}
+
+
+def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `report`."""
+    from ocp.app.report import report_of_plan
+
+    made = Plan.load(options.plan)
+    check_period(made, options.period)
+    progress("audit")
+    report = report_of_plan(made, options.period, options.title or str(options.plan))
+    write_text(options.file, report.html())
+    told = {"written": str(options.file), "passed": report.passed, "verdict": report.verdict}
+    return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", told
+
+
+def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `cache`."""
+    files = cache.files()
+    size = sum(file.stat().st_size for file in files)
+    if options.action == "clear":
+        for file in files:
+            file.unlink(missing_ok=True)
+    word = "cleared" if options.action == "clear" else "kept"
+    told = {"folder": str(cache.folder()), "files": len(files), "bytes": size, "cleared": options.action == "clear"}
+    return 0, f"{cache.folder()}: {len(files)} files, {size / 1e6:.3g} MB {word}", told
+
+
+def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `completion`."""
+    try:
+        import shtab
+    except ImportError as error:
+        words = "scripts of shell completion are made by the package shtab: pip install 'selfmotion[completion]'"
+        raise ProblemError(words, name="shtab") from error
+    script = shtab.complete(options.whole, options.shell)
+    return 0, script, {"shell": options.shell, "script": script}
+
+
+def read_robot(options: argparse.Namespace) -> Robot:
+    """The robot as the options read it."""
+    robot = Robot.from_urdf(options.robot, tip=options.tip)
+    if options.lock:
+        robot = locked(robot, dict(options.lock))
+    if options.load is not None:
+        robot = with_load(robot, robot.tip_link, options.load, robot.tip_translation)
+    return robot
+
+
+def mount_of(options: argparse.Namespace) -> tuple[Array, Array]:
+    """Translation (3,), m, and rotation (3, 3) of the base in world."""
+    numbers = options.mount or [0.0] * 6
+    return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)
+
+
+def _limit(text: str) -> tuple[str, float]:
+    name, _, value = text.rpartition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number, nor JOINT=NUMBER") from None
+
+
+def _named_number(text: str) -> tuple[str, float]:
+    name, value = _limit(text)
+    if not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not JOINT=VALUE")
+    return name, value
+
+
+def _pair(text: str) -> tuple[str, str]:
+    one, comma, other = text.partition(",")
+    if not comma or not one.strip() or not other.strip():
+        raise argparse.ArgumentTypeError(f"{text!r} is not two names, LINK,LINK")
+    return one.strip(), other.strip()

@@ -1,0 +1,212 @@
+"""What joints bear, against a motion: positions, velocities, accelerations and jerks at every time, torques at many.
+
+Polynomials are looked at by their Bernstein coefficients, so that nothing between two samples is passed over. Digits
+that a file has not leave room: what is beyond a limit by less than they may make is told and not held against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase, FreeFloating, Robot, inverse_dynamics, simplified
+from models.arrays import Array
+from ocp.app.oddities import Fault
+from ocp.app.pieces import Along, Indices, Motion, highest
+from ocp.problem.formulation import Sampler
+from ocp.tasks.limits import JointBounds
+
+__all__ = ["ORDERS", "Row", "floating_torques", "limit_rows", "states_along", "torque_rows"]
+
+ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
+PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Of a piece, where torques are looked at."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table of a check.
+
+    Attributes:
+        name: What was looked at, of which joint or bodies.
+        value: The worst found. limit: What it may be; None: nothing limits it. Both in `unit`; time: s.
+        verdict: "ok", "FAILED", "unlimited", "told" (nothing to hold it against) or "not decided" (the file has too few
+            digits to say).
+        note: How it was looked at, where that is not plain.
+    """
+
+    name: str
+    value: float
+    limit: float | None
+    unit: str
+    time: float | None
+    verdict: str
+    note: str = ""
+
+
+def limit_rows(
+    motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, share: float
+) -> tuple[list[Row], list[Fault], list[str]]:
+    """Rows and faults of what is limited of each joint, and what could not be looked at.
+
+    Args:
+        joints: Which of the joint vector the motion has. share: Of a limit, by which it may be passed.
+    """
+    rows: list[Row] = []
+    faults: list[Fault] = []
+    unseen = []
+    for what, per in ORDERS.items():
+        along = motion.along(what)
+        if along is None:
+            if np.isfinite(getattr(bounds, what)[joints]).any():
+                unseen.append(f"{what}, of which so few samples say nothing")
+            continue
+        note = "" if along.closed else "of any motion through the samples, by divided differences"
+        most = None if what == "position" else getattr(bounds, what)
+        for column, joint in enumerate(joints):
+            name = robot.joint_names[joint]
+            unit = robot.joint(name).unit + per
+            low, high = (bounds.lower[joint], bounds.upper[joint]) if most is None else (-most[joint], most[joint])
+            row, slight, fault = _looked(along, column, what, name, unit, float(low), float(high), share)
+            rows.append(Row(f"{what} of {name}", *row, "; ".join(filter(None, (slight, note)))))
+            faults += fault
+    return rows, faults, unseen
+
+
+def _looked(
+    along: Along, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
+) -> tuple[tuple[float, float | None, str, float | None, str], str, list[Fault]]:
+    """Value, limit, unit, time and verdict of a row, that it is slightly beyond, and the fault it is."""
+    coefficients, t = along.pieces.coefficients[:, :, column], along.pieces.t
+    blur = np.asarray(along.blur)[:, column]
+    room = share * max(abs(one) for one in (low, high) if np.isfinite(one)) if np.isfinite([low, high]).any() else 0.0
+    sides = []
+    for sign, limit in ((1.0, high), (-1.0, -low)):
+        towards = sign * coefficients
+        ends = np.maximum(towards[:, 0], towards[:, -1])
+        enclosed = towards.max(axis=1)
+        # of a piece whose enclosure is above the greatest end, or beyond the limit, the greatest value is looked for
+        open_ = np.flatnonzero((enclosed > ends.max()) | ((enclosed > limit) & (ends <= limit)))
+        value, place = ends.copy(), (towards[:, -1] > towards[:, 0]).astype(float)
+        if open_.size and towards.shape[1] > 2:
+            value[open_], place[open_] = highest(towards[open_])
+        k = int(value.argmax())
+        time = float(t[k] + place[k] * (t[k + 1] - t[k])) if towards.shape[1] > 1 else float((t[k] + t[k + 1]) / 2)
+        sides.append((value, limit, sign, k, time))
+    worst = max(sides, key=lambda side: side[0][side[3]] - side[1] if np.isfinite(side[1]) else -np.inf)
+    if not np.isfinite(worst[1]):
+        worst = max(sides, key=lambda side: float(side[0][side[3]]))
+    value, limit, sign, k, time = worst
+    found = sign * float(value[k])
+    if not np.isfinite(limit):
+        return (found, None, unit, time, "unlimited"), "", []
+    beyond = [side[0] > side[1] + room for side in sides]
+    sure = [over & (side[0] > side[1] + room + blur) for over, side in zip(beyond, sides, strict=True)]
+    allowed = sign * float(limit)
+    if not (beyond[0] | beyond[1]).any():
+        slight = f"beyond, by less than the {100 * share:g} % allowed" if value[k] > limit else ""
+        return (found, allowed, unit, time, "ok"), slight, []
+    if not (sure[0] | sure[1]).any():
+        return (found, allowed, unit, time, "not decided"), "", []
+    if not sure[0 if sign > 0 else 1].any():
+        value, limit, sign, k, time = sides[1] if sign > 0 else sides[0]
+        found, allowed = sign * float(value[k]), sign * float(limit)
+    over = sure[0] | sure[1]
+    starts = np.flatnonzero(over & ~np.concatenate([[False], over[:-1]]))
+    first = float(t[starts[0]])
+    between = ", between two samples" if along.closed and time not in t else ""
+    stretches = f"; {len(starts)} times, first from {first:.6g} s" if len(starts) > 1 else ""
+    share_over = abs(found) / abs(allowed) - 1 if allowed else np.inf
+    much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
+    text = f"{found:.5g} {unit} at {time:.6g} s{between}, limit {allowed:.5g}{much}{stretches}"
+    return (found, allowed, unit, time, "FAILED"), "", [Fault(what, name, text, time, first, found, allowed, unit)]
+
+
+def torque_rows(
+    motion: Motion,
+    machine: FixedBase | FreeFloating,
+    bounds: JointBounds,
+    gravity: Array,
+    share: float,
+    check: Callable[[], None],
+) -> tuple[list[Row], list[Fault]]:
+    """Rows and faults of torques by inverse dynamics, at five times of every piece.
+
+    Of straight lines at the samples, their velocities and accelerations by differences. A base that floats goes as the
+    joints drive it, from rest, without gravity.
+    """
+    robot = machine.robot
+    n = robot.dof
+    q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
+    if isinstance(machine, FreeFloating):
+        torque = floating_torques(machine, q, v, a)
+    else:
+        bodies = simplified(robot, frozenset())
+        torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
+    sampler = Sampler([q, v, a], [torque])
+    times, *values = states_along(motion)
+    if not len(times):
+        return [], []
+    check()
+    found = sampler(*values)[0]
+    mean = motion.q.mean(axis=0)
+    weight = np.abs(np.array(ca.Function("m", [q, a], [ca.jacobian(torque, a)])(mean, 0 * mean)))
+    blurred = motion.along("acceleration")
+    blur = weight @ (np.zeros(n) if blurred is None else np.median(np.asarray(blurred.blur), axis=0))
+    rows, faults = [], []
+    note = "at samples, by differences" if motion.rule == "linear" else "at five times of every piece"
+    for k, name in enumerate(robot.joint_names):
+        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[k])
+        at = int(np.abs(found[:, k]).argmax())
+        value, time = float(found[at, k]), float(times[at])
+        verdict = "unlimited"
+        if np.isfinite(limit):
+            beyond = np.abs(found[:, k]) > limit * (1 + share)
+            sure = beyond & (np.abs(found[:, k]) > limit * (1 + share) + blur[k])
+            verdict = "FAILED" if sure.any() else "not decided" if beyond.any() else "ok"
+            if sure.any():
+                first = float(times[np.flatnonzero(sure)[0]])
+                text = f"{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
+                faults.append(Fault("torque", name, text, time, first, value, limit, unit))
+        rows.append(Row(f"torque of {name}", value, limit if np.isfinite(limit) else None, unit, time, verdict, note))
+    return rows, faults
+
+
+def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
+    """Torques of joints whose base floats, wherever it is: it moves so that the momentum stays what it is. (n, 1)."""
+    base = ca.SX.sym("base", machine.base_size)
+    rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
+    twist = ca.mtimes(rows, machine.base_twist(base, q, v))
+    rate = machine.base_rate(base, q, v)
+    change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
+    torque = inverse_dynamics(
+        machine.robot,
+        q,
+        v,
+        a,
+        (),
+        (0.0, 0.0, 0.0),
+        machine.world_from_base(base),
+        base_twist=twist,
+        base_acceleration=change,
+    )
+    return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
+
+
+def states_along(motion: Motion) -> tuple[Array, Array, Array, Array]:
+    """Times, positions, velocities and accelerations where torques are looked at. Shape (K,), (K, n) each."""
+    t, h = motion.t, np.diff(motion.t)
+    if motion.acceleration is None:
+        if len(t) < 3:
+            return t[:0], motion.q[:0], motion.q[:0], motion.q[:0]
+        slope = np.diff(motion.q, axis=0) / h[:, None]
+        left, right = h[:-1, None], h[1:, None]
+        v = (slope[:-1] * right + slope[1:] * left) / (left + right)
+        return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
+    piece = np.repeat(np.arange(len(h)), len(PLACES))
+    place = np.tile(PLACES, len(h))
+    values = (one.within(piece, place) for one in (motion.position, motion.velocity, motion.acceleration))
+    return (t[piece] + place * h[piece], *values)  # type: ignore[return-value]

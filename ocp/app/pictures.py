@@ -1,0 +1,156 @@
+"""Pictures of a motion for a report: the robot's bodies at several times, and the curves of its joints with limits."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from models import Machine, Robot, link_frames
+from models.arrays import Array
+from models.shapes.bodies import bodies_of
+from models.shapes.hull import convex_hull
+from ocp.app.pieces import Motion
+from ocp.problem.formulation import Sampler
+from ocp.problem.hulls import frames_of
+from ocp.tasks.limits import JointBounds
+
+__all__ = ["Solid", "curves", "scene", "solids_of"]
+
+Solid = tuple[Array, NDArray[np.intp]]
+"""Corners (k, 3), m, and triangles of them (f, 3)."""
+
+PLAN, LIMIT, GREY, GREEN = "#0072B2", "#D55E00", "#6E6E6E", "#009E73"
+"""Of the motion, of what it is held against, of what stands around, of the tip: told apart with every colour vision
+(Okabe, Ito 2008)."""
+SHOWN = 4
+"""Times at which the robot is shown."""
+POINTS = 400
+"""Of a curve."""
+WIDTH = 7.4
+"""Of a picture, inches."""
+
+
+def solids_of(robot: Robot, folders: Sequence[Any] = ()) -> list[tuple[str, Solid]]:
+    """Convex bodies of a robot's links, in the frames of the links; of meshes their hulls, once each."""
+    found: list[tuple[str, Solid]] = []
+    seen = set()
+    for body in bodies_of(robot, folders=tuple(folders), missing="skip"):
+        shape: Any = body.shape
+        if body.mesh is not None:
+            if id(body.mesh) in seen:
+                continue
+            seen.add(id(body.mesh))
+            shape = body.mesh.hull
+        found.append((body.link, solid_of(shape.core, shape.swelling)))
+    return found
+
+
+def solid_of(core: Array, radius: float) -> Solid:
+    """The hull of points swelled by a radius."""
+    around = np.zeros((1, 3))
+    if radius > 0:
+        u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(-np.pi / 2, np.pi / 2, 7))
+        around = radius * np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1).reshape(-1, 3)
+    hull = convex_hull((np.asarray(core)[:, None] + around).reshape(-1, 3))
+    return np.asarray(hull.vertices), hull.faces
+
+
+def scene(
+    machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Solid], folders: Sequence[Any] = ()
+) -> bytes:
+    """The robot at several times, the last boldest, its tip's way, and what stands around; a PNG."""
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+
+    robot = machine.robot
+    base, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
+    frames = link_frames(robot, q, machine.world_from_base(base))
+    tip = ca.SX(0, 1) if robot.tip is None else machine.tip_pose(base, q).position
+    placed = ca.vertcat(*(ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in frames.values()))
+    sampler = Sampler([base, q], [placed, tip])
+    times = np.linspace(motion.t[0], motion.t[-1], POINTS)
+    places = np.zeros((POINTS, 0))
+    if bases is not None:
+        places = np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
+    placements, tips = sampler(places, motion.position.at(times))
+    rotations, positions = frames_of(placements)
+    numbers = {name: k for k, name in enumerate(frames)}
+    solids = solids_of(robot, folders)
+    figure = Figure(figsize=(WIDTH, 5.2))
+    axes: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
+    clouds = [positions[:, :-1].reshape(-1, 3)]
+    for number, k in enumerate(np.linspace(0, POINTS - 1, SHOWN).astype(int)):
+        shade = 0.16 + 0.74 * (number / (SHOWN - 1)) ** 2
+        for link, (corners, faces) in solids:
+            i = numbers[link]
+            world = corners @ rotations[k, i].T + positions[k, i]
+            clouds.append(world)
+            axes.add_collection3d(Poly3DCollection(world[faces], facecolors=PLAN, alpha=shade, shade=True))
+        if not solids:
+            lines = [[positions[k, numbers[j.parent]], positions[k, numbers[j.child]]] for j in robot.joints]
+            for line in np.array(lines):
+                axes.plot(*line.T, "-o", color=PLAN, alpha=shade, lw=2, ms=3)
+    for corners, faces in around:
+        clouds.append(corners)
+        axes.add_collection3d(Poly3DCollection(corners[faces], facecolors=GREY, alpha=0.35, shade=True))
+    if tips.shape[1]:
+        clouds.append(tips)
+        axes.plot(*tips.T, color=GREEN, lw=2.5, label="way of the tip")
+        axes.legend(loc="upper left", frameon=False)
+    cloud = np.vstack(clouds)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    room = 0.02 * float((high - low).max()) + 1e-6
+    axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    axes.set(zlim=(low[2] - room, high[2] + room), xlabel="x, m", ylabel="y, m", zlabel="z, m")
+    axes.set_box_aspect(high - low + 2 * room, zoom=1.05)
+    axes.view_init(22, -58)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=130, metadata={"Software": None})
+    return stream.getvalue()
+
+
+def curves(
+    motion: Motion, names: Sequence[str], units: Sequence[str], bounds: JointBounds, faults: Sequence[Any]
+) -> str:
+    """Position, velocity and acceleration of every joint with its limits, and where faults are; an SVG."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    kinds = [("position", ""), ("velocity", "/s"), ("acceleration", "/s²")]
+    times = np.unique(
+        np.concatenate([np.linspace(motion.t[0], motion.t[-1], POINTS), motion.t[:: len(motion.t) // POINTS + 1]])
+    )
+    along = [motion.along(kind) for kind, _ in kinds]
+    with matplotlib.rc_context(
+        {"font.size": 7.5, "svg.hashsalt": "selfmotion", "axes.spines.top": False, "axes.spines.right": False}
+    ):
+        figure = Figure(figsize=(WIDTH, 0.4 + 1.15 * len(names)), layout="constrained")
+        grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
+        for row, name in enumerate(names):
+            for column, (kind, per) in enumerate(kinds):
+                ax, one = grid[row, column], along[column]
+                most = getattr(bounds, kind, None)
+                limits = (bounds.lower[row], bounds.upper[row]) if most is None else (-most[row], most[row])
+                if one is not None:
+                    ax.plot(times, one.pieces.at(times)[:, row], color=PLAN, lw=1.2)
+                for limit in limits:
+                    if np.isfinite(limit):
+                        ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+                for fault in faults:
+                    if fault.name == name and fault.kind == kind and fault.time is not None:
+                        ax.axvline(fault.time, color=LIMIT, lw=1.4, alpha=0.6)
+                if row == 0:
+                    ax.set_title(kind, fontsize=8.5)
+                ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
+                ax.margins(x=0.01)
+        for ax in grid[-1]:
+            ax.set_xlabel("time, s")
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,480 @@
+"""All postures that do a task at some instants, covered by charts: boxes in tangent spaces of the set of solutions.
+
+Where a task leaves r of n joints free, the postures that do it at one time form curves (r = 1), surfaces (r = 2) or lie
+apart (r = 0). A chart is a posture, the r directions in which it can move without moving the tip, and how far a box of
+such moves stays near the set. The set is covered from the solutions of inverse kinematics at all instants: wherever the
+edge of a chart lies in no other chart, the next one is put there, until the union of the charts has no edge but at the
+joints' limits (Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Curves so are found
+whole, folds and branches that meet are nothing special, and no angle has to be chosen to list them by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise, product
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from models import Machine
+from models.arrays import Array
+from ocp.errors import ProblemError
+from ocp.problem.formulation import Sampler
+from ocp.tasks.equations import TaskEquations
+
+__all__ = ["Charts", "Held", "Instant", "JointSpace", "SelfMotions", "point"]
+
+Indices = NDArray[np.intp]
+
+EXACT = 1e-9
+"""m and rad: what a posture may miss its task by."""
+CORRECTIONS = 12
+"""Newton steps at most; from a tangent space a few are enough."""
+SINGULAR = 1e-9
+"""Singular value of a task's Jacobian relative to the largest below which a row counts as dependent."""
+REACH = 0.9
+"""Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by the rest."""
+BENT = 0.1
+"""Share of its radius by which the set may leave a chart at its edge; the radius is halved until it does not."""
+HALVINGS = 7
+"""Of the radius, at most: nearer to singular postures the cover ends, and says so."""
+NEIGHBOURS = 12
+"""Charts in which a point of an edge is looked for."""
+APART = 1e3
+"""Distance between the sets of two instants in the tree that neighbours are looked up in."""
+TURN = 2 * np.pi
+
+
+class JointSpace:
+    """Where postures lie: joints that turn without end come round, and distances are those of the squared rates.
+
+    Attributes:
+        scale: Square roots of the weights: the metric is |scale * dq|. Shape (n,).
+        periodic: Which joints turn without end; two turns within their limits do, since one of these can be chosen.
+        lower, upper: Limits of the others. Shape (n,).
+    """
+
+    def __init__(self, machine: Machine, lower: Array, upper: Array, weights: Array) -> None:
+        robot = machine.robot
+        coupled = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+        turns = [joint.kind != "prismatic" and joint.name not in coupled for joint in robot.moving_joints]
+        self.scale = np.sqrt(weights)
+        self.periodic = np.array(turns) & ~(upper - lower < 2 * TURN - 1e-6)
+        self.lower = np.where(self.periodic, -np.inf, lower)
+        self.upper = np.where(self.periodic, np.inf, upper)
+
+    def difference(self, to: Array, of: Array) -> Array:
+        """to - of, (..., n), the shorter way round for joints that turn without end."""
+        apart = to - of
+        around = apart[..., self.periodic]
+        apart[..., self.periodic] = around - TURN * np.round(around / TURN)
+        return np.asarray(apart)
+
+    def length(self, way: Array) -> Array:
+        """Of ways (..., n) in the metric."""
+        return np.asarray(np.linalg.norm(way * self.scale, axis=-1))
+
+    def within(self, joints: Array) -> NDArray[np.bool_]:
+        """Whether postures (..., n) keep the limits."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((joints >= self.lower - EXACT) & (joints <= self.upper + EXACT)).all(axis=-1))
+
+    def tree(self, joints: Array, layer: Indices | None = None) -> Any:
+        """Tree of postures (M, n), to be asked with what `placed` says; those of other layers are far."""
+        size = np.zeros(1 + joints.shape[1])
+        size[1:][self.periodic] = (TURN * self.scale)[self.periodic]
+        return cKDTree(self.placed(joints, layer), boxsize=size)
+
+    def placed(self, joints: Array, layer: Indices | None = None) -> Array:
+        """Points of the tree."""
+        wrapped = joints.copy()
+        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], TURN)
+        return np.column_stack([np.zeros(len(joints)) if layer is None else APART * layer, wrapped * self.scale])
+
+
+@dataclass(frozen=True, eq=False)
+class Charts:
+    """Parts of the set of postures, of some instants.
+
+    Attributes:
+        layer: Number of the instant. Shape (N,).
+        centers: Postures, rad or m. Shape (N, n).
+        tangents: Directions that keep the tip where it is, orthonormal in the metric. Shape (N, n, r).
+        radii: Half widths of the boxes, in the metric. Shape (N,).
+        low, high: Ends of the boxes, nearer where the joints' limits are. Shape (N, r).
+        strays: From the corners of the box, and the middles of its sides, to the set. Shape (N, c, n).
+    """
+
+    layer: Indices
+    centers: Array
+    tangents: Array
+    radii: Array
+    low: Array
+    high: Array
+    strays: Array
+
+    def __len__(self) -> int:
+        return len(self.layer)
+
+    def of(self, chosen: Any) -> Charts:
+        """Some of them."""
+        return Charts(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def by_layer(self, count: int) -> list[Charts]:
+        """Those of each of so many instants."""
+        order = np.argsort(self.layer, kind="stable")
+        ends = np.searchsorted(self.layer[order], np.arange(count + 1))
+        return [self.of(order[first:last]) for first, last in pairwise(ends.tolist())]
+
+    @property
+    def spans(self) -> Array:
+        """How far the boxes reach from their centres, by joints. Shape (N, n)."""
+        reach = np.maximum(np.abs(self.low), np.abs(self.high))
+        return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.most_stray)
+
+    @property
+    def most_stray(self) -> Array:
+        """How far the set leaves the boxes, by joints. Shape (N, n)."""
+        return np.asarray(np.abs(self.strays).max(axis=1, initial=0.0))
+
+    def bent(self) -> tuple[Array, Array]:
+        """How the set leaves the boxes: the quadratic form nearest to that, (N, n, r, r), and the rest, (N, c, n)."""
+        r = self.tangents.shape[2]
+        rim, count = _rim(r), self.strays.shape[1]
+        rows, columns = np.triu_indices(r)
+        terms = rim[:, rows] * rim[:, columns] * np.where(rows == columns, 0.5, 1.0)
+        bends = np.zeros((*self.tangents.shape, r))
+        if not r or not count:
+            return bends, self.strays
+        found = np.einsum("tc,kcn->knt", np.linalg.pinv(terms), self.strays)
+        bends[:, :, rows, columns] = bends[:, :, columns, rows] = found / self.radii[:, None, None] ** 2
+        return bends, self.strays - np.einsum("ct,knt->kcn", terms, found)
+
+
+def point(joints: Array) -> Charts:
+    """The chart of a posture (n,) alone."""
+    n, none = len(joints), np.zeros((1, 0))
+    strays = np.zeros((1, 0, n))
+    return Charts(np.zeros(1, dtype=np.intp), joints[None], np.zeros((1, n, 0)), np.zeros(1), none, none, strays)
+
+
+def together(parts: list[Charts]) -> Charts:
+    """One after the other."""
+    return Charts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Charts.__dataclass_fields__))
+
+
+class _Edges(NamedTuple):
+    """Points at the edges of charts.
+
+    Attributes:
+        layer: Shape (E,). points: On the set. Shape (E, n). ways: Unit vectors away from the chart. Shape (E, n).
+        owners: Charts that they belong to. Shape (E,). radii: Of the charts to be put there. Shape (E,).
+    """
+
+    layer: Indices
+    points: Array
+    ways: Array
+    owners: Indices
+    radii: Array
+
+    def of(self, chosen: Any) -> _Edges:
+        return _Edges(*(part[chosen] for part in self))
+
+
+@dataclass(frozen=True, eq=False)
+class Held(TaskEquations):
+    """Equations of tasks and a last row: one joint is to be where the last of the targets says.
+
+    Attributes:
+        joint: Its number.
+    """
+
+    joint: int
+
+    @property
+    def size(self) -> int:
+        return super().size + 1
+
+    def error(self, base: Any, joints: Any, targets: Any) -> Any:
+        return ca.vertcat(super().error(base, joints, targets[:-1]), targets[-1] - joints[self.joint])
+
+    def jacobian(self, base: Any, joints: Any) -> Any:
+        row = ca.DM.eye(self.machine.joint_size)[self.joint, :]
+        return ca.vertcat(super().jacobian(base, joints), row)
+
+
+class SelfMotions:
+    """The sets of postures that do a task at some instants.
+
+    Attributes:
+        space: Where they lie.
+        size: How many directions are free in a regular posture.
+        lost: Edges of charts beyond which nothing was found, near singular postures.
+    """
+
+    def __init__(self, space: JointSpace, equations: TaskEquations, targets: Array) -> None:
+        """
+        Args:
+            space: Of the machine's joints, which stands on a fixed base.
+            equations: Of poses.
+            targets: Of the equations at each instant. Shape (K, size).
+        """
+        self.space, self.equations, self.targets = space, equations, targets
+        n = equations.machine.joint_size
+        self.size, self.lost = n - equations.size, 0
+        q, wanted, none = ca.SX.sym("q", n), ca.SX.sym("wanted", targets.shape[1]), ca.SX(0, 1)
+        parts = [equations.error(none, q, wanted), equations.jacobian(none, q)]
+        self._sampler = Sampler([q, wanted], parts)
+
+    # ---- postures ------------------------------------------------------------------------------------------------
+
+    def linearised(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
+        """What the tasks miss (M, m), and their Jacobian by joints of the metric (M, m, n)."""
+        error, jacobian = self._sampler(joints, self.targets[layer])
+        m, n = error.shape[1], joints.shape[1]
+        return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
+
+    def corrected(self, layer: Indices, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """The nearest postures that do the task, by Newton's method, shape (M, n), and whether they do. Shape (M,)."""
+        found = joints.copy()
+        good = np.zeros(len(found), dtype=bool)
+        busy = np.arange(len(found))
+        for _ in range(CORRECTIONS):
+            if not busy.size:
+                break
+            error, jacobian = self.linearised(layer[busy], found[busy])
+            worst = np.abs(error).max(axis=1, initial=0.0)
+            done = worst < EXACT
+            good[busy[done]] = True
+            on = ~done & np.isfinite(worst)
+            busy, error, jacobian = busy[on], error[on], jacobian[on]
+            if busy.size:
+                step = np.einsum("kmn,km->kn", jacobian, _solved(jacobian @ jacobian.transpose(0, 2, 1), error))
+                found[busy] += np.clip(step, -1.0, 1.0) / self.space.scale
+        return found, good
+
+    def tangents_at(self, layer: Indices, joints: Array, like: Array | None = None) -> Array:
+        """Directions that keep the tips where they are, orthonormal in the metric, turned as others are.
+
+        Args:
+            joints: Shape (M, n). like: Directions to be near to, shape (M, n, r).
+        """
+        _, jacobian = self.linearised(layer, joints)
+        r = self.size if like is None else like.shape[2]
+        _, _, rows = np.linalg.svd(jacobian, full_matrices=True)
+        free = rows[:, rows.shape[1] - r :].transpose(0, 2, 1)
+        if like is not None and r:
+            left, _, right = np.linalg.svd(free.transpose(0, 2, 1) @ (like * self.space.scale[:, None]))
+            free = free @ (left @ right)
+        return np.asarray(free / self.space.scale[:, None])
+
+    # ---- charts --------------------------------------------------------------------------------------------------
+
+    def at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
+        """Charts about postures, their radii halved until the set stays near, and where it is at their rims.
+
+        Returns:
+            The charts, and the points of the set at the rims, shape (N, c, n), nan where none was found.
+        """
+        tangents = self.tangents_at(layer, joints, like)
+        rim = _rim(tangents.shape[2])
+        radii = radii.copy()
+        strays = np.zeros((len(joints), len(rim), joints.shape[1]))
+        points = np.full_like(strays, np.nan)
+        busy = np.arange(len(joints))
+        for halving in range(HALVINGS + 1):
+            if not busy.size:
+                break
+            on, apart = self._strays(layer[busy], joints[busy], tangents[busy], radii[busy])
+            points[busy], strays[busy] = on, apart
+            far = ~(self.space.length(apart) <= BENT * radii[busy, None]).all(axis=1)
+            if halving < HALVINGS:
+                radii[busy[far]] /= 2
+            busy = busy[far]
+        return self._within(layer, joints, tangents, radii, strays), points
+
+    def _within(self, layer: Indices, joints: Array, tangents: Array, radii: Array, strays: Array) -> Charts:
+        """Charts, their boxes cut where no posture of theirs is within the joints' limits."""
+        strays = np.nan_to_num(strays)
+        stray = np.abs(strays).max(axis=1, initial=0.0)
+        reach = np.abs(tangents) * radii[:, None, None]
+        others = reach.sum(axis=2)[:, :, None] - reach
+        up, down = self.space.upper - joints + stray, joints - self.space.lower + stray
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (np.stack([up, down])[:, :, :, None] + others) / np.abs(tangents)
+            rising = tangents > 0
+            high = np.where(rising, far[0], far[1]).min(axis=1)
+            low = np.where(rising, far[1], far[0]).min(axis=1)
+        limit = radii[:, None]
+        return Charts(layer, joints, tangents, radii, -np.fmin(low, limit), np.fmin(high, limit), strays)
+
+    def _strays(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
+        """Points of the set at the rims of boxes, nan where there are none, and how far they are from these."""
+        rim = _rim(tangents.shape[2])
+        flat = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
+        on, good = self.corrected(np.repeat(layer, len(rim)), flat.reshape(-1, joints.shape[1]))
+        on = np.where(good[:, None], on, np.nan).reshape(flat.shape)
+        return on, on - flat
+
+    def inside(self, charts: Charts) -> NDArray[np.bool_]:
+        """Which charts have a part within the joints' limits. Shape (N,)."""
+        low, high = charts.centers - charts.spans, charts.centers + charts.spans
+        reached = ((high >= self.space.lower) & (low <= self.space.upper)).all(axis=1)
+        return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
+
+    def cover(self, layer: Indices, joints: Array, radius: float, most: int) -> Charts:
+        """Charts of all that is connected with some postures, at their instants or from one instant to the next.
+
+        Args:
+            layer, joints: The postures, which do their tasks. Shapes (M,), (M, n).
+            radius: Of the charts, at most.
+            most: Charts, beyond which the set is too large.
+
+        Raises:
+            ProblemError: There are more.
+        """
+        charts = self._grown(None, layer, joints, radius, most)
+        last, new = len(self.targets) - 1, charts
+        while len(new):
+            layer = np.concatenate([new.layer - 1, new.layer + 1])
+            within = np.flatnonzero((layer >= 0) & (layer <= last))
+            there, good = self.corrected(layer[within], np.tile(new.centers, (2, 1))[within])
+            good &= self.space.within(there)
+            layer, there = layer[within][good], there[good]
+            fresh = ~self.covered(charts, layer, there)
+            before = len(charts)
+            charts = self._grown(charts, layer[fresh], there[fresh], radius, most)
+            new = charts.of(slice(before, None))
+        return charts
+
+    def _grown(self, known: Charts | None, layer: Indices, joints: Array, radius: float, most: int) -> Charts:
+        """The charts that are known, and those of all that is connected with some postures at their instants."""
+        number = 0 if known is None else len(known)
+        charts, edges = self._begun(layer, joints, np.full(len(layer), radius), None, number)
+        charts = charts if known is None else together([known, charts])
+        edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
+        while len(edges.layer):
+            beyond = edges.points + REACH * edges.radii[:, None] * edges.ways
+            joints, good = self.corrected(edges.layer, beyond)
+            shift = self.space.length(joints - beyond)
+            good &= shift <= 2 * BENT * edges.radii
+            chosen = np.flatnonzero(good)
+            chosen = chosen[self._apart(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
+            like = charts.tangents[edges.owners[chosen]]
+            new, ends = self._begun(
+                edges.layer[chosen], joints[chosen], np.minimum(2 * edges.radii[chosen], radius), like, len(charts)
+            )
+            tight = edges.radii / 2  # of what is not covered by these: nearer by
+            charts = together([charts, new])
+            if len(charts) > most:
+                words = (
+                    f"more than {most} charts of {radius:.3g} rad cover the postures that do the task; "
+                    "take larger ones, or fewer instants"
+                )
+                raise ProblemError(words, name="postures", value=len(charts), limit=most)
+            kept = edges._replace(radii=tight)
+            narrow = tight < radius / 2**HALVINGS
+            self.lost += int(narrow.sum())
+            kept = kept.of(~narrow)
+            edges = _Edges(*(np.concatenate(pair) for pair in zip(kept, ends, strict=True)))
+            edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
+        return charts
+
+    def halved(self, charts: Charts) -> Charts:
+        """Charts of half the radius in their place."""
+        r = charts.tangents.shape[2]
+        signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
+        flat = charts.centers[:, None] + charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
+        shape = flat.shape
+        layer = np.repeat(charts.layer, shape[1])
+        joints, good = self.corrected(layer, flat.reshape(-1, shape[2]))
+        like = np.repeat(charts.tangents, shape[1], axis=0)
+        stray = self.space.length(charts.strays).max(axis=1, initial=0.0)
+        radii = np.repeat(charts.radii / 2 + stray, shape[1])  # a box is turned against that which it lies in
+        whole = good.reshape(shape[:2]).all(axis=1)
+        part = np.flatnonzero(np.repeat(whole, shape[1]))
+        layer, joints, radii = layer[part], joints[part], radii[part]
+        tangents = self.tangents_at(layer, joints, like[part])
+        strays = self._strays(layer, joints, tangents, radii)[1]
+        new = self._within(layer, joints, tangents, radii, strays)
+        return together([new.of(self.inside(new)), charts.of(~whole)])
+
+    def covered(self, charts: Charts, layer: Indices, joints: Array, but: Indices | None = None) -> NDArray[np.bool_]:
+        """Whether postures lie in charts; of edges, in others `but` their own. Shape (M,)."""
+        if not len(layer) or not len(charts):
+            return np.zeros(len(layer), dtype=bool)
+        r = charts.tangents.shape[2]
+        within = 2 * float(charts.radii.max()) * np.sqrt(max(r, 1)) + 1e-6
+        tree = self.space.tree(charts.centers, charts.layer)
+        count = min(NEIGHBOURS * 2 ** max(r - 1, 0), len(charts))
+        _, near = tree.query(self.space.placed(joints, layer), k=count, distance_upper_bound=within)
+        near = np.reshape(near, (len(layer), -1))
+        found = np.zeros(len(layer), dtype=bool)
+        for column in near.T:
+            rows = np.flatnonzero((column < len(charts)) & ~found)
+            if but is not None:
+                rows = rows[column[rows] != but[rows]]
+            which = column[rows]
+            apart = self.space.difference(joints[rows], charts.centers[which]) * self.space.scale
+            flat = np.einsum("kn,knr->kr", apart, charts.tangents[which] * self.space.scale[:, None])
+            normal = np.sqrt(np.maximum((apart**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
+            radii = charts.radii[which]
+            near = normal <= 2 * BENT * radii + 1e-6
+            found[rows] = near & (np.abs(flat) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
+        return found
+
+    def _apart(self, layer: Indices, joints: Array, radii: Array) -> Indices:
+        """Of postures to put charts at, those that are not within the radius of one before."""
+        if not len(layer):
+            return np.zeros(0, dtype=np.intp)
+        tree = self.space.tree(joints, layer)
+        pairs = tree.query_pairs(float(radii.max()), output_type="ndarray")
+        kept = np.ones(len(layer), dtype=bool)
+        if len(pairs):
+            far = self.space.length(self.space.difference(joints[pairs[:, 0]], joints[pairs[:, 1]]))
+            pairs = pairs[far < np.minimum(radii[pairs[:, 0]], radii[pairs[:, 1]])]
+            for one, other in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
+                if kept[one]:
+                    kept[other] = False
+        return np.flatnonzero(kept)
+
+    def _begun(
+        self, layer: Indices, joints: Array, radii: Array, like: Array | None, number: int = 0
+    ) -> tuple[Charts, _Edges]:
+        """Charts about postures, and the points of their edges within limits; the first one has the given number."""
+        if like is None:
+            kept = self._apart(layer, joints, radii)
+            layer, joints, radii = layer[kept], joints[kept], radii[kept]
+        charts, points = self.at(layer, joints, radii, like)
+        good = self.inside(charts)
+        charts, points = charts.of(good), points[good]
+        owner, side = np.nonzero(self.space.within(points))
+        ways = np.einsum("enr,er->en", charts.tangents[owner], _rim(charts.tangents.shape[2])[side])
+        return charts, _Edges(charts.layer[owner], points[owner, side], ways, number + owner, charts.radii[owner])
+
+
+class Instant(NamedTuple):
+    """Which set of postures of whose."""
+
+    sets: SelfMotions
+    number: int
+
+
+def _rim(r: int) -> Array:
+    """Places at the rim of a box of half width 1: the middles of its sides, and its corners. Shape (c, r)."""
+    middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
+    corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
+    found = [*middles, *corners]
+    return np.array(found).reshape(len(found), r)
+
+
+def _solved(square: Array, right: Array) -> Array:
+    """Solutions (K, m) of normal equations (K, m, m), those that are singular softened."""
+    m = square.shape[1]
+    if not m:
+        return right
+    size = np.trace(square, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(np.linalg.solve(square + (SINGULAR**2 * size + 1e-300) * np.eye(m), right[:, :, None])[:, :, 0])

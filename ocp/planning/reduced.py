@@ -1,0 +1,227 @@
+"""Many states of a machine whose base moves by itself, moved at once: its kinematics in the scaled rates of the joints.
+
+With the scaled rates p = sqrt(W) dq/dt the running cost is |p|^2 / 2. Those that do a task, A p = v, are the least ones
+and any in the null space of A, its self-motion; the base moves along as its momentum is conserved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from models import Machine
+from models.arrays import Array
+from ocp.problem.formulation import Sampler
+from ocp.tasks.equations import TaskEquations
+
+__all__ = ["ReducedKinematics", "Slopes", "within"]
+
+SINGULAR = 1e-9
+"""Relative to the largest: what counts as a dependent row."""
+NEARLY = 1e-9
+"""rad/s or m/s: what rates may pass a limit by."""
+LOW, HIGH, SLOW, FAST = range(4)
+"""Limits of a joint: of its position, and of its rate."""
+
+
+class Slopes(NamedTuple):
+    """Kinematics at K states of n joints, m rows of tasks and a base of size b.
+
+    Attributes:
+        right, error: What the rates are to give, and what poses are off. Shape (K, m).
+        base, drift: The base's rate is base @ p + drift. Shapes (K, b, n), (K, b).
+        ways, lower: A = lower @ ways', the ways orthonormal, lower triangular. Shapes (K, n, m), (K, m, m).
+        null: Directions in which nothing is done for the task, orthonormal. Shape (K, n, r).
+    """
+
+    right: Array
+    error: Array
+    base: Array
+    drift: Array
+    ways: Array
+    lower: Array
+    null: Array
+
+    def of(self, rows: Any) -> Slopes:
+        """Of some states."""
+        return Slopes(*(part[rows] for part in self))
+
+    def given(self, rates: Array) -> Array:
+        """What scaled rates (K, n) do for the task. Shape (K, m)."""
+        done: Array = self.lower @ (self.ways.transpose(0, 2, 1) @ rates[:, :, None])
+        return done[:, :, 0]
+
+    def least(self, wanted: Array) -> Array:
+        """Least scaled rates (K, n) that give what is wanted (K, m)."""
+        if not wanted.shape[1]:
+            return np.zeros(self.null.shape[:2])
+        found: Array = self.ways @ np.linalg.solve(self.lower, wanted[:, :, None])
+        return found[:, :, 0]
+
+    def idle(self, rates: Array) -> Array:
+        """The part of scaled rates (K, n) that does nothing for the task."""
+        used: Array = self.ways @ (self.ways.transpose(0, 2, 1) @ rates[:, :, None])
+        return np.asarray(rates - used[:, :, 0])
+
+    def moved(self, rates: Array) -> Array:
+        """Rates of the base (K, b) to those of the joints, but for its drift."""
+        return np.asarray((self.base @ rates[:, :, None])[:, :, 0])
+
+
+class ReducedKinematics:
+    """Of a machine that does tasks, or none.
+
+    Attributes:
+        rows: Of the tasks. equations: Of these, or None.
+        root: Square roots of the weights. Shape (n,).
+    """
+
+    def __init__(self, machine: Machine, equations: TaskEquations | None, weights: Array) -> None:
+        self.root, self.equations, self.rows = np.sqrt(weights), equations, 0 if equations is None else equations.size
+        n = machine.joint_size
+        b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", n), ca.SX.sym("u", n)
+        self._targets = None if equations is None else equations.target_function()
+        symbols = [b, q]
+        parts = [ca.jacobian(machine.base_rate(b, q, u), u), machine.base_rate(b, q, ca.DM.zeros(n))]
+        if equations is not None:
+            assert self._targets is not None
+            symbols.append(wanted := ca.SX.sym("targets", self._targets.numel_out()))
+            parts += [equations.jacobian(b, q), equations.right(b, q, wanted), equations.error(b, q, wanted)]
+        self._sampler = Sampler(symbols, parts)
+
+    def at(self, base: Array, joints: Array, time: float) -> Slopes:
+        """At states (K, b), (K, n)."""
+        count, n = joints.shape
+        given = [base, joints]
+        if self._targets is not None:
+            given.append(np.array(self._targets(time)).ravel())
+        turning, drift, *task = self._sampler(*given)
+        matrix, right, error = task if task else (np.zeros((count, 0)),) * 3
+        turning = turning.reshape(count, n, -1).transpose(0, 2, 1) / self.root
+        whole, upper = np.linalg.qr(matrix.reshape(count, n, self.rows) / self.root[:, None], mode="complete")
+        lower = upper[:, : self.rows].transpose(0, 2, 1).copy()
+        for i in range(self.rows):  # rows that depend on others give what they can
+            least = SINGULAR * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
+            lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < least, least, lower[:, i, i])
+        if self.equations is not None:
+            error = np.where(self.equations.posed, error, 0.0)
+        return Slopes(right, error, turning, drift, whole[:, :, : self.rows], lower, whole[:, :, self.rows :])
+
+    def speed(self, base: Array, joints: Array, time: float) -> Array:
+        """About how large squared scaled rates (K,) the tasks of then need, far from singularities."""
+        if self.equations is None:
+            return np.zeros(len(joints))
+        tasks = [part.task for part in self.equations.bound]
+        gains = np.repeat([float(task.gain) for task in tasks], [task.size for task in tasks])
+        slopes = self.at(base, joints, time)
+        moved = ((slopes.right - gains * slopes.error) ** 2).sum(axis=1)
+        return np.asarray(self.rows * moved / (slopes.lower**2).sum(axis=(1, 2)))
+
+    def missed(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
+        """How fast joint rates (K, n) move tips off what velocities ask for, and how fast these are. Shapes (K,)."""
+        none = np.zeros(len(joints))
+        if self.equations is None or self.equations.posed.all():
+            return none, none
+        slopes, rows = self.at(base, joints, time), ~self.equations.posed
+        return np.linalg.norm((slopes.given(rates * self.root) - slopes.right)[:, rows], axis=1), np.linalg.norm(
+            slopes.right[:, rows], axis=1
+        )
+
+    def stepped(
+        self, base: Array, joints: Array, slopes: Slopes, rates: Array, begin: float, end: float, exact: float
+    ) -> tuple[Array, Array, Array]:
+        """States after a step with the self-motion of scaled rates (K, n), by the rule of the middle.
+
+        Returns:
+            Base (K, b), joints (K, n), and what is left of the errors of poses (K,), corrected until they are `exact`.
+        """
+        step, first = end - begin, joints
+        half = base + step / 2 * (slopes.moved(rates) + slopes.drift)
+        middle = self.at(_sound(half), joints + step / 2 * rates / self.root, begin + step / 2)
+        rates = middle.least(middle.right) + middle.idle(slopes.idle(rates))
+        base, joints = _sound(base + step * (middle.moved(rates) + middle.drift)), joints + step * rates / self.root
+        if self.equations is None or self.equations.posed.all():
+            return self.corrected(base, joints, end, exact)
+
+        def missed(there: Slopes, joints: Array) -> Array:
+            """Of the ways that velocities ask for in this step, by Simpson's rule."""
+            straight = (joints - first) * self.root
+            parts = ((1, slopes), (4, middle), (1, there))
+            return np.asarray(sum(k / 6 * (step * each.right - each.given(straight)) for k, each in parts))
+
+        return self.corrected(base, joints, end, exact, missed=missed)
+
+    def corrected(
+        self,
+        base: Array,
+        joints: Array,
+        time: float,
+        exact: float,
+        most: int = 3,
+        missed: Callable[[Slopes, Array], Array] | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """States with the errors of their poses taken back; returns and `exact` as of `stepped`.
+
+        Args:
+            most: Newton steps.
+            missed: Of slopes and joints there what velocities ask for and was not done, in all rows. Shape (K, m).
+        """
+        off = np.zeros(len(joints))
+        if self.equations is None or (missed is None and not self.equations.posed.any()):
+            return base, joints, off
+        for number in range(most + 1):
+            slopes = self.at(base, joints, time)
+            error = (
+                slopes.error if missed is None else np.where(self.equations.posed, slopes.error, missed(slopes, joints))
+            )
+            off = np.abs(error).max(axis=1)
+            off = np.where(np.isfinite(off), off, np.inf)
+            if number == most or off.max(initial=0.0) <= exact:
+                break
+            rates = slopes.least(error)
+            rates /= np.maximum(np.linalg.norm(rates, axis=1, keepdims=True), 1.0)
+            base, joints = _sound(base + slopes.moved(rates)), joints + rates / self.root
+        return base, joints, off
+
+
+def _sound(base: Array) -> Array:
+    """Configurations of bases (K, b), their quaternions of length one."""
+    if base.shape[1] == 7:
+        base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1, keepdims=True)
+    return base
+
+
+def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Rates (K, n) bent along self-motions so that each keeps its limits.
+
+    Args:
+        null: Directions of the self-motions. Shape (K, n, r).
+        low, high: Limits. Shape (K, n).
+        fast: Limits of the rates alone. Shape (n,).
+
+    Returns:
+        The rates, and of each the joint that cannot keep a limit and which one (LOW, HIGH, SLOW, FAST), or -1. (K, 2).
+    """
+    rates, why = rates.copy(), np.full((len(rates), 2), -1, dtype=np.intp)
+    busy = np.arange(len(rates))
+    for _ in range(2 * rates.shape[1] + 1):  # of each joint both limits
+        over = np.maximum(rates[busy] - high[busy], low[busy] - rates[busy])
+        worst = over.argmax(axis=1)
+        beyond = over[np.arange(len(busy)), worst] > NEARLY
+        why[busy[~beyond]] = -1
+        busy, worst = busy[beyond], worst[beyond]
+        if not busy.size:
+            break
+        below = rates[busy, worst] < low[busy, worst]
+        limit = np.where(below, low[busy, worst], high[busy, worst])
+        of_rate = np.abs(limit) >= fast[worst]
+        why[busy, 0], why[busy, 1] = worst, np.where(below, LOW, HIGH) + np.where(of_rate, SLOW, LOW)
+        turn = null[busy, worst]
+        lever = (turn**2).sum(axis=1)
+        share = np.where(lever > SINGULAR, (limit - rates[busy, worst]) / np.maximum(lever, SINGULAR), 0.0)
+        rates[busy] += share[:, None] * (null[busy] @ turn[:, :, None])[:, :, 0]
+    return rates, why

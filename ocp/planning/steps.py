@@ -1,0 +1,420 @@
+"""What the straight step between two instants costs at least, from one chart into another, by the place it begins at.
+
+The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts touch the
+sets; what a set bends away from them is taken into account, and for the rest it is assumed that within a box it strays
+no farther than at the rim.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from models.arrays import Array
+from ocp.planning.charts import Charts
+
+__all__ = [
+    "Homogeneous",
+    "Largest",
+    "Length",
+    "Sheets",
+    "Squares",
+    "StepCost",
+    "Steps",
+    "Values",
+    "least_in_box",
+    "lowest_curvature",
+]
+
+MEETINGS = 8
+"""Times that the least of the largest is looked for where lines meet."""
+NEAREST = 2
+"""Times that the nearest places of two charts are looked for, in one and in the other."""
+CONCAVE = 0.5
+"""Curvature of values, of the step's own, that is taken as it is; what is more concave is bounded by its ends."""
+
+
+class Values(NamedTuple):
+    """Bounds of what is to come (or has been) on the charts of an instant: least + slope . t + t . curve . t / 2.
+
+    Attributes:
+        least: Infinite where nothing leads on. Shape (N,). slope: Shape (N, r). curve: Symmetric. Shape (N, r, r).
+    """
+
+    least: Array
+    slope: Array
+    curve: Array
+
+    def of(self, chosen: Any) -> Values:
+        """Some of them."""
+        return Values(*(part[chosen] for part in self))
+
+
+class Sheets(NamedTuple):
+    """Charts, and how the set that they touch bends away from them: bends[t, t] / 2 + rest.
+
+    Attributes:
+        charts: N of them. bends: Shape (N, n, r, r). rest: At the rim. Shape (N, c, n).
+    """
+
+    charts: Charts
+    bends: Array
+    rest: Array
+
+    def of(self, chosen: Any) -> Sheets:
+        """Some of them."""
+        return Sheets(self.charts.of(chosen), self.bends[chosen], self.rest[chosen])
+
+
+class Steps(Protocol):
+    """Bounds of P steps, and the cost after them, by the place t in the box that they go from.
+
+    Each place p gives one: value + slope . (t - p) + (t - p) . curve . (t - p) / 2.
+    """
+
+    @property
+    def curve(self) -> Array:
+        """Shape (P, r, r)."""
+
+    def of(self, chosen: Any) -> Steps:
+        """Some of them."""
+
+    def at(self, places: Array) -> tuple[Array, Array]:
+        """Values (P,) and slopes (P, r) at places (P, r)."""
+
+    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+        """Places (P, r) at which the values are lower, less slope . t + t . curve . t / 2, if some are known."""
+
+
+class StepCost(Protocol):
+    """What a straight step costs at least."""
+
+    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+        """Costs (P,) of the cheapest steps into P charts, whose centres are `delta` (P, n) away, and places (P, r)."""
+
+    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
+        """Bounds of P steps from charts into others, whose centres are `delta` (P, n) away."""
+
+    def of(self, delta: Array, seconds: Any) -> Array:
+        """Of steps (..., n)."""
+
+    def farthest(self, cost: float, seconds: float) -> float:
+        """How far a step of at most this cost goes in the metric of the charts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """The integral of half the weighted squared rates.
+
+    A step d moves along the chart that it goes into and across it. Along, the cost is convex in both places, and the
+    least over the place in the box is quadratic in the place that is gone from, by the multipliers of the box. Across,
+    |d|^2 / (2 dt) is at least p . d - dt |p|^2 / 2, p what it is from the nearest places: what the set bends goes into
+    the curvature of the values, where it cancels from step to step, and only the rest, of third order, is lost.
+    """
+
+    weights: Array
+
+    def of(self, delta: Array, seconds: Any) -> Array:
+        return np.asarray((self.weights * delta**2 / (2 * seconds)).sum(axis=-1))
+
+    def farthest(self, cost: float, seconds: float) -> float:
+        return float(np.sqrt(2 * seconds * cost))
+
+    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+        flat = np.einsum("pnr,pn->pr", into.tangents, self.weights * delta)
+        square = after.curve + np.eye(flat.shape[1]) / seconds
+        least, place = least_in_box(flat / seconds + after.slope, square, into.low, into.high)
+        return self.of(delta, seconds) + after.least + least, place
+
+    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
+        here, there = out.charts, into.charts
+        heavy = there.tangents * self.weights[:, None]
+        turn = heavy.transpose(0, 2, 1) @ here.tangents
+        flat = np.einsum("pnr,pn->pr", heavy, delta)
+        near, on = _nearest(flat, turn, here, there, after, seconds)
+        bends = np.einsum("pnab,pa,pb->pn", into.bends, on, on) - np.einsum("pnab,pa,pb->pn", out.bends, near, near)
+        across = delta - np.einsum("pnr,pr->pn", here.tangents, near) + bends / 2
+        across -= np.einsum("pnr,pr->pn", there.tangents, np.einsum("pnr,pn->pr", heavy, across))
+        pull, size = self.weights * across / seconds, (self.weights * across**2).sum(axis=1) / seconds
+        lost = np.einsum("pcn,pn->pc", out.rest, pull).max(axis=1, initial=0.0)
+        lost -= np.einsum("pcn,pn->pc", into.rest, pull).min(axis=1, initial=0.0)
+        # the multiplier of what moves across the charts is the less, the more the set may stray that way
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(size > 0, np.clip(1 - lost / size, 0.0, 1.0), 0.0)
+        pull *= share[:, None]
+        curve, excess = _raised(after.curve + np.einsum("pn,pnab->pab", pull, into.bends), -CONCAVE / seconds)
+        # places along the chart as well move by what the set strays
+        slid = sum(
+            np.abs(np.einsum("pcn,pnr->pcr", one.strays, heavy)).max(axis=1, initial=0.0) for one in (here, there)
+        )
+        low, high = there.low - slid, there.high + slid
+        wide = np.maximum(np.abs(low), np.abs(high))
+        lost = share * lost + excess * (wide**2).sum(axis=1) / 2
+        lost += (slid * (np.abs(after.slope) + np.einsum("pab,pb->pa", np.abs(curve), wide + slid / 2))).sum(axis=1)
+        return SquareSteps(
+            seconds,
+            after.least + (pull * delta).sum(axis=1) - share**2 * size / 2 - lost,
+            -np.einsum("pnr,pn->pr", here.tangents, pull),
+            -np.einsum("pn,pnab->pab", pull, out.bends),
+            flat,
+            turn,
+            after.slope,
+            curve,
+            np.stack([low, high]),
+            np.stack([here.low, here.high]),
+        )
+
+
+def _nearest(
+    flat: Array, turn: Array, here: Charts, there: Charts, after: Values, seconds: float
+) -> tuple[Array, Array]:
+    """Places in boxes from and to which the ways along the charts cost little: flat - turn . one + other."""
+    one = (here.low + here.high) / 2
+    square, back = after.curve + np.eye(flat.shape[1]) / seconds, turn.transpose(0, 2, 1)
+    for _ in range(NEAREST):
+        start = (flat - np.einsum("pab,pb->pa", turn, one)) / seconds
+        other = least_in_box(start + after.slope, square, there.low, there.high)[1]
+        one = least_in_box(-np.einsum("pab,pb->pa", back, flat + other), back @ turn, here.low, here.high)[1]
+    return one, other
+
+
+@dataclass(frozen=True, eq=False)
+class SquareSteps:
+    """least + slope . t + t . level . t / 2, and the least of v . v / (2 dt) + after . t' + t' . curved . t' / 2.
+
+    There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`.
+    """
+
+    seconds: float
+    least: Array
+    slope: Array
+    level: Array
+    flat: Array
+    turn: Array
+    after: Array
+    curved: Array
+    into: Array
+    out: Array
+
+    def of(self, chosen: Any) -> SquareSteps:
+        rows = {
+            name: getattr(self, name)[chosen] for name in ("least", "slope", "level", "flat", "turn", "after", "curved")
+        }
+        return replace(self, **rows, into=self.into[:, chosen], out=self.out[:, chosen])
+
+    @property
+    def _square(self) -> Array:
+        return np.asarray(self.curved + np.eye(self.curved.shape[1]) / self.seconds)
+
+    @property
+    def curve(self) -> Array:
+        sunk = np.linalg.solve(self._square, self.curved) / self.seconds
+        return np.asarray(self.turn.transpose(0, 2, 1) @ sunk @ self.turn + self.level)
+
+    def _onward(self, places: Array) -> tuple[Array, Array, Array]:
+        start = self.flat - np.einsum("pab,pb->pa", self.turn, places)
+        return start, *least_in_box(start / self.seconds + self.after, self._square, *self.into)
+
+    def at(self, places: Array) -> tuple[Array, Array]:
+        start, onward, there = self._onward(places)
+        held = np.einsum("pab,pb->pa", self.level, places)
+        value = self.least + onward + (start**2).sum(axis=1) / (2 * self.seconds)
+        slope = held + self.slope - np.einsum("pab,pa->pb", self.turn, start + there) / self.seconds
+        return value + (places * (held / 2 + self.slope)).sum(axis=1), slope
+
+    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+        back = self.turn.transpose(0, 2, 1)
+        pulled = -np.einsum("pab,pb->pa", back, self.flat + self._onward(places)[2]) / self.seconds
+        square = back @ self.turn / self.seconds + self.level - curve
+        return least_in_box(pulled + self.slope - slope, square, *self.out)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Homogeneous:
+    """What is twice as much for a way twice as long, on at most one free direction; its values are affine.
+
+    Attributes:
+        weights: Of the joints' ways, 0 for what does not count. Shape (n,).
+    """
+
+    weights: Array
+
+    def of(self, delta: Array, seconds: Any) -> Array:
+        """Of steps (..., n)."""
+        raise NotImplementedError
+
+    def farthest(self, cost: float, seconds: float) -> float:
+        """How far a step of at most this cost goes in the metric of the charts."""
+        raise NotImplementedError
+
+    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
+        """The cheapest steps on charts: bounds (P,), their multipliers (P, n), the gradient by the way, and places."""
+        raise NotImplementedError
+
+    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+        cost, _, place = self.least(delta, into, after)
+        return cost, place
+
+    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
+        return HomogeneousSteps(self, delta, out, into, after)
+
+
+class Length(Homogeneous):
+    """The weighted sum of the joints' ways."""
+
+    def of(self, delta: Array, seconds: Any) -> Array:
+        return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
+
+    def farthest(self, cost: float, seconds: float) -> float:
+        return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
+
+    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
+        count = len(delta)
+        if not into.tangents.shape[2]:
+            return self.of(delta, 1.0) + after.least, self.weights * np.sign(delta), np.zeros((count, 0))
+        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = np.nan_to_num(np.clip(-delta / along, into.low, into.high))
+        places = np.column_stack([into.low, into.high, places])  # an end of the box before what is cut there
+        costs = np.stack([self.of(delta + along * at[:, None], 1.0) + slope * at for at in places.T], axis=1)
+        best = costs.argmin(axis=1)
+        rows = np.arange(count)
+        at = places[rows, best]
+        # the multiplier: signs, and for the joint that does not move there what makes the place the least
+        signs = np.sign(delta + along * at[:, None])
+        turning = best > 1
+        joint = np.maximum(best - 2, 0)
+        signs[rows[turning], joint[turning]] = 0.0
+        rest = slope + (self.weights * signs * along).sum(axis=1)
+        own = self.weights[joint] * along[rows, joint]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            balance = np.clip(np.nan_to_num(-rest / own), -1.0, 1.0)
+        signs[rows[turning], joint[turning]] = balance[turning]
+        rest = slope + (self.weights * signs * along).sum(axis=1)
+        pull = self.weights * signs
+        least = np.minimum(rest * into.low[:, 0], rest * into.high[:, 0])
+        return (pull * delta).sum(axis=1) + least + after.least, pull, at[:, None]
+
+
+class Largest(Homogeneous):
+    """The largest of the joints' weighted ways: the time, where the weights are one over the joints' velocities."""
+
+    def of(self, delta: Array, seconds: Any) -> Array:
+        return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
+
+    def farthest(self, cost: float, seconds: float) -> float:
+        return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
+
+    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
+        if not into.tangents.shape[2]:
+            return self.of(delta, 1.0) + after.least, self._pull(delta), np.zeros((len(delta), 0))
+        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
+        low, high = into.low[:, 0].copy(), into.high[:, 0].copy()
+        # where what rises from there meets what falls: a piece of the convex function is left out each time
+        for _ in range(MEETINGS):
+            ends = [self._pull(delta + along * at[:, None]) for at in (low, high)]
+            rises = [(pull * along).sum(axis=1) + slope for pull in ends]
+            crosses = (rises[0] < 0) & (rises[1] > 0)
+            values = [(pull * delta).sum(axis=1) for pull in ends]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meet = np.where(crosses, (values[0] - values[1]) / (rises[1] - rises[0]), low)
+            at = np.clip(np.nan_to_num(meet), low, high)
+            there = (self._pull(delta + along * at[:, None]) * along).sum(axis=1) + slope
+            low, high = np.where(crosses & (there < 0), at, low), np.where(crosses & (there > 0), at, high)
+        place = np.where(rises[0] >= 0, into.low[:, 0], np.where(rises[1] <= 0, into.high[:, 0], at))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(crosses, np.clip(rises[1] / (rises[1] - rises[0]), 0.0, 1.0), rises[0] >= 0)
+        pull = share[:, None] * ends[0] + (1 - share[:, None]) * ends[1]
+        rest = (pull * along).sum(axis=1) + slope
+        least = np.minimum(rest * into.low[:, 0], rest * into.high[:, 0])
+        return (pull * delta).sum(axis=1) + least + after.least, pull, place[:, None]
+
+    def _pull(self, way: Array) -> Array:
+        """Gradients by the ways (P, n)."""
+        pull, rows = np.zeros(way.shape), np.arange(len(way))
+        joint = (self.weights * np.abs(way)).argmax(axis=1)
+        pull[rows, joint] = (self.weights * np.sign(way))[rows, joint]
+        return pull
+
+
+@dataclass(frozen=True, eq=False)
+class HomogeneousSteps:
+    """Arguments as of `Homogeneous.below`."""
+
+    cost: Homogeneous
+    delta: Array
+    out: Sheets
+    into: Sheets
+    after: Values
+
+    def of(self, chosen: Any) -> HomogeneousSteps:
+        out, into, after = self.out.of(chosen), self.into.of(chosen), self.after.of(chosen)
+        return HomogeneousSteps(self.cost, self.delta[chosen], out, into, after)
+
+    @property
+    def curve(self) -> Array:
+        r = self.out.charts.tangents.shape[2]
+        return np.zeros((len(self.delta), r, r))
+
+    def at(self, places: Array) -> tuple[Array, Array]:
+        here, there = self.out.charts, self.into.charts
+        start = np.einsum("pnr,pr->pn", here.tangents, places)
+        cost, pull, _ = self.cost.least(self.delta - start, there, self.after)
+        back = np.einsum("pcn,pn->pc", there.strays, pull).min(axis=1, initial=0.0)
+        lost = np.einsum("pcn,pn->pc", here.strays, pull).max(axis=1, initial=0.0) - back
+        return cost - lost, -np.einsum("pnr,pn->pr", here.tangents, pull)
+
+    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+        return places
+
+
+def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Least values (P,) of slope . t + t . square . t / 2 on boxes, and where they are, (P, r), r at most two.
+
+    Looked at are the corners, where the function is level on a side, and where it is level.
+    """
+    r = slope.shape[1]
+    if not r:
+        return np.zeros(len(slope)), np.zeros(slope.shape)
+    places = [np.where(side, high, low) for side in product((False, True), repeat=r)]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if r == 1:
+            places.append(-slope / square[:, 0])
+        else:
+            for axis in range(r):
+                beside = 1 - axis
+                for end in (low, high):
+                    place = end.copy()
+                    place[:, beside] = -(slope[:, beside] + square[:, 0, 1] * end[:, axis]) / square[:, beside, beside]
+                    places.append(place)
+            size = square[:, 0, 0] * square[:, 1, 1] - square[:, 0, 1] ** 2
+            one = (square[:, 0, 1] * slope[:, 1] - square[:, 1, 1] * slope[:, 0]) / size
+            other = (square[:, 0, 1] * slope[:, 0] - square[:, 0, 0] * slope[:, 1]) / size
+            places.append(np.column_stack([one, other]))
+    looked = np.stack([np.clip(np.nan_to_num(place), low, high) for place in places], axis=1)
+    values = np.einsum("pcr,pr->pc", looked, slope) + np.einsum("pca,pab,pcb->pc", looked, square, looked) / 2
+    best = values.argmin(axis=1)
+    rows = np.arange(len(slope))
+    return values[rows, best], looked[rows, best]
+
+
+def lowest_curvature(square: Array) -> Array:
+    """Least eigenvalues of symmetric matrices (P, r, r), r at most two. Shape (P,)."""
+    if square.shape[1] < 2:
+        return np.asarray(square.sum(axis=(1, 2)))
+    middle, half = (square[:, 0, 0] + square[:, 1, 1]) / 2, (square[:, 0, 0] - square[:, 1, 1]) / 2
+    return np.asarray(middle - np.hypot(half, square[:, 0, 1]))
+
+
+def _raised(square: Array, floor: float) -> tuple[Array, Array]:
+    """Symmetric matrices (P, r, r), their eigenvalues raised to a floor, and the most by which one was. Shape (P,)."""
+    excess = np.maximum(floor - lowest_curvature(square), 0.0)
+    rows = np.flatnonzero(excess > 0)
+    if rows.size:
+        values, ways = np.linalg.eigh(square[rows])
+        square = square.copy()
+        square[rows] = (ways * np.maximum(values, floor)[:, None]) @ ways.transpose(0, 2, 1)
+    return square, excess

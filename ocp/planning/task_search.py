@@ -1,0 +1,193 @@
+"""Search over all motions that do tip tasks in their own time: which instants are looked at, and plans with a bound."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from models.arrays import Array
+from ocp.errors import ProblemError
+from ocp.local.following import Followed
+from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.dead_end import DeadEnd, dead_end
+from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.planning.search import FREE, GAPS, Search
+from ocp.planning.steps import Squares
+from ocp.tasks.equations import TaskEquations
+
+__all__ = ["TaskSearch"]
+
+STARTS = 16
+"""Random starts of inverse kinematics at each instant."""
+INSTANTS = 8
+"""Steps over the motion, at least."""
+TIGHT, AT_LIMIT = 0.9, 1e-3
+"""Share of its greatest speed, and rad or m from the limit of its position, where a joint has hardly any room."""
+CLOSEST = 1e-3
+"""Share of the horizon: instants do not come closer."""
+TOLD = 64
+"""Times of the motions that are told, beside the breaks of the tasks."""
+
+
+class TaskSearch:
+    """Search over the postures of all tasks.
+
+    Attributes:
+        bound: Of the cost of any motion that does them; inf where there is none.
+
+    Raises:
+        ProblemError: A machine or a task that cannot be searched: a base that moves, velocities, too much freedom.
+        Unreachable: An instant at which no posture does the tasks.
+    """
+
+    def __init__(self, asked: Asked, followed: list[Followed]) -> None:
+        """
+        Args:
+            asked: What is asked.
+            followed: Local motions through its stretches, of which the cheapest says where instants are needed.
+        """
+        self.asked = asked
+        machine, bounds = asked.machine, asked.bounds
+        if machine.base_size:
+            words = "search='global' is for machines on a fixed base; search='postures' for those that move"
+            raise ProblemError(words, name="search", value="global")
+        cost = np.sum([part.cost for part in followed], axis=0)
+        follows = np.array(misfits_of(followed)) <= OUT_OF_REACH
+        self._known = float(cost[follows].min()) if follows.any() else np.inf
+        best = int(np.where(follows | ~follows.any(), cost, np.inf).argmin())
+        self.space = JointSpace(machine, bounds.lower, bounds.upper, asked.weights)
+        self.bound = 0.0
+        times = list[Array]()
+        for stretch, part in zip(asked.stretches, followed, strict=True):
+            if (equations := stretch.equations) is None:
+                continue
+            if not equations.posed.all():
+                words = "search='global' needs poses, and a task gives velocities; say where its tip is: position=..."
+                raise ProblemError(words, name="search", value="global", time=stretch.begin)
+            size = machine.joint_size - equations.size
+            if size > FREE:
+                words = (
+                    f"search='global': the tasks leave {size} directions free from {stretch.begin:g} s on, "
+                    f"at most {FREE} can be searched; fix more, or search='postures'"
+                )
+                raise ProblemError(words, name="search", value=size, limit=FREE, time=stretch.begin)
+            steps = int(np.ceil(INSTANTS * stretch.duration / asked.horizon))
+            own = instants_of(part.t, part.joints[best], asked.weights, GAPS[max(size, 0)] / 3, steps)
+            times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
+        self._look(times)
+
+    def _look(self, times: list[Array]) -> None:
+        """Search the postures at the times of each stretch that has tasks."""
+        asked, instants = self.asked, list[Instant]()
+        for equations, own in zip(self._equations, times, strict=True):
+            targets = np.array(equations.target_function().map(len(own))(own[None, :])).T
+            sets = SelfMotions(self.space, equations, targets)
+            instants += [Instant(sets, number) for number in range(len(own))]
+        self._instants, self._parts, self.times = instants, times, np.concatenate(times)
+        clear = None if asked.clear is None else asked.clear.surroundings
+        limits = asked.bounds.velocity * np.diff(self.times)[:, None]
+        told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "surroundings": clear}
+        self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
+        self._best, bound = self._search.best(self._known)
+        self.bound = max(self.bound, bound)  # of fewer instants it holds as well
+        if self._best is not None:
+            self._known = max(self._known, self._search.steps(self._best))
+
+    @property
+    def _equations(self) -> list[TaskEquations]:
+        return [stretch.equations for stretch in self.asked.stretches if stretch.equations is not None]
+
+    def dead_end(self) -> DeadEnd | None:
+        """Where motions end, and why; None where one does not."""
+        return dead_end(self._search, proven=not np.isfinite(self.bound)) if self._best is None else None
+
+    def looked_closer(self) -> bool:
+        """Search again with instants between those at which the best motion has hardly any room; False where it has."""
+        if self._best is None:
+            return False
+        bounds, steps = self.asked.bounds, np.abs(np.diff(self._best, axis=0))
+        at_limit = np.minimum(self._best - bounds.lower, bounds.upper - self._best).min(axis=1) < AT_LIMIT
+        tight = (steps >= TIGHT * self._search.limits).any(axis=1) | at_limit[1:] | at_limit[:-1]
+        tight &= np.diff(self.times) > CLOSEST * self.asked.horizon
+        if not tight.any():
+            return False
+        middles = (self.times[:-1] + self.times[1:])[tight] / 2
+        self._look([np.union1d(own, middles[(middles > own[0]) & (middles < own[-1])]) for own in self._parts])
+        return True
+
+    def _seeds(self, k: int) -> Array:
+        """Postures at an instant, by inverse kinematics."""
+        asked, time = self.asked, float(self.times[k])
+        tasks = [part.task for part in self._instants[k].sets.equations.bound]
+        options: dict[str, Any] = {"seed": asked.seed + k, "limits": asked.limits.joints, "starts": STARTS}
+        try:
+            return np.array([one.joints for one in inverse_kinematics(asked.machine, tasks, time=time, **options)])
+        except Unreachable as error:
+            raise placed(asked, error, time) from error
+
+    def followed(self) -> list[Followed]:
+        """The cheapest motion of each class through all stretches, as what a plan begins from."""
+        asked, found = self.asked, list[Followed]()
+        ways = self._search.motions(self._known)
+        if self._best is not None:
+            ways.insert(0, self._best)
+        paths = [self._turned(path) for path in ways]
+        count, n = len(paths), asked.machine.joint_size
+        for stretch in asked.stretches:
+            share = max(int(np.ceil(TOLD * stretch.duration / asked.horizon)), INSTANTS)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
+            rows = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in paths])
+            rows = rows.reshape(count, n, len(times)).transpose(0, 2, 1)
+            if stretch.equations is not None:
+                targets = np.array(stretch.equations.target_function().map(len(times))(times[None, :])).T
+                on = SelfMotions(self.space, stretch.equations, targets)
+                rows = on.corrected(np.tile(np.arange(len(times)), count), rows.reshape(-1, n))[0].reshape(rows.shape)
+            rows = np.clip(rows, asked.bounds.lower, asked.bounds.upper)
+            rates = np.diff(rows, axis=1) / np.diff(times)[:, None]
+            cost = np.einsum("kmn,n,m->k", rates**2, asked.weights, np.diff(times)) / 2
+            base, none = np.zeros((count, len(times), 0)), np.zeros(count)
+            rates = np.concatenate([rates, rates[:, -1:]], axis=1)
+            found.append(Followed(times, base, rows, rates, np.asarray(cost), none, none))
+        return found
+
+    def _turned(self, path: Array) -> Array:
+        """A path moved by whole turns of joints so that it keeps their limits, where it can."""
+        bounds, path = self.asked.bounds, path.copy()
+        if self.asked.start is None:
+            for j in np.flatnonzero(
+                self.space.periodic & np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
+            ).tolist():
+                middle = (bounds.lower[j] + bounds.upper[j] - path[:, j].min() - path[:, j].max()) / 2
+                path[:, j] += TURN * np.round(middle / TURN)
+        return path
+
+
+def instants_of(t: Array, joints: Array, weights: Array, share: float, least: int) -> Array:
+    """Of the times of a motion (M,) as few as leave all but a share of its cost to the straight steps between them.
+
+    At each turn that time is left out that adds least to what the steps miss; at least so many steps are left.
+    """
+    kept = list(range(len(t)))
+
+    def cost(a: int, b: int) -> float:
+        return float((weights * (joints[b] - joints[a]) ** 2).sum() / (2 * (t[b] - t[a])))
+
+    def missing(i: int) -> float:
+        a, b, c = kept[i - 1 : i + 2]
+        return cost(a, b) + cost(b, c) - cost(a, c)
+
+    room = share * sum(cost(a, b) for a, b in pairwise(kept))
+    missed = [np.inf, *(missing(i) for i in range(1, len(kept) - 1)), np.inf]
+    while len(kept) > least + 1:
+        i = int(np.argmin(missed))
+        room -= missed[i]
+        if room < 0:
+            break
+        del kept[i], missed[i]
+        for k in (i - 1, i):
+            if 0 < k < len(kept) - 1:
+                missed[k] = missing(k)
+    return np.asarray(t[kept])

@@ -1,0 +1,310 @@
+"""The least that a motion costs from each posture on: dynamic programming over charts, with values that are bounds.
+
+Between two instants a motion costs at least what the straight step costs: the integral of half the squared rates no
+less than |dq|^2 / (2 dt), the length no less than |dq|_1. So the least cost over all sequences of postures, one of each
+instant, bounds that of every motion that does the task, and it is found backwards, w_k(q) = min over q' of
+d(q, q') + w_{k+1}(q'). A value on a chart is a quadratic function of the place in its box that lies nowhere above:
+every step gives one for each corner by its multipliers, all curved nearly alike; less the curvature of the cheapest
+they are affine, the least of these is concave, and an affine function below a concave one at the corners of a box is
+below it everywhere. What is lost is of third order in the size of the charts for squares, and of second for lengths,
+whose values are affine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from ocp.planning.charts import Charts, JointSpace
+from ocp.planning.steps import Sheets, StepCost, Steps, Values, least_in_box, lowest_curvature
+
+__all__ = ["FARTHEST", "Graph"]
+
+Indices = NDArray[np.intp]
+LOOKED = 8
+"""Charts that are tried to go on to from a posture."""
+FARTHEST = 1e6
+"""rad or m: no step goes farther."""
+PAIRS = 200_000
+"""Steps between two instants that are looked at together: what memory is taken."""
+ROUNDS, LOWER = 4, 3
+"""Times that the least of a step in a box is looked at nearer, and places on the way to it at first."""
+
+
+class Graph:
+    """The charts of all instants, and the steps between them that a motion may take."""
+
+    def __init__(
+        self, space: JointSpace, layers: list[Charts], seconds: Array, cost: StepCost, limits: Array, most: Array
+    ) -> None:
+        """
+        Args:
+            space: Where the charts lie.
+            layers: Charts of each instant.
+            seconds: From each instant to the next. Shape (K - 1,).
+            cost: Of a step.
+            limits: How far the joints may go from each instant to the next. Shape (K - 1, n).
+            most: What the step from each instant to the next may cost. Shape (K - 1,).
+        """
+        self.space, self.layers, self.seconds, self.cost, self.limits = space, layers, seconds, cost, limits
+        self.most = most
+
+    @cached_property
+    def sheets(self) -> list[Sheets]:
+        """Charts of each instant, and how the set bends away from them."""
+        return [Sheets(charts, *charts.bent()) for charts in self.layers]
+
+    def to_come(self) -> list[Values]:
+        """Bounds of what is to come from each instant."""
+        return self._swept(range(len(self.layers) - 1, -1, -1), -1)
+
+    def passed(self) -> list[Values]:
+        """Bounds of what has been until each instant."""
+        return self._swept(range(len(self.layers)), 1)
+
+    def alive(self) -> list[NDArray[np.bool_]]:
+        """Of the charts of each instant, which lie on a way from the first instant to the last. Shapes (N,)."""
+        found = [np.ones(len(charts), dtype=bool) for charts in self.layers]
+        last = len(found) - 1
+        for order in (range(last), range(last, 0, -1)):
+            for k in order:
+                other = k + int(np.sign(order.step))
+                led = np.zeros(len(found[other]), dtype=bool)
+                for i, j in self.steps(k, other):
+                    led[j[found[k][i]]] = True
+                found[other] &= led
+        return found
+
+    def steps(self, k: int, other: int) -> Iterator[tuple[Indices, Indices]]:
+        """Charts of an instant and of one beside it between which a motion may go, some at a time."""
+        here, there = self.layers[k], self.layers[other]
+        if not len(here) or not len(there):
+            return
+        between, spans = min(k, other), (here.spans, there.spans)
+        sizes = [self.space.length(span) for span in spans]
+        limit = self.limits[between]
+        dearest = max(float(self.most[between]), 0.0)
+        way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
+        way = min(way, FARTHEST)
+        tree = self.space.tree(there.centers)
+        share = max(16, PAIRS // len(there))
+        for first in range(0, len(here), share):
+            part = np.arange(first, min(first + share, len(here)))
+            own = self.space.tree(here.centers[part])
+            found = own.sparse_distance_matrix(
+                tree, way + float(sizes[0][part].max() + sizes[1].max()), output_type="ndarray"
+            )
+            i, j, far = part[found["i"]], found["j"].astype(np.intp), found["v"]
+            near = far <= way + sizes[0][i] + sizes[1][j]
+            i, j = i[near], j[near]
+            delta = np.abs(self.space.difference(there.centers[j], here.centers[i]))
+            near = (delta <= limit + spans[0][i] + spans[1][j]).all(axis=1)
+            i, j = i[near], j[near]
+            order = np.argsort(i, kind="stable")
+            yield i[order], j[order]
+
+    def nearest(self, joints: Array, k: int, other: int, after: Values) -> Iterator[Array]:
+        """Postures of an instant to go on to from one (n,) of another, the cheapest first."""
+        there = self.layers[other]
+        between = min(k, other)
+        seconds = float(self.seconds[between])
+        delta = self.space.difference(there.centers, np.repeat(joints[None], len(there), axis=0))
+        reached = (np.abs(delta) <= self.limits[between] + there.spans).all(axis=1) & np.isfinite(after.least)
+        chosen = np.flatnonzero(reached)
+        if not chosen.size:
+            return
+        into = there.of(chosen)
+        costs, places = self.cost.cheapest(delta[chosen], into, after.of(chosen), seconds)
+        for i in np.argsort(costs, kind="stable")[:LOOKED].tolist():
+            yield joints + delta[chosen[i]] + into.tangents[i] @ places[i]
+
+    def _swept(self, order: range, direction: int) -> list[Values]:
+        layers = self.layers
+        found: list[Any] = [None] * len(layers)
+        first = order[0]
+        r = layers[first].tangents.shape[2]
+        count = len(layers[first])
+        found[first] = Values(np.zeros(count), np.zeros((count, r)), np.zeros((count, r, r)))
+        for k in order[1:]:
+            found[k] = self._before(k, k - direction, found[k - direction])
+        return found
+
+    def _before(self, k: int, other: int, after: Values) -> Values:
+        """Bounds on the charts of an instant by those of the one that motions go on to."""
+        here, there = self.layers[k], self.layers[other]
+        r = here.tangents.shape[2]
+        seconds = float(self.seconds[min(k, other)])
+        found = Values(np.full(len(here), np.inf), np.zeros((len(here), r)), np.zeros((len(here), r, r)))
+        for i, j in self.steps(k, other):
+            alive = np.isfinite(after.least[j])
+            i, j = i[alive], j[alive]
+            if not i.size:
+                continue
+            delta = self.space.difference(there.centers[j], here.centers[i])
+            steps = self.cost.below(delta, self.sheets[k].of(i), self.sheets[other].of(j), after.of(j), seconds)
+            starts = np.flatnonzero(np.diff(i, prepend=-1))
+            parts = _below_all(steps, here.of(i), starts)
+            for whole, part in zip(found, parts, strict=True):
+                whole[i[starts]] = part
+        return found
+
+    def least(self, values: Values, k: int) -> Array:
+        """The least of values anywhere on the charts of an instant. Shape (N,)."""
+        charts = self.layers[k]
+        return np.asarray(values.least + least_in_box(values.slope, values.curve, charts.low, charts.high)[0])
+
+    def through(self, passed: list[Values], to_come: list[Values], k: int) -> Array:
+        """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
+        both = Values(*(one + other for one, other in zip(passed[k], to_come[k], strict=True)))
+        return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
+
+
+def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:
+    """A bound for each chart that steps go from, whose steps are together and begin at `starts`."""
+    r = own.tangents.shape[2]
+    group = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(own))))
+    middle, half = (own.low + own.high) / 2, (own.high - own.low) / 2
+    places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
+    touching = [steps.at(place) for place in places]
+    # less the curvature of the cheapest they are affine, or nearly so
+    curves = steps.curve
+    curve = curves[np.lexsort((touching[0][0], group))[starts]]
+    common = curve[group]
+    concave = np.minimum(lowest_curvature(curves - common), 0.0)
+    touching = [_less(place, one, common) for place, one in zip(places, touching, strict=True)]
+    lowest = [np.minimum.reduceat(value, starts) for value, _ in touching]
+    slope, boxes = _rise(lowest, half[starts]), own.of(starts)
+
+    def least_of(least: Array, slope: Array, chosen: Any) -> Array:
+        box = boxes.of(chosen)
+        ends = np.minimum(slope * box.low, slope * box.high).sum(axis=1)
+        return np.asarray(2 * least + (slope * middle[starts[chosen]]).sum(axis=1) + ends)
+
+    def under(slope: Array, chosen: Indices) -> Array:
+        """How far above the linear functions the steps of some charts lie. Shape (M,)."""
+        which = np.flatnonzero(np.isin(group, chosen))
+        first = np.searchsorted(group[which], chosen)
+        lean = slope[np.searchsorted(chosen, group[which])]
+        near, part, box, bend = which, steps.of(which), own.of(which), concave[which]
+        at = [place[which] for place in places]
+        looked = [(value[which], leaning[which]) for value, leaning in touching]
+        tangents = [_tangents(place, one, lean) for place, one in zip(at, looked, strict=True)]
+        best, least = tangents[0], tangents[0].least(box, bend)
+        for one in tangents[1:]:
+            best, least = best.mixed(one, box, bend)
+        # what may be the least of all is looked at nearer
+        values = np.stack([value - (place * lean).sum(axis=1) for (value, _), place in zip(looked, at, strict=True)])
+        found, place = least.copy(), np.stack(at)[values.argmin(axis=0), np.arange(len(which))]
+        most = np.repeat(np.minimum.reduceat(values.min(axis=0), first), np.diff(np.append(first, len(which))))
+        rows = np.arange(len(which))
+        for _ in range(ROUNDS):
+            kept = np.flatnonzero(found[rows] < most[rows])
+            if not kept.size:
+                break
+            rows, near, part, box, bend = rows[kept], near[kept], part.of(kept), box.of(kept), bend[kept]
+            best, place = best.of(kept), place[kept]
+            for _ in range(LOWER):
+                place = part.lower(place, lean[rows], common[near])
+            for looked_at in (place, None):
+                there = best.lowest(box, bend) if looked_at is None else looked_at
+                one = _tangents(there, _less(there, part.at(there), common[near]), lean[rows])
+                best, found[rows] = best.mixed(one, box, bend)
+        return np.asarray(np.minimum.reduceat(found, first))
+
+    every = np.arange(len(starts))
+    least = under(slope, every)
+    # a level one instead where it is higher, in the middle and at its least together
+    flat = np.flatnonzero(least_of(least, slope, every) < 2 * np.min(lowest, axis=0))
+    if flat.size and r:
+        none = np.zeros((len(flat), r))
+        level = under(none, flat)
+        higher = least_of(level, none, flat) > least_of(least[flat], slope[flat], flat)
+        least[flat[higher]], slope[flat[higher]] = level[higher], 0.0
+    return Values(least, slope, curve)
+
+
+class Tangents(NamedTuple):
+    """Functions value + slope . t below others, those that touch these at places or means of such.
+
+    Attributes:
+        value: Shape (P,). slope: Shape (P, r). place: Where they touch, in the mean. Shape (P, r).
+        square: Mean square of the place. Shape (P,).
+    """
+
+    value: Array
+    slope: Array
+    place: Array
+    square: Array
+
+    def of(self, chosen: Any) -> Tangents:
+        """Some of them."""
+        return Tangents(*(part[chosen] for part in self))
+
+    def _ends(self, charts: Charts, curve: Array) -> tuple[Array, Array]:
+        """What the sides of the boxes add, (2, P, r), and a value without them (P,)."""
+        bent, ways = curve[:, None] / 2, np.stack([charts.low, charts.high])
+        return self.slope * ways + bent * ways * (ways - 2 * self.place), self.value + curve / 2 * self.square
+
+    def least(self, charts: Charts, curve: Array) -> Array:
+        """The least in boxes, with curve |t - place|^2 / 2 of each place, which is not positive. Shape (P,)."""
+        ends, value = self._ends(charts, curve)
+        return np.asarray(value + ends.min(axis=0).sum(axis=1))
+
+    def lowest(self, charts: Charts, curve: Array) -> Array:
+        """Where that is. Shape (P, r)."""
+        ends, _ = self._ends(charts, curve)
+        return np.where(ends[1] < ends[0], charts.high, charts.low)
+
+    def mixed(self, other: Tangents, charts: Charts, curve: Array) -> tuple[Tangents, Array]:
+        """The mean with others whose least is the largest, of those level along an axis; and that least."""
+        best, most = self, self.least(charts, curve)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.clip(np.nan_to_num(-self.slope / (other.slope - self.slope)), 0.0, 1.0)
+        for share in (*shares.T, np.ones(len(most))):
+            parts = [
+                one + (share[:, None] if one.ndim > 1 else share) * (two - one)
+                for one, two in zip(self, other, strict=True)
+            ]
+            mean = Tangents(*parts)
+            least = mean.least(charts, curve)
+            better = least > most
+            best = Tangents(
+                *(
+                    np.where(better[:, None] if one.ndim > 1 else better, two, one)
+                    for one, two in zip(best, mean, strict=True)
+                )
+            )
+            most = np.maximum(most, least)
+        return best, most
+
+
+def _less(place: Array, values: tuple[Array, Array], curve: Array) -> tuple[Array, Array]:
+    """Values and slopes at places, less t . curve . t / 2."""
+    pressed = np.einsum("pab,pb->pa", curve, place)
+    return values[0] - (place * pressed).sum(axis=1) / 2, values[1] - pressed
+
+
+def _tangents(place: Array, values: tuple[Array, Array], lean: Array) -> Tangents:
+    """Of functions with such values and slopes at places, less lean . t."""
+    value, slope = values
+    return Tangents(value - (place * slope).sum(axis=1), slope - lean, place, (place**2).sum(axis=1))
+
+
+def _rise(values: list[Array], half: Array) -> Array:
+    """Slopes (M, r) of functions in boxes from values in the middle, and at each axis' ends.
+
+    Of one that is bent down, that from end to end; of one that is bent up, the flattest.
+    """
+    rise = np.zeros(half.shape)
+    for axis in range(half.shape[1]):
+        low, high = values[1 + 2 * axis], values[2 + 2 * axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, last = (values[0] - low) / half[:, axis], (high - values[0]) / half[:, axis]
+        flat = np.clip(0.0, first, np.maximum(first, last))
+        rise[:, axis] = np.where(half[:, axis] > 0, np.where(first < last, flat, (first + last) / 2), 0.0)
+    return rise

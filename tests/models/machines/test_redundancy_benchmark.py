@@ -1,0 +1,89 @@
+"""The problems of a public benchmark: what touches in them is what coal says, at random and along their paths."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import casadi as ca
+import coal
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from models import Surroundings, link_frames
+from models.arrays import Array
+from models.shapes.bodies import bodies_of
+from models.shapes.pairs import ALWAYS, NEIGHBOURS, NEVER, RIGID
+from ocp import TipTask, inverse_kinematics
+from ocp.local.touching import distances_along
+from tests.models.shapes.shape_oracles import in_coal
+from tests.redundancy_benchmark import PROBLEMS, Benchmark, problem_of
+
+RANDOM, WAYPOINTS, EACH = 150, 6, 8
+"""Postures anywhere, and waypoints with so many postures each."""
+
+
+def postures(problem: Benchmark) -> Array:
+    """Anywhere within limits, and those that put the tip on some waypoints. Shape (M, n)."""
+    robot = problem.machine.robot
+    rng = np.random.default_rng(0)
+    found = [*rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (RANDOM, robot.dof))]
+    for k in np.linspace(0, len(problem.positions) - 1, WAYPOINTS).astype(int):
+        pose = TipTask(position=problem.positions[k], orientation=problem.quaternions[k])
+        found += [each.joints for each in inverse_kinematics(problem.machine, pose, starts=2 * EACH)[:EACH]]
+    return np.array(found)
+
+
+def by_coal(problem: Benchmark, joints: Array) -> dict[frozenset[str], Array]:
+    """Distances (M,) of all capsules to each other and to the boxes, by their names; of none that is ignored."""
+    robot = problem.machine.robot
+    bodies = {body.link: body.shape for body in bodies_of(robot)}
+    boxes = {f"obstacle {k}": box for k, box in enumerate(problem.boxes)}
+    listed = {frozenset(pair) for pair in problem.ignored}
+    q = ca.SX.sym("q", robot.dof)
+    frames = link_frames(robot, q)
+    placed = ca.Function("placed", [q], [ca.horzcat(frames[name].rotation, frames[name].position) for name in bodies])
+    known = {name: in_coal(shape) for name, shape in (bodies | boxes).items()}
+    pairs = [*combinations(bodies, 2), *((name, box) for name in bodies for box in boxes)]
+    found: dict[frozenset[str], Any] = {frozenset(pair): [] for pair in pairs if frozenset(pair) not in listed}
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = True
+    request.gjk_tolerance = 1e-9
+    for posture in joints:
+        places = {name: place for name, (_, place) in known.items()}
+        for name, frame in zip(bodies, map(np.array, placed(posture)), strict=True):
+            own, turn = places[name], frame[:, :3]
+            places[name] = coal.Transform3s(turn @ own.getRotation(), turn @ own.getTranslation() + frame[:, 3])
+        for pair, values in found.items():
+            one, other = pair
+            result.clear()
+            values.append(coal.distance(known[one][0], places[one], known[other][0], places[other], request, result))
+    return {pair: np.array(values) for pair, values in found.items()}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_what_touches_is_what_coal_says(name: str) -> None:
+    problem = problem_of(name)
+    around = Surroundings(problem.machine, problem.boxes, ignored=problem.ignored)
+    joints = postures(problem)
+    expected = by_coal(problem, joints)
+    base, q = ca.SX(0, 1), ca.SX.sym("q", problem.machine.joint_size)
+    exact = np.array(ca.Function("exact", [q], [around.distances(base, q)]).map(len(joints))(joints.T)).T
+    seen = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))
+    looked_at = {frozenset(label) for label in around.labels}
+    assert looked_at <= expected.keys()
+    for k, label in enumerate(around.labels):
+        by_others = expected[frozenset(label)]
+        assert_allclose(exact[:, k], by_others, atol=1e-6)
+        apart = by_others > 1e-6
+        assert_allclose(seen[apart, k], by_others[apart], atol=1e-6)
+        assert np.all(seen[by_others < -1e-6, k] < 0)
+    some = {frozenset(pair): why for pair, why in around.left.items()}
+    for pair in expected.keys() - looked_at:
+        assert some[pair] in (NEIGHBOURS, RIGID, ALWAYS, NEVER, "neither moves")
+        assert some[pair] != NEVER or expected[pair].min() > 0
+        assert some[pair] != ALWAYS or expected[pair].max() <= 0
+    touching = np.min([expected[pair] for pair in looked_at], axis=0) < 0
+    assert touching.any()
+    assert not touching.all()

@@ -1,0 +1,315 @@
+"""Odd files: what is odd is named, what only looks odd is not; a motion is judged the same however it is written."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, FreeFloating, Robot, Sphere, Standing, Surroundings, mass_matrix, rectangle
+from ocp.app import Check, check_trajectory
+from ocp.app.bases import floating_base
+from ocp.app.joint_limits import floating_torques
+from ocp.app.oddities import BASES
+from ocp.app.pieces import Motion, Pieces, highest
+from ocp.app.surroundings import proof, within_limits
+from ocp.errors import ProblemError
+from ocp.files import read_trajectory
+from ocp.local.touching import distances_along
+from scripts.viewer.plan import play
+from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
+
+GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
+SPINNING = (
+    '<robot name="gripper"><link name="a"/>'
+    + "".join(f'<link name="{name}"/>' for name in "cd")
+    + link("b", 0.1, 1.0)
+    + joint("spin", "continuous", "a", "b", 0.3, 'velocity="4" effort="100"')
+    + joint("left", "prismatic", "b", "c", 0.3, 'lower="0" upper="0.04" velocity="1" effort="9"', "0 1 0")
+    + joint(
+        "right",
+        "prismatic",
+        "b",
+        "d",
+        0.3,
+        'lower="0" upper="0.08" velocity="1" effort="9"',
+        "0 -1 0",
+        '<mimic joint="left" multiplier="2"/>',
+    )
+    + "</robot>"
+)
+
+
+def checked(folder: Path, urdf: str, names: tuple[str, ...], t: Any, *values: Any, **options: Any) -> Check:
+    robot = Robot.from_urdf(urdf, tip="finger" if urdf == URDF else None)
+    file = write_table(folder / "m.csv", t, *values, names=names)
+    return check_trajectory(robot, read_trajectory(file, joints=robot.joint_names), **options)
+
+
+# ---- enclosures ----------------------------------------------------------------------------------------------------
+
+
+def test_greatest_values_are_those_of_a_fine_sampling() -> None:
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(size=(300, 6))
+    value, place = highest(coefficients)
+    s = np.linspace(0.0, 1.0, 2001)
+    whole = Pieces(np.arange(301.0), coefficients[:, :, None])
+    fine = np.array([whole.within(np.full(2001, k), s)[:, 0].max() for k in range(300)])
+    assert (value >= fine).all()
+    assert (value <= fine + 1e-4).all()
+    np.testing.assert_allclose(whole.within(np.arange(300), place)[:, 0], value, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 3, 5])
+def test_a_rule_gives_back_polynomials_of_its_degree(degree: int) -> None:
+    rng = np.random.default_rng(degree)
+    f = np.polynomial.Polynomial(rng.normal(size=degree + 1))
+    t = np.sort(rng.uniform(0.0, 2.0, 7))
+    values = [f.deriv(k)(t)[:, None] if k else f(t)[:, None] for k in range((degree + 1) // 2)]
+    motion = Motion(t, *values)
+    x = np.linspace(t[0], t[-1], 40)
+    np.testing.assert_allclose(motion.position.at(x)[:, 0], f(x), atol=1e-9)
+    np.testing.assert_allclose(motion.velocity.at(x)[:, 0], f.deriv()(x), atol=1e-9)
+
+
+def test_divided_differences_are_exact_for_polynomials_of_their_order() -> None:
+    f = np.polynomial.Polynomial([0.3, -1.0, 0.7, 0.25])
+    t = np.sort(np.random.default_rng(1).uniform(0.0, 2.0, 9))
+    found = Motion(t, f(t)[:, None]).along("jerk")
+    assert found is not None
+    assert not found.closed
+    np.testing.assert_allclose(found.pieces.coefficients[:, 0, 0], f.deriv(3)(0.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("rates", [1, 2, 3])
+@pytest.mark.parametrize("count", [20, 500])
+def test_proven_distances_lie_below_a_fine_sampling_and_near_it(rates: int, count: int) -> None:
+    rng = np.random.default_rng(10 * count + rates)
+    t = np.sort(np.concatenate([[0.0, 3.0], rng.uniform(0.0, 3.0, count - 2)]))
+    turns, phase = rng.uniform(1.0, 4.0, 4), rng.uniform(0.0, 6.0, 4)
+    angle = np.outer(t, turns) + phase
+    swing = SWING * [1.5, 1.5, 1.5, 1.0]
+    values = [MIDDLE + swing * np.sin(angle), swing * turns * np.cos(angle), -swing * turns**2 * np.sin(angle)]
+    motion = Motion(t, *values[:rates])
+    arm = FixedBase(Robot.from_urdf(URDF, tip="finger"))
+    ball = Sphere(radius=0.1, position=rng.uniform([0.3, -0.2, 0.3], [0.9, 0.6, 0.6]))
+    around = Surroundings(within_limits(arm, motion), [ball], 0.05)
+    found = proof(around, motion)
+    assert found.settled
+    fine = np.unique(np.concatenate([a + (b - a) * np.linspace(0.0, 1.0, 21) for a, b in pairwise(t)]))
+    apart = distances_along(around, np.zeros(0), motion.position.at(fine), fine)
+    least = dict(zip(around.labels, apart.min(axis=0), strict=True))
+    for near in found.pairs:
+        assert near.least <= least[near.bodies] + 1e-12
+    worst = min(found.pairs, key=lambda near: near.distance)
+    nearest = min(least.values())
+    assert worst.distance <= nearest + 1e-3
+    assert min(near.least for near in found.pairs) >= nearest - max(0.03 * abs(nearest - 0.05), 1e-3)
+
+
+# ---- what only looks odd -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("digits", [3, 4, 6])
+def test_digits_that_a_file_has_not_are_no_fault(tmp_path: Path, digits: int) -> None:
+    t, q, *_ = smooth(2001)
+    found = checked(tmp_path, URDF, NAMES, t, np.round(q, digits), acceleration=8.0, jerk=60.0)
+    assert found.passed, found
+    assert "not decided" in found.sentence
+    t, q, v, _ = smooth(2001)
+    single = q.astype(np.float32).astype(float), v.astype(np.float32).astype(float)
+    assert checked(tmp_path, URDF, NAMES, t, *single, acceleration=8.0, jerk=60.0).passed
+
+
+def test_noise_is_no_jump(tmp_path: Path) -> None:
+    t, q, *_ = smooth(2001)
+    noisy = q + 1e-4 * np.random.default_rng(0).normal(size=q.shape)
+    assert not [one for one in checked(tmp_path, URDF, NAMES, t, noisy).faults if one.kind == "jump"]
+
+
+def test_a_joint_without_end_may_turn_on_and_be_wrapped(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 20.0, 1001)
+    left, still = 0.02 + 0.01 * np.sin(t), 0.01 * np.cos(t)
+    wrapped = (2 * t + np.pi) % (2 * np.pi) - np.pi
+    for spin, notes in ((2 * t, 0), (wrapped, 1)):
+        q, v = np.column_stack([spin, left]), np.column_stack([0 * t + 2, still])
+        for values in ([q], [q, v]):
+            found = checked(tmp_path, SPINNING, ("spin", "left"), t, *values, clearance=None)
+            assert found.passed, found
+            assert len(found.notes) == notes, found
+            row = next(row for row in found.rows if row.name == "velocity of spin")
+            assert row.value == pytest.approx(2.0, abs=1e-6)
+    fast = checked(tmp_path, SPINNING, ("spin", "left"), t, np.column_stack([np.degrees(2 * t), left]), clearance=None)
+    assert [one.kind for one in fast.faults] == ["units"]
+
+
+def test_a_joint_with_limits_that_was_wrapped_jumps(tmp_path: Path) -> None:
+    t, q, *_ = smooth()
+    q[:, 1] = (2.5 + 0.3 * t + np.pi) % (2 * np.pi) - np.pi
+    found = checked(tmp_path, URDF, NAMES, t, q, clearance=None)
+    fault = next(one for one in found.faults if one.kind == "jump")
+    assert fault.name == "elbow"
+    assert "a whole turn" in fault.text
+    assert fault.time == pytest.approx((np.pi - 2.5) / 0.3, abs=0.02)
+
+
+def test_followers_follow(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 2.0, 101)
+    left = 0.02 + 0.01 * np.sin(t)
+    names = ("spin", "left", "right")
+    sound = np.column_stack([t, left, 2 * left])
+    assert checked(tmp_path, SPINNING, names, t, sound, clearance=None).passed
+    wrong = np.column_stack([t, left, np.where(t > 1.2, left, 2 * left)])
+    (fault,) = checked(tmp_path, SPINNING, names, t, wrong, clearance=None).faults
+    assert (fault.kind, fault.name) == ("follower", "right")
+    assert (fault.time or 0.0) > 1.2
+    found = checked(tmp_path, SPINNING, ("spin", "right"), t, np.column_stack([t, 2 * left]), clearance=None)
+    assert "right, which is there, follows it" in found.faults[0].text
+
+
+def test_times_in_nanoseconds(tmp_path: Path) -> None:
+    t, q, *_ = smooth()
+    found = checked(tmp_path, URDF, NAMES, np.rint(1e9 * t), q)
+    assert [(one.kind, one.name) for one in found.faults] == [("units", "time")]
+    assert found.duration == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_samples(tmp_path: Path, count: int) -> None:
+    t, q, v, a = smooth(11)
+    for values in ([q], [q, v], [q, v, a]):
+        found = checked(tmp_path, URDF, NAMES, t[:count], *(one[:count] for one in values), acceleration=50.0)
+        assert {one.kind for one in found.faults} <= {"velocity", "acceleration", "torque"}
+        assert found.samples == count
+
+
+def test_where_a_file_begins_changes_no_verdict(tmp_path: Path) -> None:
+    t, q, v, _ = smooth()
+    limits = {"elbow": 0.9}
+    first = checked(tmp_path, URDF, NAMES, t, q, v, velocity=limits).faults[0]
+    for shift in (-100.0, 1e5):
+        again = checked(tmp_path, URDF, NAMES, t + shift, q, v, velocity=limits).faults[0]
+        assert again.value == pytest.approx(first.value, rel=1e-9)
+        assert (again.time or 0.0) - shift == pytest.approx(first.time, abs=1e-4)
+
+
+# ---- bases ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_a_floating_base_keeps_its_momentum_or_is_told_wrong(tmp_path: Path, planar: bool) -> None:
+    text = URDF if not planar else URDF.replace('axis xyz="0 -1 0"', 'axis xyz="0 0 1"')
+    t, q, v, a = smooth()
+    machine = FreeFloating(Robot.from_urdf(text), "planar" if planar else "spatial")
+    base, rows = floating_base(machine, Motion(t, q, v, a))
+    assert max(row.value for row in rows) > 0.05
+    names = (*NAMES, *BASES[1 if planar else 0])
+    assert checked(tmp_path, text, names, t, np.column_stack([q, base]), base="floating").passed
+    base[:, 0] += 0.02 * np.sin(t) ** 2
+    found = checked(tmp_path, text, names, t, np.column_stack([q, base]), base="floating")
+    assert {one.kind for one in found.faults} == {"momentum"}
+    assert checked(tmp_path, text, NAMES, t, q, v, base="floating").passed
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_torques_of_a_floating_arm_are_the_power_that_goes_into_its_motion(planar: bool) -> None:
+    """dT/dt = torque . rates, T the kinetic energy of the whole; and where the base is changes nothing."""
+    text = URDF if not planar else URDF.replace('axis xyz="0 -1 0"', 'axis xyz="0 0 1"')
+    machine = FreeFloating(Robot.from_urdf(text), "planar" if planar else "spatial")
+    q, v, a = (ca.SX.sym(name, 4) for name in "qva")
+    base = ca.DM(machine.base_home())
+    inertia, joints = machine.momentum_matrices(base, q)
+    held = mass_matrix(machine.robot, q)
+    twist = machine.base_twist(base, q, v)
+    energy = (ca.bilin(held, v, v) + ca.bilin(inertia, twist, twist)) / 2 + ca.dot(twist, ca.mtimes(joints, v))
+    power = ca.jtimes(energy, ca.vertcat(q, v), ca.vertcat(v, a))
+    given = ca.dot(floating_torques(machine, q, v, a), v)
+    function = ca.Function("power", [q, v, a], [power, given])
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        one, other = function(*rng.normal(size=(3, 4)))
+        assert float(one) == pytest.approx(float(other), rel=1e-9, abs=1e-9)
+
+
+def test_a_floating_base_beside_an_obstacle(tmp_path: Path) -> None:
+    t, q, v, a = smooth()
+    ball = Sphere(radius=0.2, position=(0.9, 0.3, 0.4))
+    found = checked(tmp_path, URDF, NAMES, t, q, v, a, base="floating", obstacles=[ball])
+    assert {one.kind for one in found.faults} == {"clearance"}
+    far = Sphere(radius=0.2, position=(9.0, 0.0, 0.0))
+    assert checked(tmp_path, URDF, NAMES, t, q, v, a, base="floating", obstacles=[far]).passed
+
+
+def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -> None:
+    t, q, v, a = smooth()
+    robot = Robot.from_urdf(URDF, tip="finger")
+    wide = rectangle((-1.0, 2.0), (-1.0, 1.0))
+    assert checked(tmp_path, URDF, NAMES, t, q, v, a, base="standing", foot=wide).passed
+    machine = Standing(robot=robot, support=wide)
+    symbols = [ca.SX.sym(name, 4) for name in "qva"]
+    zmp = ca.Function("zmp", symbols, [machine.zero_moment_point(*symbols)])
+    points = np.array(zmp(q.T, v.T, a.T)).T
+    narrow = rectangle((-1.0, float(points[:, 0].max()) - 0.01), (-1.0, 1.0))
+    found = checked(tmp_path, URDF, NAMES, t, q, v, a, base="standing", foot=narrow)
+    (fault,) = found.faults
+    assert fault.kind == "zero moment point"
+    assert fault.time == pytest.approx(t[points[:, 0].argmax()], abs=0.02)
+    assert fault.value == pytest.approx(-0.01, abs=1e-4)
+
+
+# ---- the package's own plans ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "clearance"),
+    [("ur5", 0.0), ("panda", None), ("space_arm", None), ("mobile_manipulator", None), ("pushing", None)],
+)
+@pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")
+def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, clearance: float | None) -> None:
+    played = play(GALLERY / f"{name}.npz")
+    robot, solution = played.robot, played.solution
+    t = np.linspace(0.0, played.horizon, round(played.horizon / 0.01) + 1)
+    at = solution.at(t)
+    q = at[played.joints][:, played.columns]
+    rates = at["rates"] if "rates" in at else at["velocities"]
+    more = [at["accelerations"]] if "accelerations" in at else []
+    for values in ([q], [q, rates], [q, rates, *more]):
+        file = write_table(tmp_path / "m.csv", t, *values, names=tuple(robot.joint_names))
+        found = check_trajectory(
+            robot,
+            read_trajectory(file, joints=robot.joint_names),
+            base="fixed" if played.base is None else "floating",
+            translation=played.translation,
+            rotation=played.rotation,
+            clearance=clearance,
+        )
+        assert found.passed, found
+
+
+# ---- what is asked ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"velocity": {"nobody": 1.0}}, "nobody"),
+        ({"acceleration": -1.0}, "acceleration"),
+        ({"jerk": "much"}, "jerk"),
+        ({"torque": [1.0]}, "torque"),
+        ({"base": "flying"}, "base"),
+        ({"share": -1.0}, "share"),
+        ({"path_tolerance": 0.0}, "path_tolerance"),
+        ({"path_angle": np.nan}, "path_angle"),
+        ({"friction": 0.0}, "friction"),
+    ],
+)
+def test_what_is_asked_wrongly_is_refused_by_name(tmp_path: Path, options: dict[str, Any], name: str) -> None:
+    t, q, *_ = smooth(11)
+    with pytest.raises(ProblemError) as caught:
+        checked(tmp_path, URDF, NAMES, t, q, **options)
+    assert caught.value.name == name

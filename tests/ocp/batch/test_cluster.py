@@ -1,0 +1,41 @@
+"""A Dask cluster does what processes do, and when its workers or its scheduler are killed nothing is lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from ocp import ProblemError
+from ocp.batch import run_batch
+from tests.ocp.batch import functions
+from tests.ocp.batch.drivers import check_killed_cluster, cluster
+
+
+@pytest.mark.filterwarnings("ignore")  # of Dask's own, at its end
+def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ocp.batch.cluster.PATIENCE", 2.0)
+    tasks = [{"mass": float(mass)} for mass in range(1, 7)]
+    own = run_batch(functions.warm, tasks, tmp_path / "own", workers=1, near=["mass"])
+    with cluster(2) as (address, processes):
+        far = run_batch(functions.warm, tasks, tmp_path / "far", cluster=address, near=["mass"])
+        with Client(address, set_as_default=False) as client:
+            ends = run_batch(functions.endings, ["problem", "nan", "good"], tmp_path / "ends", cluster=client)
+            assert client.status == "running"
+            log = tmp_path / "deadly"
+            killed = [{"x": i, "kill": i == 1, "log": str(log)} for i in range(3)]
+            dead = run_batch(functions.deadly, killed, tmp_path / "dead", cluster=client)
+        check_killed_cluster(tmp_path / "b", 30, 0.1, address, processes)
+    for one, two in zip(own, far, strict=True):
+        assert (one.key, one.cost, one.neighbour) == (two.key, two.cost, two.neighbour)
+        assert two.value["plan"].cost == one.cost
+    assert [(result.status, result.error) for result in ends] == [("failed", "ProblemError")] * 2 + [("done", "")]
+    assert [result.status for result in dead] == ["done", "killed", "done"]
+    assert "Dask says" in dead[1].message
+    assert 3 <= len(log.read_text().split()) <= 4
+    with pytest.raises(ProblemError, match="no scheduler answers") as caught:
+        run_batch(functions.square, [{"x": 1.0}], tmp_path / "b", cluster=address)
+    assert caught.value.name == "cluster"

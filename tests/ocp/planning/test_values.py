@@ -1,0 +1,167 @@
+"""Bounds of the cost of every motion: below what brute force finds, and near it."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase
+from models.arrays import Array
+from ocp import TipTask, inverse_kinematics
+from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions, _rim
+from ocp.planning.search import Search
+from ocp.planning.steps import Largest, Length, Sheets, Squares, StepCost, Values, least_in_box
+from ocp.tasks.equations import bind
+from tests.ocp.planning.test_charts import planar
+
+SECONDS, INSTANTS = 3.0, 6
+
+
+def reached(lengths: Array, at: Array, limit: float, count: int) -> Array:
+    """Postures of a planar arm of three joints with the tip at a place: of the first joint all angles, by triangles."""
+    first = np.linspace(-limit, limit, count)
+    x, y = (at[k] - lengths[0] * turn(first) for k, turn in enumerate((np.cos, np.sin)))
+    cosine = (x**2 + y**2 - lengths[1] ** 2 - lengths[2] ** 2) / (2 * lengths[1] * lengths[2])
+    good = np.abs(cosine) <= 1
+    found = []
+    for side in (1.0, -1.0):
+        last = side * np.arccos(cosine[good])
+        second = np.arctan2(y[good], x[good]) - np.arctan2(
+            lengths[2] * np.sin(last), lengths[1] + lengths[2] * np.cos(last)
+        )
+        second = np.remainder(second - first[good] + np.pi, 2 * np.pi) - np.pi
+        found.append(np.column_stack([first[good], second, last]))
+    both = np.vstack(found)
+    return np.asarray(both[(np.abs(both) <= limit).all(axis=1)])
+
+
+def brute_force(nodes: list[Array], cost: StepCost, seconds: float, limit: Array) -> float:
+    """The least cost over all sequences of nodes."""
+    value = np.zeros(len(nodes[-1]))
+    for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
+        way = there[None] - here[:, None]
+        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.of(way, seconds), np.inf)
+        value = (steps + value).min(axis=1)
+    return float(value.min())
+
+
+def random_case(seed: int) -> tuple[FixedBase, Array, Array, Array]:
+    """An arm, its lengths, the places of its tip and weights."""
+    rng = np.random.default_rng(seed)
+    lengths = rng.uniform(0.25, 0.6, 3)
+    machine = planar(lengths)
+    joints = rng.uniform(-2.0, 2.0, 3)
+    first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2]
+    way = rng.normal(size=2)
+    way *= rng.uniform(0.1, 0.4) / np.linalg.norm(way)
+    bend = rng.normal(size=2) * 0.1
+    s = np.linspace(0, 1, INSTANTS)[:, None]
+    places = first + s * way + 4 * s * (1 - s) * bend
+    reach = lengths.sum()
+    places *= np.minimum(1.0, 0.97 * reach / np.linalg.norm(places, axis=1).max())
+    return machine, lengths, places, rng.uniform(0.5, 2.0, 3)
+
+
+def search_of(machine: FixedBase, places: Array, cost: StepCost) -> Search:
+    times = np.linspace(0, SECONDS, INSTANTS)
+    task = TipTask(position=[*places[0]], rows=[3, 4])
+    equations = bind(machine, task)
+    targets = np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places])
+    robot = machine.robot
+    space = JointSpace(machine, robot.lower, robot.upper, cost.weights if isinstance(cost, Squares) else np.ones(3))
+    sets = SelfMotions(space, equations, targets)
+
+    def seeds(k: int) -> Array:
+        at = TipTask(position=[*places[k]], rows=[3, 4])
+        return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
+
+    limits = robot.velocity * np.diff(times)[:, None]
+    return Search(space, [Instant(sets, k) for k in range(INSTANTS)], times, cost, limits, seeds=seeds)
+
+
+@pytest.mark.parametrize("kind", [Squares, Length, Largest])
+@pytest.mark.parametrize("seed", range(25))
+def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> None:
+    machine, lengths, places, weights = random_case(seed)
+    cost = kind(weights)
+    nodes = [reached(lengths, place, 2.8, 700) for place in places]
+    seconds = SECONDS / (INSTANTS - 1)
+    least = brute_force(nodes, cost, seconds, machine.robot.velocity * seconds)
+    search = search_of(machine, places, cost)
+    path, bound = search.best(np.inf)
+    assert path is not None
+    steps = search.steps(path)
+    tips = np.array([np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2] for joints in path])
+    assert tips == pytest.approx(places, abs=1e-8)
+    assert (np.abs(np.diff(path, axis=0)) <= machine.robot.velocity * seconds + 0.1).all()
+    assert steps <= least * 1.01
+    assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free: int) -> None:
+    rng = np.random.default_rng(3)
+    count, n, seconds, half = 200, 4, 0.7, 0.2
+    weights = rng.uniform(0.5, 2.0, n)
+    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
+
+    def charts() -> Charts:
+        """That lie flat."""
+        ways = np.linalg.qr(rng.normal(size=(count, n, free)))[0] / scale[:, None]
+        ends = rng.uniform(0.0, half, (2, count, free))
+        flat = np.zeros((count, len(_rim(free)), n))
+        return Charts(
+            np.zeros(count, dtype=np.intp), np.zeros((count, n)), ways, np.full(count, half), -ends[0], ends[1], flat
+        )
+
+    out, into = charts(), charts()
+    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
+    after = Values(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
+    delta = 0.3 * rng.normal(size=(count, n))
+    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    grid = np.array(list(product(np.linspace(0, 1, 41 if free > 1 else 1001), repeat=free)))
+    there = into.low[:, None] + (into.high - into.low)[:, None] * grid
+    to_come = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
+    to_come = to_come + np.einsum("pga,pab,pgb->pg", there, after.curve, there) / 2
+
+    def costs(place: Array) -> Array:
+        start = delta - np.einsum("pnr,pr->pn", out.tangents, place)
+        ways = start[:, None] + np.einsum("pnr,pgr->pgn", into.tangents, there)
+        return np.asarray((cost.of(ways, seconds) + to_come).min(axis=1))
+
+    def somewhere() -> Array:
+        return np.asarray(out.low + (out.high - out.low) * rng.uniform(size=(count, free)))
+
+    for _ in range(8):
+        place, other = somewhere(), somewhere()
+        value, slope = steps.at(place)
+        way = other - place
+        below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
+        assert (below <= costs(other) + 1e-9).all()
+        assert (value <= costs(place) + 1e-9).all()
+        if kind is not Squares:
+            assert value == pytest.approx(costs(place), abs=1e-3)
+    near = somewhere()
+    lower = steps.lower(near, np.zeros((count, free)), np.zeros((count, free, free)))
+    assert (steps.at(lower)[0] <= steps.at(near)[0] + 1e-9).all()
+
+
+@pytest.mark.parametrize("free", [1, 2])
+def test_the_least_of_a_quadratic_in_a_box_is_that_of_a_fine_grid(free: int) -> None:
+    rng = np.random.default_rng(5)
+    count = 500
+    slope, square = rng.normal(size=(count, free)), rng.normal(size=(count, free, free)) * 3
+    square += square.transpose(0, 2, 1)
+    low, high = -rng.uniform(0.0, 1.0, (count, free)), rng.uniform(0.0, 1.0, (count, free))
+    grid = np.array(list(product(np.linspace(0, 1, 61), repeat=free)))
+    at = low[:, None] + (high - low)[:, None] * grid
+    values = np.einsum("pgr,pr->pg", at, slope) + np.einsum("pga,pab,pgb->pg", at, square, at) / 2
+    least, place = least_in_box(slope, square, low, high)
+    assert (least <= values.min(axis=1) + 1e-12).all()
+    assert least == pytest.approx(values.min(axis=1), abs=5e-3)
+    assert ((place >= low) & (place <= high)).all()
+    assert least == pytest.approx((place * (slope + np.einsum("pab,pb->pa", square, place) / 2)).sum(axis=1))

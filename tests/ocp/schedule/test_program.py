@@ -1,0 +1,93 @@
+"""The parts of a schedule's programs: sums by interval, the jerk that a motion holds, demands between the nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp.schedule import LineLimits, schedule
+from ocp.schedule.grid import make_grid
+from ocp.schedule.profile import LineMotion, through
+from ocp.schedule.program import Spline, _ByInterval
+from ocp.schedule.rows import rows_at
+from ocp.schedule.stretch import _jerk_of
+from ocp.schedule.window import ROOM, Stretch, Window, demanded, profile_of
+from scripts.timing.schedules import JOINTS, panda_path
+from tests.models.paths.task_paths import seeds
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(1, 700), st.integers(1, 4))
+def test_sums_and_least_values_by_interval_are_those_of_a_loop(seed: int, count: int, kinds: int) -> None:
+    rng = np.random.default_rng(seed)
+    interval = rng.integers(0, count, int(rng.integers(1, 6 * count)))
+    by = _ByInterval(interval, count)
+    values = rng.normal(size=(kinds, len(interval)))
+    sums, least = np.zeros((kinds, count)), np.full((kinds, count), np.inf)
+    for row, k in enumerate(interval.tolist()):
+        sums[:, k] += values[:, row]
+        least[:, k] = np.minimum(least[:, k], values[:, row])
+    ordered = values[:, by.order]
+    assert by.reduced(np.add, ordered, 0.0) == pytest.approx(sums, abs=1e-12)
+    assert by.reduced(np.minimum, ordered, np.inf) == pytest.approx(least)
+
+
+@settings(max_examples=40)
+@given(seeds)
+def test_a_spline_has_the_values_and_derivatives_of_its_basis(seed: int) -> None:
+    """And goes through what it is made of; its second derivative is that of the slopes."""
+    rng = np.random.default_rng(seed)
+    nodes = np.cumsum(rng.uniform(0.1, 1.0, 9))
+    spline = Spline(nodes)
+    b = rng.uniform(0.5, 2.0, len(nodes) + 1)
+    x, slope = spline.at_nodes(b)
+    assert spline.through(x, slope) == pytest.approx(b)
+    interval, fraction = rng.integers(0, 8, 30), rng.uniform(0, 1, 30)
+    near = np.stack([b[interval + k] for k in range(3)])
+    value, first, second = (spline.basis(interval, fraction) * near).sum(axis=1)
+    way = fraction * np.diff(nodes)[interval]
+    assert second == pytest.approx((np.diff(slope) / np.diff(nodes))[interval])
+    assert first == pytest.approx(slope[interval] + way * second)
+    assert value == pytest.approx(x[interval] + way * (slope[interval] + first) / 2)
+
+
+@settings(max_examples=40)
+@given(st.floats(-1, 1), st.floats(-1, 1))
+def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float, bend: float) -> None:
+    """But for terms of second order: half the interval, a quarter of the error."""
+    errors = []
+    for h in (0.04, 0.02):
+        s = np.array([0.0, h])
+        x = 1 + slope * s + bend * s**2 / 2
+        jerk = through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
+        places = h * np.array([_jerk_of(0.0), _jerk_of(1.0)])
+        errors.append(np.abs(jerk - bend / 2 * np.sqrt(1 + slope * places + bend * places**2 / 2)).max())
+    assert errors[1] <= errors[0] / 3.5 + 1e-11
+    assert errors[0] <= 1e-3
+
+
+def test_what_is_demanded_is_what_dense_samples_demand() -> None:
+    """In every interval, by every limit that comes near: no less, and next to no more."""
+    path, joints = panda_path(4)
+    limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
+    grid = make_grid(path, limits, joints)
+    stretch = Stretch(path, limits, joints, grid, 0, len(grid.asked))
+    window = Window.of(stretch, 0, len(grid.asked), stretch.ends)
+    plan = schedule(path, limits, joints=joints)
+    motion = plan.profile.at_distance(grid.distance)
+    profile = profile_of(window, motion.speed**2, 2 * motion.acceleration)
+    used = demanded(window, profile)[0]
+    shares = np.linspace(1e-6, 1 - 1e-6, 201)
+    places = grid.distance[:-1, None] + shares * np.diff(grid.distance)[:, None]
+    dense = profile.at_distance(places.ravel())
+    rows = rows_at(path, limits, joints, places.ravel())
+    values = rows.demands(LineMotion(*dense)).reshape(*places.shape, -1)
+    for side, sign in zip(used, (1, -1), strict=True):
+        most = (sign * values).max(axis=1)
+        near = most > 0.9
+        assert near.sum() > 50
+        # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
+        assert (side - most)[near].min() > -2 * ROOM
+        assert (side - most)[near].max() < 2 * ROOM

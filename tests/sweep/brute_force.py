@@ -1,0 +1,148 @@
+"""Random coarse tasks of planar arms: the search beside the least over all sequences of postures of a fine grid.
+
+python -m tests.sweep.brute_force --out FILE [--count 1000] [--only two] [--minutes 60]
+
+The bound must be above none of them, what is found as cheap, and nothing may be called impossible that the grid can do.
+Results are added line by line to a file; a case that is there already is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import Array
+from ocp import TipTask, inverse_kinematics
+from ocp.local.inverse_kinematics import Unreachable
+from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.search import Search
+from ocp.planning.steps import Length, Squares, StepCost
+from ocp.tasks.equations import bind
+from tests.ocp.planning.test_charts import planar
+from tests.ocp.planning.test_values import INSTANTS, SECONDS, reached
+
+KINDS = ("plain", "cut", "slow", "turning", "two")
+"""Limits that hardly matter; that cut the set of postures; slow joints; joints that turn without end; four joints."""
+GRID, COARSE = 700, 36
+"""Angles of the first joint of three; of each of the first two of four."""
+GAPS = {False: 0.03, True: 0.1}
+AS_CHEAP = {False: 1.01, True: 1.02}
+"""What is found of the least on the grid, at most; with two free directions the grid is coarse."""
+
+
+def judged(kind: str, seed: int) -> dict[str, Any]:
+    """One case: what was found, its bound, the least on the grid, and what is wrong."""
+    rng = np.random.default_rng([KINDS.index(kind), seed])
+    two, cost = kind == "two", (Squares, Length)[seed % 2 if kind != "two" else 0]
+    size = 4 if two else 3
+    limit = {"cut": rng.uniform(1.0, 2.2), "turning": 7.0, "two": 1.6}.get(kind, 2.8)
+    speed = rng.uniform(0.15, 0.5) if kind == "slow" else 3.0
+    lengths, weights = rng.uniform(0.25, 0.6, size), rng.uniform(0.5, 2.0, size)
+    machine = planar(lengths, limit, speed)
+    joints = rng.uniform(-1.0, 1.0, size) * min(limit, 2.0)
+    first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2]
+    ways = rng.normal(size=(2, 2))
+    ways *= np.array([[rng.uniform(0.1, 0.4)], [0.1]]) / np.linalg.norm(ways, axis=1)[:, None]
+    s = np.linspace(0, 1, INSTANTS)[:, None]
+    places = first + s * ways[0] + 4 * s * (1 - s) * ways[1]
+    places *= np.minimum(1.0, 0.97 * lengths.sum() / np.linalg.norm(places, axis=1).max())
+    times = np.linspace(0, SECONDS, INSTANTS)
+    price, seconds = cost(weights), float(times[1])
+    metric = weights if cost is Squares else np.ones(size)
+    space = JointSpace(machine, machine.robot.lower, machine.robot.upper, metric)
+    most = machine.robot.velocity * seconds
+    angles = min(limit, np.pi) * (1 - 1e-9)
+    nodes = [(_by_four if two else _by_three)(lengths, place, angles) for place in places]
+    least = _least(nodes, price, seconds, most, space)
+    equations = bind(machine, TipTask(position=[*places[0]], rows=[3, 4]))
+    sets = SelfMotions(space, equations, np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]))
+
+    def seeds(k: int) -> Array:
+        at = TipTask(position=[*places[k]], rows=[3, 4])
+        return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
+
+    begun, steps, bound = time.process_time(), np.inf, np.inf
+    try:
+        instants = [Instant(sets, k) for k in range(INSTANTS)]
+        search = Search(space, instants, times, price, np.repeat(most[None], INSTANTS - 1, axis=0), seeds=seeds)
+        path, bound = search.best(np.inf)
+        steps = np.inf if path is None else search.steps(path)
+    except Unreachable:
+        pass
+    wrong = []
+    if bound > min(steps, least) * (1 + 1e-9):
+        wrong.append("bound above")
+    if steps > AS_CHEAP[two] * least:
+        wrong.append("dearer")
+    if np.isfinite(steps) and bound < (1 - GAPS[two]) * steps:
+        wrong.append("gap")
+    found = {"kind": kind, "seed": seed, "cost": cost.__name__, "steps": steps, "bound": bound, "least": least}
+    return found | {"wrong": wrong, "seconds": time.process_time() - begun}
+
+
+def _by_three(lengths: Array, at: Array, limit: float) -> Array:
+    """Postures of an arm of three joints, of the first all angles."""
+    return reached(lengths, at, limit, GRID)
+
+
+def _by_four(lengths: Array, at: Array, limit: float) -> Array:
+    """Postures of an arm of four joints, of the first two all angles."""
+    found = []
+    for angle in np.linspace(-limit, limit, COARSE):
+        c, s = np.cos(angle), np.sin(angle)
+        beyond = np.array([[c, s], [-s, c]]) @ at - [lengths[0], 0.0]
+        rest = reached(lengths[1:], beyond, limit, COARSE)
+        found.append(np.column_stack([np.full(len(rest), angle), rest]))
+    return np.vstack(found)
+
+
+def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, space: JointSpace) -> float:
+    """The least cost over all sequences of nodes."""
+    value = np.zeros(len(nodes[-1]))
+    for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
+        before = np.full(len(here), np.inf)
+        for i, one in enumerate(here):
+            way = there - one
+            way[:, space.periodic] -= TURN * np.round(way[:, space.periodic] / TURN)
+            total = value + price.of(way, seconds)
+            before[i] = total[(np.abs(way) <= most).all(axis=1)].min(initial=np.inf)
+        value = before
+    return float(value.min(initial=np.inf))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
+    parser.add_argument("--only", choices=KINDS, action="append")
+    parser.add_argument("--count", type=int, default=1000, help="cases, of the kinds in turn")
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no further case is begun")
+    given = parser.parse_args()
+    kinds, end, rows = given.only or list(KINDS), time.time() + 60 * given.minutes, dict[Any, dict[str, Any]]()
+    if given.out.exists():
+        rows = {(row["kind"], row["seed"]): row for row in map(json.loads, given.out.read_text().splitlines())}
+    shown = []
+    for number in range(given.count):
+        key = kinds[number % len(kinds)], number // len(kinds)
+        if key not in rows:
+            if time.time() > end:
+                break
+            rows[key] = judged(*key)
+            with given.out.open("a") as file:
+                file.write(json.dumps(rows[key]) + "\n")
+        shown.append(rows[key])
+        if rows[key]["wrong"]:
+            print(rows[key], flush=True)
+    possible = sum(np.isfinite(row["steps"]) for row in shown)
+    print(
+        f"{len(shown)} cases, {possible} of which have a motion; {sum(bool(row['wrong']) for row in shown)} are wrong"
+    )
+
+
+if __name__ == "__main__":
+    main()

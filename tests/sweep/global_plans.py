@@ -1,0 +1,155 @@
+"""Seeded tasks planned by search over all motions, beside the best of many random starts.
+
+python -m tests.sweep.global_plans --out FILE [--kind panda] [--count 40] [--starts 200] [--minutes 60] [--again]
+
+The global plan must never be dearer than the best of the starts, must cost at most a tenth of their processor time, and
+its bound must be within 2 % with one free direction, 10 % with two. Results are added line by line to a file; a task
+that is there already is not done again, or, with --again, only its global plan.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase
+from models.arrays import Array
+from ocp import ProblemError, SolveError, TipTask, inverse_kinematics, plan
+from ocp.local.inverse_kinematics import Unreachable
+from tests.ocp.planning.test_charts import planar
+from tests.ocp.tasks.space_tasks import panda, ur5
+
+SECONDS = 4.0
+KINDS = {"panda": (panda, 1), "ur5": (ur5, 1), "planar": (lambda: planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0), 2)}
+"""Machines, and the directions that their tasks leave free: the whole pose, the roll free, and the place in a plane."""
+GAPS = {1: 0.02, 2: 0.1}
+SHARE = 0.1
+LOOKED = 5
+"""Times at which a task must be within reach."""
+
+
+def task_of(kind: str, seed: int) -> tuple[FixedBase, TipTask]:
+    """A bent way from a random posture that is within reach all along."""
+    rng = np.random.default_rng([sorted(KINDS).index(kind), seed])
+    make: Any = KINDS[kind][0]
+    machine: FixedBase = make()
+    low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
+    while True:
+        joints = rng.uniform(0.8 * low, 0.8 * high)
+        pose = machine.tip_pose((), joints)
+        first, turn = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))
+        ways = rng.normal(size=(2, 3))
+        ways *= np.array([[rng.uniform(0.1, 0.3)], [rng.uniform(0.0, 0.1)]]) / np.linalg.norm(ways, axis=1)[:, None]
+
+        def where(t: Any, first: Array = first, ways: Array = ways) -> Any:
+            s = t / SECONDS
+            return ca.DM(first) + s * ca.DM(ways[0]) + ca.sin(2 * np.pi * s) * ca.DM(ways[1])
+
+        if kind == "panda":
+            task = TipTask(position=where, orientation=turn, duration=SECONDS)
+        elif kind == "ur5":
+            task = TipTask(position=where, direction=turn[:, 2], duration=SECONDS)
+        else:
+            task = TipTask(position=lambda t, where=where: where(t)[:2], rows=[3, 4], duration=SECONDS)
+        try:
+            for t in np.linspace(0, SECONDS, LOOKED):
+                inverse_kinematics(machine, task, time=float(t), starts=16)
+        except Unreachable:
+            continue
+        return machine, task
+
+
+def by_search(kind: str, seed: int) -> dict[str, Any]:
+    """The global plan: its cost, bound and processor time."""
+    machine, task = task_of(kind, seed)
+    begun = time.process_time()
+    try:
+        found = plan(machine, task, search="global", clearance=None)
+        row = {"cost": found.cost, "bound": found.bound, "passed": found.audit().passed}
+    except (SolveError, ProblemError) as error:
+        row = {"cost": np.inf, "bound": 0.0, "passed": False, "said": str(error)[:200]}
+    return row | {"seconds": time.process_time() - begun}
+
+
+def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
+    """The best of so many random starts, and the processor time of all."""
+    machine, task = task_of(kind, seed)
+    begun, best, failed, k = time.process_time(), np.inf, 0, 0
+    while k < starts:
+        for posture in inverse_kinematics(machine, task, seed=1000 * seed + k, starts=starts):
+            k += 1
+            try:
+                best = min(best, plan(machine, task, start=posture.joints, search="start", clearance=None).cost)
+            except (SolveError, ProblemError):
+                failed += 1
+            if k == starts:
+                break
+    return {"best": best, "failed": failed, "starts": starts, "starts_seconds": time.process_time() - begun}
+
+
+def faults(row: dict[str, Any]) -> list[str]:
+    """What a task's result breaks of what is promised."""
+    found = list[str]()
+    if row["cost"] > row["best"] * (1 + 1e-6):
+        found.append("dearer")
+    if row["bound"] > min(row["best"], row["cost"]) * (1 + 1e-6):
+        found.append("bound above")
+    if np.isfinite(row["cost"]) and row["bound"] < (1 - GAPS[KINDS[row["kind"]][1]]) * row["cost"]:
+        found.append("gap")
+    if row["seconds"] > SHARE * row["starts_seconds"]:
+        found.append("slow")
+    if np.isfinite(row["cost"]) and not row["passed"]:
+        found.append("audit")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
+    parser.add_argument("--kind", choices=list(KINDS), action="append")
+    parser.add_argument("--count", type=int, default=40, help="tasks, of the kinds in turn")
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no further task is begun")
+    parser.add_argument("--again", action="store_true", help="the global plans of the tasks in the file once more")
+    given = parser.parse_args()
+    kinds, rows, end = (
+        given.kind or list(KINDS),
+        dict[tuple[str, int], dict[str, Any]](),
+        time.time() + 60 * given.minutes,
+    )
+    if given.out.exists():
+        for line in given.out.read_text().splitlines():
+            row = json.loads(line)
+            rows[row["kind"], row["seed"]] = row
+    shown = {}
+    for number in range(given.count):
+        key = kinds[number % len(kinds)], number // len(kinds)
+        known = rows.get(key)
+        if time.time() > end:
+            break
+        if known is None or given.again:
+            row = {"kind": key[0], "seed": key[1], **by_search(*key)}
+            names = ("best", "failed", "starts", "starts_seconds")
+            row |= by_starts(*key, given.starts) if known is None else {name: known[name] for name in names}
+            rows[key] = row
+            with given.out.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        shown[key] = rows[key]
+        row = shown[key]
+        print(
+            f"{key[0]:7s} {key[1]:3d}  cost {row['cost']:.6f}  best of starts {row['best']:.6f}  bound "
+            f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {faults(row)}",
+            flush=True,
+        )
+    wrong = [key for key, row in shown.items() if faults(row)]
+    print(f"{len(shown)} tasks, {len(wrong)} of which break what is promised")
+
+
+if __name__ == "__main__":
+    main()
