@@ -258,7 +258,7 @@ def run(code: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
 
 
 INTERRUPTED = """
-import os, signal, threading, time
+import os, signal, subprocess, time
 import casadi as ca
 from ocp import Collocation, Problem, prepare
 
@@ -274,8 +274,8 @@ never = {"tol": 1e-300, "acceptable_iter": 0, "max_iter": 1000000} if SOLVER == 
 prepared = prepare(problem, Collocation(600, 4), solver=SOLVER, options=never)
 before = signal.getsignal(signal.SIGINT)
 for check in (False, True):
-    stop = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
-    stop.start()
+    # from another process, for a thread may wait long for its turn
+    stop = subprocess.Popen(["sh", "-c", f"sleep 0.1; kill -INT {os.getpid()}"])
     began = time.monotonic()
     try:
         prepared.solve(check=check)
@@ -283,7 +283,7 @@ for check in (False, True):
     except KeyboardInterrupt as error:
         print(error.solution.success, error.solution.status, error.solution["x"].shape)
     assert time.monotonic() - began < 2
-    stop.join()
+    stop.wait()
     print("restored", signal.getsignal(signal.SIGINT) is before)
 again = prepare(problem, Collocation(20), solver=SOLVER).solve()
 print("afterwards", again.success)
