@@ -52,6 +52,10 @@ class PiecewisePolynomial:
     nodes: np.ndarray
     values: np.ndarray
 
+    def __repr__(self) -> str:
+        pieces, nodes, columns = self.values.shape
+        return f"<PiecewisePolynomial of {pieces} pieces of {nodes} nodes, {columns} columns>"
+
     def __call__(self, at: np.ndarray) -> np.ndarray:
         """Values at ``at`` (M,), continuous from the right at breaks, clipped to the ends. Shape (M, n)."""
         piece = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)

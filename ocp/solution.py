@@ -51,6 +51,7 @@ HEAD = {
     "regularised": bool,
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
+MOST_LINES = 15  # of a solution that is printed
 AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
 PLAIN = ("t", "variables", "multipliers")
 PARTS = ("breaks", "nodes", "values")  # of an interpolant
@@ -143,6 +144,61 @@ class Solution:
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
         return by_name("state or control", name, {**self.states, **self.controls})
+
+    def __repr__(self) -> str:
+        return (
+            f"<Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict}, "
+            f"cost {self.cost:.6g}, {self.horizon:.6g} s, {len(self.t)} times>"
+        )
+
+    def __str__(self) -> str:
+        """What solved it, what it costs, and between which values states and controls are; 15 lines at most."""
+        lines = [
+            f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
+            f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
+        ]
+        pools = {**self.states, **self.controls}
+        width = max(map(len, pools), default=0)
+        for name, values in list(pools.items())[: MOST_LINES - 2]:
+            kind = "state" if name in self.states else "control"
+            span = f"{values.min():.5g} to {values.max():.5g}" if values.size else "nothing"
+            lines.append(f"  {name:<{width}}  {kind:<7}  {values.shape[1]} wide, {span}")
+        if len(pools) > MOST_LINES - 2:
+            lines.append(f"  {len(pools) - MOST_LINES + 2} more")
+        return "\n".join(lines)
+
+    @property
+    def _verdict(self) -> str:
+        return "solved" if self.success else self.status
+
+    def plot(self, against: Any = None, *, figure: Any = None) -> Any:
+        """States and controls over time, with their bounds; see :func:`ocp.app.plots.plot_solution`.
+
+        The solution is blue; another one of the same states and controls, or several by name, orange. A notebook shows
+        the figure, ``.savefig("plan.png")`` writes it; ``figure=plt.figure()`` draws into a window.
+
+        Raises:
+            ProblemError: No solution, or of other states and controls.
+        """
+        from ocp.app.plots import plot_solution
+
+        return plot_solution(self, against, figure)
+
+    def _repr_html_(self) -> str:
+        from ocp.app.plots import html_of_solution
+
+        return html_of_solution(self)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns by name, a row for every reported time: what pandas.DataFrame, polars.DataFrame, pyarrow.table take.
+
+        ``time`` (s), states and controls; an entry of several is called ``NAME[k]``. Shape (M,) each.
+        """
+        columns = {"time": self.t}
+        for name, values in {**self.states, **self.controls}.items():
+            several = values.shape[1] > 1
+            columns |= {f"{name}[{k}]" if several else name: column for k, column in enumerate(values.T)}
+        return columns
 
     def costate(self, name: str) -> np.ndarray:
         """Costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""

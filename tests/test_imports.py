@@ -39,8 +39,12 @@ FLOORS = {
 }
 """Rooms and single modules from the ground up; each may import what stands on lower floors."""
 SEES_MODELS = {"tasks", "local", "builders", "planning", "batch", "files", "app"}
-LAZY = {("ocp.solution", "ocp.audit.audit")}
-"""The one import that goes up, when `Solution.audit` is called."""
+LAZY = {
+    ("ocp.solution", "ocp.audit.audit"),
+    ("ocp.solution", "ocp.app.plots"),
+    ("ocp.planning.motion", "ocp.app.plots"),
+}
+"""Imports that go up, when `Solution.audit`, or `plot` of a solution or a plan, is called."""
 FOREIGN = {"models": {"casadi", "numpy"}}
 
 
@@ -74,7 +78,7 @@ class House:
         }
 
     def arrows(self) -> Iterator[tuple[Module, str]]:
-        """A module and one that it imports, the lazy exception left out."""
+        """A module and one that it imports, the lazy exceptions left out."""
         for module in self.modules.values():
             for other in sorted(module.imports):
                 if (module.name, other) not in LAZY:

@@ -272,6 +272,9 @@ class Robot:
         """Print the tree with masses and limits, which is also `str(robot)`. A limit that is not there is not shown."""
         print(self)
 
+    def __repr__(self) -> str:
+        return f"<Robot {self.name!r}: {len(self.links)} links, {self.dof} degrees of freedom, tip on {self.tip}>"
+
     def __str__(self) -> str:
         lines = [
             f"{self.name} of {len(self.links)} links, {self.dof} degrees of freedom, "

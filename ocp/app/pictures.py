@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -14,25 +14,41 @@ from models import Machine, Robot, link_frames
 from models.arrays import Array
 from models.shapes.bodies import bodies_of
 from models.shapes.hull import convex_hull
+from ocp.app.colors import COMPARED, FAULT, LIMIT, PLAN, SURROUNDINGS, TIP
 from ocp.app.pieces import Motion
 from ocp.problem.formulation import Sampler
 from ocp.problem.hulls import frames_of
 from ocp.tasks.limits import JointBounds
 
-__all__ = ["Solid", "curves", "scene", "solids_of"]
+__all__ = [
+    "STYLE",
+    "Solid",
+    "add_names",
+    "as_svg",
+    "curves",
+    "draw_joints",
+    "look",
+    "scene",
+    "show_limits",
+    "solids_of",
+]
 
 Solid = tuple[Array, NDArray[np.intp]]
 """Corners (k, 3), m, and triangles of them (f, 3)."""
 
-PLAN, LIMIT, GREY, GREEN = "#0072B2", "#D55E00", "#6E6E6E", "#009E73"
-"""Of the motion, of what it is held against, of what stands around, of the tip: told apart with every colour vision
-(Okabe, Ito 2008)."""
 SHOWN = 4
 """Times at which the robot is shown."""
 POINTS = 400
 """Of a curve."""
+FAR = 1.5
+"""Of the span of a curve: limits further from it would leave nothing of its shape to see."""
+NOTHING = 1e-3
+"""Of the largest value of a kind: what changes by less is rounding."""
 WIDTH = 7.4
 """Of a picture, inches."""
+STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
+DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
+"""Of what a plan is compared with, so that nothing is known by its colour alone."""
 
 
 def solids_of(robot: Robot, folders: Sequence[Any] = ()) -> list[tuple[str, Solid]]:
@@ -97,10 +113,10 @@ def scene(
                 axes.plot(*line.T, "-o", color=PLAN, alpha=shade, lw=2, ms=3)
     for corners, faces in around:
         clouds.append(corners)
-        axes.add_collection3d(Poly3DCollection(corners[faces], facecolors=GREY, alpha=0.35, shade=True))
+        axes.add_collection3d(Poly3DCollection(corners[faces], facecolors=SURROUNDINGS, alpha=0.35, shade=True))
     if tips.shape[1]:
         clouds.append(tips)
-        axes.plot(*tips.T, color=GREEN, lw=2.5, label="way of the tip")
+        axes.plot(*tips.T, color=TIP, lw=2.5, label="way of the tip")
         axes.legend(loc="upper left", frameon=False)
     cloud = np.vstack(clouds)
     low, high = cloud.min(axis=0), cloud.max(axis=0)
@@ -118,39 +134,100 @@ def curves(
     motion: Motion, names: Sequence[str], units: Sequence[str], bounds: JointBounds, faults: Sequence[Any]
 ) -> str:
     """Position, velocity and acceleration of every joint with its limits, and where faults are; an SVG."""
-    import matplotlib
     from matplotlib.figure import Figure
 
+    figure = Figure(figsize=(WIDTH, 0.4 + 1.15 * len(names)), layout="constrained")
+    draw_joints(figure, {"": motion}, names, units, bounds, faults)
+    return as_svg(figure)
+
+
+def draw_joints(
+    figure: Any,
+    motions: Mapping[str, Motion],
+    names: Sequence[str],
+    units: Sequence[str],
+    bounds: JointBounds,
+    faults: Sequence[Any] = (),
+) -> None:
+    """Position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+
+    Of several motions, by name, the first is the plan, and the others are what it is compared with.
+    """
+    import matplotlib
+
     kinds = [("position", ""), ("velocity", "/s"), ("acceleration", "/s²")]
-    times = np.unique(
-        np.concatenate([np.linspace(motion.t[0], motion.t[-1], POINTS), motion.t[:: len(motion.t) // POINTS + 1]])
-    )
-    along = [motion.along(kind) for kind, _ in kinds]
-    with matplotlib.rc_context(
-        {"font.size": 7.5, "svg.hashsalt": "selfmotion", "axes.spines.top": False, "axes.spines.right": False}
-    ):
-        figure = Figure(figsize=(WIDTH, 0.4 + 1.15 * len(names)), layout="constrained")
+    with matplotlib.rc_context(STYLE):
         grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
-        for row, name in enumerate(names):
-            for column, (kind, per) in enumerate(kinds):
-                ax, one = grid[row, column], along[column]
-                most = getattr(bounds, kind, None)
-                limits = (bounds.lower[row], bounds.upper[row]) if most is None else (-most[row], most[row])
-                if one is not None:
-                    ax.plot(times, one.pieces.at(times)[:, row], color=PLAN, lw=1.2)
-                for limit in limits:
-                    if np.isfinite(limit):
-                        ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+        for column, (kind, per) in enumerate(kinds):
+            drawn = []
+            for number, motion in reversed([*enumerate(motions.values())]):  # the plan on top
+                spread = motion.t[:: len(motion.t) // POINTS + 1]
+                times = np.unique(np.concatenate([np.linspace(motion.t[0], motion.t[-1], POINTS), spread]))
+                one = motion.along(kind)
+                drawn.append((number, times, None if one is None else one.pieces.at(times)))
+            most = getattr(bounds, kind, None)
+            lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
+            least = NOTHING * max((np.abs(values).max() for _, _, values in drawn if values is not None), default=1.0)
+            grid[0, column].set_title(kind)
+            for row, name in enumerate(names):
+                ax = grid[row, column]
+                for number, times, values in drawn:
+                    if values is not None:
+                        ax.plot(times, values[:, row], **look(number))
+                show_limits(ax, lower[row], upper[row], least)
                 for fault in faults:
                     if fault.name == name and fault.kind == kind and fault.time is not None:
-                        ax.axvline(fault.time, color=LIMIT, lw=1.4, alpha=0.6)
-                if row == 0:
-                    ax.set_title(kind, fontsize=8.5)
+                        ax.axvline(fault.time, color=FAULT, lw=1.6)
                 ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
                 ax.margins(x=0.01)
         for ax in grid[-1]:
             ax.set_xlabel("time, s")
-        stream = io.StringIO()
+        if len(motions) > 1:
+            add_names(figure, list(motions))
+
+
+def show_limits(ax: Any, lower: float, upper: float, least: float) -> None:
+    """Limits of the curves in some axes: dashed where they are near, and said in words where they are far.
+
+    Curves that change by less than `least` are drawn as ones that do not.
+    """
+    low, high = ax.dataLim.y0, ax.dataLim.y1
+    if not np.isfinite([low, high]).all():
+        low = high = 0.0
+    span = max(high - low, least) or 1.0
+    far = []
+    for limit in (lower, upper):
+        if low - FAR * span <= limit <= high + FAR * span:
+            ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+            low, high = min(low, limit), max(high, limit)
+        elif np.isfinite(limit):
+            far.append(f"{limit:.3g}")
+    if far:
+        words = f"limit{'s' if len(far) > 1 else ''} {', '.join(far)}"
+        ax.annotate(words, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", color=LIMIT, fontsize=6)
+    room = max(0.06 * (high - low), 0.55 * (span - (high - low)))
+    ax.set_ylim(low - room, high + room + (0.1 * span if far else 0.0))
+
+
+def look(number: int) -> dict[str, Any]:
+    """How the curve of a plan, number 0, and those of what it is compared with are drawn."""
+    return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
+
+
+def add_names(figure: Any, names: Sequence[str]) -> None:
+    """A legend below a figure: the plan's name, and those of what it is compared with."""
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], **look(number)) for number in range(len(names))]
+    figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
+
+
+def as_svg(figure: Any) -> str:
+    """A figure as the element `svg`, for a page."""
+    import matplotlib
+
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "selfmotion"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]

@@ -89,7 +89,7 @@ class Report:
             )
         parts.append(
             f"<h2>The joints</h2><figure>{self.plots}<figcaption>Blue: the motion, between its samples as a controller "
-            "makes it. Orange, dashed: limits.</figcaption></figure>"
+            "makes it. Grey: limits, dashed or, far off, in words. Purple: where they are passed.</figcaption></figure>"
         )
         parts += [f"<h2>{escape(title)}</h2>{_table(rows)}" for title, rows in self.tables]
         if self.notes:

@@ -138,11 +138,16 @@ class Audit:
         share = self["cost lost, relative"].value
         return f"may be run; a local minimum; at most {share:.2g} of its cost dearer than the extremal beside it"
 
+    def __repr__(self) -> str:
+        return f"<Audit of {self.name!r}: {self._word}; {len(self.findings)} findings, {len(self.failures)} failed>"
+
+    @property
+    def _word(self) -> str:
+        return "passed" if self.passed else "not decided" if self.feasible and self.optimal is None else "FAILED"
+
     def __str__(self) -> str:
         width = max(len(finding.name) for finding in self.findings)
-        open_only = self.feasible and self.optimal is None
-        word = "passed" if self.passed else "not decided" if open_only else "FAILED"
-        lines = [f"Audit of {self.name!r}: {word}"]
+        lines = [f"Audit of {self.name!r}: {self._word}"]
         words = {True: "yes", False: "NO", None: "not decided"}
         for verdict, holds in (("feasible", self.feasible), ("optimal", self.optimal)):
             title = f"{verdict}: {words[holds]}"

@@ -85,6 +85,9 @@ class Certificate:
         parts += [f"the audit of {', '.join(failed)} failed"] if failed else []
         return "; ".join(parts)
 
+    def __repr__(self) -> str:
+        return f"<Certificate of {self.problem!r}: {self.verdict}>"
+
     def __str__(self) -> str:
         width = max(len(c.name) for c in self.comparisons)
         head = ("cost", "d cost", "d state", "d control", "d costate", "d H")

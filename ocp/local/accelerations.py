@@ -90,6 +90,9 @@ class AccelerationSolution:
         """Whether it reaches the horizon on the ground, inside the foot, within the joint limits and on its path."""
         return not self.failures
 
+    def __repr__(self) -> str:
+        return f"<AccelerationSolution by {self.law}: {', '.join(self.failures) or 'succeeds'}>"
+
     def __str__(self) -> str:
         end = "reaches the horizon" if self.stopped is None else self.stopped.message
         verdict = ", ".join(self.failures) or "succeeds"

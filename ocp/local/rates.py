@@ -74,6 +74,10 @@ class LocalSolution:
     clearance: Array = field(default_factory=lambda: np.zeros(0))
     nearest: tuple[tuple[str, str], ...] = ()
 
+    def __repr__(self) -> str:
+        end = f", stopped: {self.stopped}" if self.stopped else ""
+        return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
+
     def at(self, time: float) -> dict[str, Array]:
         """Cubic interpolation of "base" and "joints", linear of "joint_rates"; beyond the ends the end values."""
         time = float(np.clip(time, self.t[0], self.t[-1]))

@@ -27,6 +27,8 @@ from ocp.storage import read_arrays, write_arrays, write_text
 __all__ = ["Candidate", "Part", "Plan", "PlanSample", "failed", "parts_of"]
 
 RATES = ("rates", SLOPES, "velocities")
+MOST_LINES = 15
+"""Of a plan that is printed."""
 HALVINGS = 52
 SLACK = 1e-9
 """Of the horizon: times beyond it by less are its ends."""
@@ -47,6 +49,10 @@ class Candidate:
     cost: float
     why: str = ""
     solution: Solution | None = None
+
+    def __repr__(self) -> str:
+        start = np.array2string(self.start, precision=3, separator=", ", max_line_width=200)
+        return f"<Candidate from {start}: cost {self.cost:.6g}, {self.why or 'the plan'}>"
 
 
 class Part(NamedTuple):
@@ -72,6 +78,11 @@ class PlanSample(NamedTuple):
     rates: Array
     accelerations: Array
     tip: Array
+
+    def __repr__(self) -> str:
+        return (
+            f"<PlanSample of {self.joints.shape[1]} joints at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,16 +187,59 @@ class Plan:
             self._audits[key] = self.solution.audit(**settings)
         return self._audits[key]
 
+    @property
+    def audits(self) -> tuple[Any, ...]:
+        """Those that were done, the first one first."""
+        return tuple(self._audits.values())
+
+    def __repr__(self) -> str:
+        return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._found}>"
+
     def __str__(self) -> str:
-        found = sum(1 for candidate in self.candidates if candidate.solution is not None)
-        low = "" if self.bound is None else f", at least {self.bound:.6g} any"
-        names = ", ".join(self.names)
-        lines = [
-            f"plan of {self.horizon:.6g} s for {names}: cost {self.cost:.6g}{low}; {found} of "
-            f"{len(self.candidates)} motions solved"
-        ]
-        lines += [f"  {c.cost:10.6g}  {c.why or 'the plan'}" for c in self.candidates]
+        """What it costs, and why the other motions are not the plan, by reason; 15 lines at most."""
+        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._found}"]
+        told: dict[str, list[float]] = {}
+        for one in self.candidates:
+            told.setdefault(one.why, []).append(one.cost)
+        for why, costs in list(told.items())[: MOST_LINES - 2]:
+            found = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
+            low, high = min(found), max(found)
+            span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
+            several = "" if len(costs) == 1 else f"{len(costs)} motions: "
+            lines.append(f"  {span:<23}  {several}{why or 'the plan'}")
+        if len(told) > MOST_LINES - 2:
+            rest = sum(len(costs) for costs in list(told.values())[MOST_LINES - 2 :])
+            lines.append(f"  {rest} more: `candidates` of the plan")
         return "\n".join(lines)
+
+    @property
+    def _costs(self) -> str:
+        return f"cost {self.cost:.6g}" + ("" if self.bound is None else f", at least {self.bound:.6g} any")
+
+    @property
+    def _found(self) -> str:
+        solved = sum(1 for candidate in self.candidates if candidate.solution is not None)
+        return f"{solved} of {len(self.candidates)} motions solved"
+
+    # ---- what it looks like --------------------------------------------------------------------------------------
+
+    def plot(self, against: Any = None, *, figure: Any = None) -> Any:
+        """Position, velocity and acceleration of every joint over time, with limits; see `ocp.app.plots.plot_plan`.
+
+        The plan is blue; what it is compared with, another plan or what `resolve` made, or several by name, orange.
+        A notebook shows the figure, `.savefig("plan.png")` writes it; `figure=plt.figure()` draws into a window.
+
+        Raises:
+            ProblemError: Nothing that can be compared, or of other joints.
+        """
+        from ocp.app.plots import plot_plan
+
+        return plot_plan(self, against, figure)
+
+    def _repr_html_(self) -> str:
+        from ocp.app.plots import html_of_plan
+
+        return html_of_plan(self)
 
     # ---- files -------------------------------------------------------------------------------------------------
 
@@ -235,18 +289,24 @@ class Plan:
         found = self.sample(period)
         return JointTrajectory(self.names, found.t, found.joints, found.rates, found.accelerations)
 
-    def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
-        """Write times and joints every `period` s, in full precision.
+    def table(self, period: float = 0.01) -> dict[str, Array]:
+        """Columns by name, a row every `period` s: what pandas.DataFrame, polars.DataFrame and pyarrow.table take.
 
-        A header names the columns: `time` (s), the joints (rad or m), `NAME.velocity` and `NAME.acceleration` of each.
+        `time` (s), the joints (rad or m), `NAME.velocity` and `NAME.acceleration` of each. Shape (M,) each.
         """
         found = self.sample(period)
+        columns = {"time": found.t}
+        for end, values in (("", found.joints), (".velocity", found.rates), (".acceleration", found.accelerations)):
+            columns |= {f"{name}{end}": column for name, column in zip(self.names, values.T, strict=True)}
+        return columns
+
+    def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
+        """Write the `table` of times and joints every `period` s, in full precision, with a header."""
+        columns = self.table(period)
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        more = [f"{name}.{kind}" for kind in ("velocity", "acceleration") for name in self.names]
-        writer.writerow(["time", *self.names, *more])
-        rows = np.column_stack([found.t, found.joints, found.rates, found.accelerations])
-        writer.writerows([repr(value) for value in row] for row in rows.tolist())
+        writer.writerow(columns)
+        writer.writerows([repr(value) for value in row] for row in np.column_stack([*columns.values()]).tolist())
         write_text(path, stream.getvalue())
 
     def to_ros(self, period: float = 0.01) -> dict[str, Any]:

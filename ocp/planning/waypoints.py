@@ -80,6 +80,11 @@ class WaypointPlan:
         """Largest way of each joint from one waypoint to the next. Shape (n,), rad or m."""
         return np.asarray(np.abs(np.diff(self.joints, axis=0)).max(axis=0))
 
+    def __repr__(self) -> str:
+        return (
+            f"<WaypointPlan through {len(self.joints)} waypoints: cost {self.cost:.6g}, at least {self.bound:.6g} any>"
+        )
+
     def __str__(self) -> str:
         lines = [
             f"way through {len(self.joints)} waypoints of {', '.join(self.machine.robot.joint_names)}: "

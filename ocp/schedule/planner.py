@@ -82,6 +82,10 @@ class Schedule:
     dips: tuple[Dip, ...]
     joints: JointPath | None = None
 
+    def __repr__(self) -> str:
+        slower = f"slower than asked in {len(self.dips)} places" if self.dips else "at the asked speed"
+        return f"<Schedule of {self.profile.distance[-1]:.6g} m in {self.duration:.6g} s, {slower}>"
+
     @property
     def duration(self) -> float:
         """s."""

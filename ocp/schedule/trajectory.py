@@ -59,6 +59,9 @@ class JointTrajectory:
                 raise ProblemError(f"trajectory: {kind} are not all finite", name=kind, value=values)
             object.__setattr__(self, kind, values)
 
+    def __repr__(self) -> str:
+        return f"<JointTrajectory of {', '.join(self.names)} at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
+
     def write_csv(self, path: str | FilePath[str]) -> None:
         """Write columns t and position, velocity, acceleration of each joint, in full precision."""
         head = ["t", *(f"{name}.{kind}" for kind in KINDS for name in self.names)]

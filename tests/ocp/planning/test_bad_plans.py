@@ -14,7 +14,7 @@ import pytest
 
 from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
 from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
-from ocp.files import write_mcap
+from ocp.files import log_rerun, write_mcap
 from ocp.planning import Plan, plan, plan_waypoints
 from ocp.schedule import LineLimits, schedule
 from ocp.tasks.tracks import along
@@ -40,6 +40,7 @@ from tests.bad_values import (
 )
 from tests.models.machines.armoured import armoured_arm
 from tests.models.robot.trees import Array, numeric
+from tests.ocp.files.recorder import recorder
 from tests.ocp.planning.motions import DOWN, angled_ur5
 from tests.ocp.tasks.space_tasks import panda, ur5
 
@@ -154,7 +155,15 @@ CASES = [
         time=but(FINITE, "empty") | {"before": -1.0, "after": 99.0, "some after": [0.1, 99.0]},
     ),
     Case("write_mcap", logged, {"period": 0.1}, {"plan": INSTANCE, "period": POSITIVE, "frame": TEXT}),
+    Case(
+        "log_rerun",
+        lambda **given: log_rerun(**{"plan": made(), **given}),
+        {"rerun": recorder(), "period": 0.1},
+        {"plan": INSTANCE, "rerun": INSTANCE, "period": POSITIVE, "entity": TEXT, "timeline": TEXT},
+    ),
     method(made, "sample", {"period": 0.1}, period=POSITIVE),
+    method(made, "table", {"period": 0.1}, period=POSITIVE),
+    method(made, "plot", {}, against=but(INSTANCE, "None"), figure=but(INSTANCE, "None")),
     method(made, "to_ros", {"period": 0.1}, period=POSITIVE),
 ]
 

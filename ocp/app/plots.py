@@ -1,0 +1,235 @@
+"""Plans and solutions drawn: their curves with limits, beside what they are compared with; and what a notebook shows.
+
+`Plan.plot` and `Solution.plot` ask for these when they are called. Figures are matplotlib's and of no window: a notebook
+shows them, `figure.savefig` writes them, and one of pyplot's may be drawn into instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from models.arrays import Array
+from ocp.app.pictures import NOTHING, STYLE, WIDTH, add_names, as_svg, draw_joints, look, show_limits
+from ocp.app.pieces import Motion
+from ocp.errors import ProblemError, checked_instance
+from ocp.local.accelerations import AccelerationSolution
+from ocp.local.rates import LocalSolution
+from ocp.planning.motion import Plan
+from ocp.problem.formulation import Formulation
+from ocp.schedule.trajectory import JointTrajectory
+from ocp.solution import Solution
+from ocp.tasks.limits import Limits
+
+__all__ = ["Picture", "html_of_plan", "html_of_solution", "plot_plan", "plot_solution"]
+
+SAMPLES = 400
+"""Of a plan's motion."""
+COLUMNS = 3
+MOST = 60
+"""Entries of states and controls that are drawn."""
+AFTER = 1e-9
+"""Of the horizon: by so much beside a node both sides of a jump are."""
+
+
+class Picture(Figure):
+    """A figure that a notebook shows as it is."""
+
+    def _repr_svg_(self) -> str:
+        return as_svg(self)
+
+
+# ---- plans -------------------------------------------------------------------------------------------------------
+
+
+def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
+    """Position, velocity and acceleration of every joint over time, with the robot's limits.
+
+    Args:
+        plan: In blue.
+        against: What it is compared with, in orange: a plan, what `resolve` or `resolve_accelerations` made, a
+            trajectory of joints; or several by name.
+        figure: An empty figure of matplotlib's to draw into, for example pyplot's, for a window; a new one if None.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ProblemError: Nothing that can be compared, or of other joints.
+    """
+    names = plan.names
+    others = {name: _compared(name, one, names) for name, one in _named(against).items()}
+    motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
+    made = _figure(figure, (WIDTH, 0.9 + 1.15 * len(names)))
+    robot = plan.machine.robot
+    units = [joint.unit for joint in robot.moving_joints]
+    draw_joints(made, motions, names, units, Limits().bounds(plan.machine))
+    costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
+    made.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
+    return made
+
+
+def html_of_plan(plan: Plan) -> str:
+    """A plan as a notebook shows it: what it costs, what its audit says where it was asked, its curves."""
+    lines = str(plan).splitlines()
+    parts = [f"<p><b>{escape(lines[0])}</b></p>"]
+    if plan.audits:
+        parts.append(f"<p>The plan {escape(plan.audits[0].sentence)}.</p>")
+    parts.append(as_svg(plot_plan(plan)))
+    if len(lines) > 1:
+        rest = escape("\n".join(lines[1:]))
+        parts.append(f"<details><summary>the motions that were looked at</summary><pre>{rest}</pre></details>")
+    return f'<div style="max-width: 56rem">{"".join(parts)}</div>'
+
+
+def _motion_of(plan: Plan) -> Motion:
+    sample = plan.sample(plan.horizon / SAMPLES)
+    return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
+
+
+def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
+    """The motion of what a plan of these joints is compared with, and what it costs, where that is known."""
+    cost: float | None = None
+    if isinstance(other, Plan):
+        told, motion, cost = other.names, _motion_of(other), other.cost
+    elif isinstance(other, LocalSolution):
+        told, motion, cost = names, Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
+    elif isinstance(other, AccelerationSolution):
+        moved = other.motion
+        told, motion = names, Motion(moved.t, moved.joints, moved.joint_velocities, moved.joint_accelerations)
+    elif isinstance(other, JointTrajectory):
+        told, motion = other.names, Motion(other.t, other.positions, other.velocities, other.accelerations)
+    else:
+        words = (
+            f"plot: {name!r} is a {type(other).__name__}; a plan is compared with a plan, with what resolve or "
+            "resolve_accelerations made, or with a JointTrajectory"
+        )
+        raise ProblemError(words, name="against", value=other)
+    if told != names or motion.q.shape[1] != len(names) or len(motion.t) < 2:
+        words = (
+            f"plot: {name!r} has joints {', '.join(told)} at {len(motion.t)} times; the plan's are {', '.join(names)}"
+        )
+        raise ProblemError(words, name="against", value=told, limit=names)
+    return motion, cost
+
+
+# ---- solutions ---------------------------------------------------------------------------------------------------
+
+
+def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -> Any:
+    """States and controls over time, each entry with its bounds where the solution has its problem.
+
+    Args:
+        solution: In blue.
+        against: A solution of the same states and controls, or several by name, in orange.
+        figure: As of a plan.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ProblemError: No solution, or of other states and controls.
+    """
+    others = _named(against)
+    shapes = _widths(solution)
+    for name, other in others.items():
+        checked_instance(f"plot: {name}", other, Solution)
+        if _widths(other) != shapes:
+            words = f"plot: {name!r} has states and controls {_widths(other)}, the solution has {shapes}"
+            raise ProblemError(words, name="against", value=_widths(other), limit=shapes)
+    entries = [(name, k) for name, width in shapes.items() for k in range(width)]
+    left_out, entries = entries[MOST:], entries[:MOST]
+    bounds, units = _bounds(solution)
+    rows = -(-len(entries) // COLUMNS)
+    made = _figure(figure, (WIDTH, 0.9 + 1.35 * rows))
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        grid: Any = made.subplots(rows, min(COLUMNS, len(entries)), squeeze=False, sharex=True)
+        for ax in grid.ravel()[len(entries) :]:
+            ax.remove()
+        curves = [(one.horizon, *_along(one)) for one in (solution, *others.values())]
+        for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
+            for number, (horizon, at, values) in reversed([*enumerate(curves)]):
+                ax.plot(horizon * at, values[name][:, k], **look(number))
+            lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
+            show_limits(ax, lower, upper, NOTHING * max(np.abs(values[name]).max() for _, _, values in curves))
+            ax.set_title(name if shapes[name] == 1 else f"{name} [{k}]")
+            ax.set_ylabel(units.get(name, ""), fontsize=7)
+            ax.margins(x=0.01)
+        for ax in grid.ravel()[max(0, len(entries) - grid.shape[1]) : len(entries)]:
+            ax.set_xlabel("time, s")
+            ax.tick_params(labelbottom=True)
+        if others:
+            add_names(made, ["solution", *others])
+    costs = "".join(f", that of {name} {other.cost:.6g}" for name, other in others.items())
+    rest = f"; {len(left_out)} entries are not drawn" if left_out else ""
+    made.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)
+    return made
+
+
+def html_of_solution(solution: Solution) -> str:
+    """A solution as a notebook shows it."""
+    head, *rest = str(solution).splitlines()
+    table = f"<pre>{escape(chr(10).join(rest))}</pre>"
+    return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
+
+
+def _widths(solution: Solution) -> dict[str, int]:
+    return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
+
+
+def _along(solution: Solution) -> tuple[Array, Mapping[str, Array]]:
+    """Fractions of the horizon, both sides of every node among them, and the values there."""
+    nodes = solution.control_interpolant.breaks[1:-1]
+    even = np.linspace(0.0, 1.0, SAMPLES + 1)
+    at = np.unique(np.concatenate([even, nodes - AFTER, nodes + AFTER]))
+    return at, solution.at_fraction(at)
+
+
+def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
+    """Lower and upper bounds (2, n) and units of states and controls by name; none without the problem."""
+    if solution.problem is None:
+        return {}, {}
+    form = Formulation.of(solution.problem)
+    both = np.array(form.bound_values(form.parameter_vector(solution.parameters)))
+    found: dict[str, Array] = {}
+    for kind, pool in (("state", form.states), ("control", form.controls)):
+        found |= {name: both[:, form.bounds.places[kind]][:, place] for name, place in pool.items()}
+    return found, form.units
+
+
+# ---- both --------------------------------------------------------------------------------------------------------
+
+
+def _named(against: Any) -> dict[str, Any]:
+    """What something is compared with, by name."""
+    if against is None:
+        return {}
+    if isinstance(against, Mapping):
+        named = {str(name): one for name, one in against.items()}
+    elif isinstance(against, Sequence) and not isinstance(against, str):
+        named = {f"other {number}": one for number, one in enumerate(against, 1)}
+    else:
+        named = {"the other": against}
+    if not named:
+        words = f"plot: nothing to compare with in {against!r}; give a motion, several, or none at all"
+        raise ProblemError(words, name="against", value=against)
+    return named
+
+
+def _figure(given: Any, size: tuple[float, float]) -> Any:
+    """A new figure, or the one that is given; ProblemError where it is none or not empty."""
+    if given is None:
+        return Picture(figsize=size, layout="constrained")
+    checked_instance("plot: figure", given, Figure)
+    if given.axes:
+        words = "plot: the figure has axes already; give an empty one"
+        raise ProblemError(words, name="figure", value=given)
+    given.set_layout_engine("constrained")
+    given.set_size_inches(size)
+    return given

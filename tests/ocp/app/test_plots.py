@@ -1,0 +1,250 @@
+"""What is drawn is what was planned; what is printed is short; what a notebook shows stands alone."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from models import FixedBase, Joint, Robot, planar_chain
+from ocp import (
+    Collocation,
+    Plan,
+    Problem,
+    ProblemError,
+    Solution,
+    TipTask,
+    WaypointPlan,
+    certificate,
+    plan,
+    resolve,
+    solve,
+)
+from ocp.app.colors import COMPARED, LIMIT, PLAN
+from ocp.local.rates import LocalSolution
+from ocp.planning import Candidate
+
+START = np.array([0.3, 0.7, 0.5])
+TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))
+
+
+@cache
+def arm() -> FixedBase:
+    """Three joints, the first near a limit of its velocity and far from those of its position."""
+    chain = planar_chain([0.5, 0.4, 0.3], [1.0, 1.0, 1.0])
+
+    def limited(joint: Joint) -> Joint:
+        return replace(joint, lower=-6.0, upper=6.0, velocity=0.6) if joint.moves else joint
+
+    return FixedBase(Robot(chain.links, tuple(map(limited, chain.joints)), tip=chain.tip, name="three bars"))
+
+
+@cache
+def motion() -> Plan:
+    return plan(arm(), TASK, 1.0, start=START)
+
+
+@cache
+def local() -> LocalSolution:
+    return resolve(arm(), task=TASK, start_joints=START, horizon=1.0)
+
+
+@cache
+def sprint() -> Solution:
+    problem = Problem("sprint")
+    q, v = problem.state("q", 2, initial=0.0, terminal=1.0, unit="m"), problem.state("v", 2, initial=0.0, terminal=0.0)
+    u = problem.control("u", 2, lower=-10.0, upper=6.5)
+    problem.dynamics(q, v)
+    problem.dynamics(v, u)
+    problem.horizon(1.0)
+    problem.minimize(u.T @ u / 2)
+    return solve(problem, Collocation(intervals=4, degree=3))
+
+
+def curves(ax: Any, color: str) -> list[Any]:
+    return [line for line in ax.lines if to_hex(line.get_color()) == color.lower()]
+
+
+def test_the_curves_of_a_plan_are_its_joints_and_their_derivatives() -> None:
+    axes = motion().plot().axes
+    assert len(axes) == 9
+    for number, ax in enumerate(axes):
+        joint, kind = divmod(number, 3)
+        (line,) = curves(ax, PLAN)
+        assert not curves(ax, COMPARED)
+        times, values = line.get_data()
+        assert (times[0], times[-1]) == (0.0, motion().horizon)
+        sampled = motion().sampled(times)
+        wanted = (sampled.joints, sampled.rates, sampled.accelerations)[kind][:, joint]
+        np.testing.assert_allclose(values, wanted, atol=1e-4 * max(1e-3, np.abs(wanted).max()))
+
+
+def test_near_limits_are_lines_and_far_ones_words_and_both_the_robots() -> None:
+    for number, ax in enumerate(motion().plot().axes):
+        told = [text.get_text() for text in ax.texts]
+        at = sorted(line.get_ydata()[0] for line in curves(ax, LIMIT))
+        if number % 3 == 0:
+            assert not at
+            assert told == ["limits -6, 6"]
+        elif number % 3 == 2:
+            assert not at
+            assert not told  # the robot tells none of accelerations
+        else:
+            far = [
+                float(word) for text in told for word in text.removeprefix("limits ").removeprefix("limit ").split(", ")
+            ]
+            assert sorted([*at, *far]) == [-0.6, 0.6]
+            low, high = ax.get_ylim()
+            assert all(low < one < high for one in at)
+            assert all(not low < one < high for one in far)
+
+
+def test_what_a_plan_is_compared_with_is_orange_and_costs_more() -> None:
+    figure = motion().plot({"pseudo-inverse": local()})
+    for joint, ax in enumerate(figure.axes[::3]):
+        (line,) = curves(ax, COMPARED)
+        times, values = line.get_data()
+        wanted = [local().at(time)["joints"][joint] for time in times]
+        np.testing.assert_allclose(values, wanted, atol=1e-6)
+    assert f"that of pseudo-inverse {local().cost[-1]:.4g}" in figure.get_suptitle()
+    assert local().cost[-1] >= motion().cost * (1 - 1e-6)
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["plan", "pseudo-inverse"]
+
+
+def test_everything_that_moves_the_same_joints_is_compared() -> None:
+    others = [motion(), motion().trajectory(0.02), local()]
+    for ax in motion().plot(others).axes:
+        assert len(curves(ax, COMPARED)) == len(others)
+
+
+def test_a_plan_is_drawn_into_a_figure_that_is_given() -> None:
+    mine = Figure()
+    assert motion().plot(figure=mine) is mine
+    assert len(mine.axes) == 9
+
+
+def test_the_curves_of_a_solution_are_its_states_and_controls_with_their_bounds() -> None:
+    axes = sprint().plot().axes
+    assert [ax.get_title() for ax in axes] == [f"{name} [{k}]" for name in ("q", "v", "u") for k in range(2)]
+    assert [ax.get_ylabel() for ax in axes] == ["m", "m", "", "", "", ""]
+    for number, ax in enumerate(axes):
+        (line,) = curves(ax, PLAN)
+        times, values = line.get_data()
+        name, k = "qvu"[number // 2], number % 2
+        np.testing.assert_array_equal(values, sprint().at(np.clip(times, 0.0, 1.0))[name][:, k])
+        at = sorted(line.get_ydata()[0] for line in curves(ax, LIMIT))
+        assert at == ([-10.0, 6.5] if name == "u" else [])  # u goes from 6 to -6
+
+
+def test_a_solution_without_its_problem_is_drawn_without_bounds_and_beside_another() -> None:
+    bare = sprint().with_problem(None)
+    for ax in bare.plot([sprint(), sprint()]).axes:
+        assert not curves(ax, LIMIT)
+        assert len(curves(ax, COMPARED)) == 2
+
+
+@pytest.mark.parametrize("wrong", [3, "plan", object(), [None], {"one": 2.0}])
+def test_what_cannot_be_compared_is_refused_by_name(wrong: Any) -> None:
+    for one in (motion(), sprint()):
+        with pytest.raises(ProblemError) as caught:
+            one.plot(wrong)
+        assert caught.value.name
+
+
+def test_motions_of_other_joints_are_refused() -> None:
+    other = plan(FixedBase(planar_chain([0.5, 0.4], [1.0, 1.0])), TASK, 0.5, start=START[:2])
+    for wrong in (other, other.trajectory(0.1)):
+        with pytest.raises(ProblemError, match="joints") as caught:
+            motion().plot(wrong)
+        assert caught.value.name == "against"
+    with pytest.raises(ProblemError, match="states and controls"):
+        sprint().plot(motion().solution)
+
+
+@pytest.mark.parametrize("wrong", [3, "a.png", object()])
+def test_only_an_empty_figure_is_drawn_into(wrong: Any) -> None:
+    full = Figure()
+    full.subplots()
+    for figure in (wrong, full):
+        with pytest.raises(ProblemError, match="figure"):
+            motion().plot(figure=figure)
+
+
+def test_what_a_notebook_shows_is_one_sound_element_that_asks_no_host() -> None:
+    for shown in (motion()._repr_html_(), sprint()._repr_html_(), sprint().plot()._repr_svg_()):
+        root = ElementTree.fromstring(shown)
+        assert "svg" in shown
+        asked = [value for one in root.iter() for key, value in one.attrib.items() if key.endswith(("href", "src"))]
+        assert all(value.startswith("#") for value in asked)
+    assert motion().audit().sentence in "".join(ElementTree.fromstring(motion()._repr_html_()).itertext())
+
+
+# ---- print -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_one() -> None:
+    kept = motion().candidates[0]
+    for reasons in (1, 12, 13, 14, 60):
+        others = [Candidate(START, 2.0 + k, f"reason {k % reasons}") for k in range(180)]
+        told = str(replace(motion(), candidates=(kept, *others))).splitlines()
+        assert len(told) == min(2 + reasons, 15)
+        assert told[0].endswith("1 of 181 motions solved")
+        counts = [int(line.split(" motions: ")[0].split()[-1]) for line in told if " motions: " in line]
+        more = [int(line.split()[0]) for line in told if "more" in line]
+        alone = [line for line in told[1:] if " motions: " not in line and "more" not in line]
+        assert sum(counts) + sum(more) + len(alone) == 181
+
+
+def test_what_was_not_found_has_no_cost_in_print() -> None:
+    lost = [Candidate(START, cost, "lost") for cost in (np.nan, 3.0, np.nan, 4.5)]
+    told = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
+    assert "3 to 4.5" in told
+    assert "4 motions: lost" in told
+    assert "nan" in str(replace(motion(), candidates=tuple(lost[:1])))
+
+
+def test_what_is_typed_at_a_prompt_is_told_in_a_line() -> None:
+    way = WaypointPlan(arm(), np.zeros((400, 3)), 2.0, 1.9, ((2.0, ""),) * 50)
+    audit = sprint().audit()
+    told: list[Any] = [motion(), motion().candidates[0], motion().sample(0.1), local(), way, motion().trajectory(0.1)]
+    told += [
+        sprint(),
+        sprint().state_interpolant,
+        audit,
+        certificate(sprint().problem, [sprint(), sprint()]),
+        arm().robot,
+    ]
+    for one in told:
+        assert len(repr(one).splitlines()) == 1, one
+        assert len(repr(one)) < 250, one
+    assert len(str(sprint()).splitlines()) == 4
+    assert f"{sprint().cost:.10g}" in str(sprint())
+    assert "passed" in repr(audit)
+
+
+# ---- tables ------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_a_plan_is_its_file(tmp_path: Path) -> None:
+    motion().write_csv(tmp_path / "a.csv", 0.03)
+    with (tmp_path / "a.csv").open(encoding="utf-8") as stream:
+        head, *rows = csv.reader(stream)
+    table = motion().table(0.03)
+    assert list(table) == head
+    np.testing.assert_array_equal(np.array(rows, dtype=float), np.column_stack([*table.values()]))
+
+
+def test_the_table_of_a_solution_has_a_column_for_every_entry() -> None:
+    table = sprint().table()
+    assert list(table) == ["time", "q[0]", "q[1]", "v[0]", "v[1]", "u[0]", "u[1]"]
+    assert {len(column) for column in table.values()} == {len(sprint().t)}
+    np.testing.assert_array_equal(table["v[1]"], sprint()["v"][:, 1])
