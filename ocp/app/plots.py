@@ -1,6 +1,6 @@
 """Plans and solutions drawn: their curves with limits, beside what they are compared with; and what a notebook shows.
 
-`Plan.plot` and `Solution.plot` ask for these when they are called. Figures are matplotlib's and of no window: a notebook
+`Plan.plot` and `Solution.plot` ask for these when they are called. Figures are matplotlib's, of no window: a notebook
 shows them, `figure.savefig` writes them, and one of pyplot's may be drawn into instead.
 """
 
