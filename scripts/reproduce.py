@@ -1,6 +1,7 @@
 """Every paper script, one after the other: `python scripts/reproduce.py [--out results] [--only free_floating]`.
 
-A script that fails does not stop the others; the exit status is 1 when any failed. Ends with a summary.
+A script that fails does not stop the others; the exit status is 1 when any failed. Ends with every number that the
+papers print of their results, ours, and why those differ that do; it is also OUT/reproduced.csv.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
+from scripts.papers import reproduced
 from scripts.papers.run import command, progress, text_table
 
 PAPERS: Mapping[str, str] = {name: f"scripts.{name}" for name in ("free_floating", "standing", "blend", "cts")}
@@ -26,6 +28,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command(__doc__, PAPERS).parse_args(arguments)
     outcomes = [reproduce(name, PAPERS[name], options.out) for name in progress(options.only or PAPERS, "papers")]
     print("\n" + text_table(outcomes, digits=3))
+    found, missing = reproduced.read(options.out, options.only or [*PAPERS])
+    reproduced.write_table(options.out, found)
+    if found or missing:
+        print("\n" + reproduced.text(found, missing) + "\n")
     failed = [outcome["paper"] for outcome in outcomes if outcome["status"] != "ok"]
     print(f"failed: {', '.join(failed)}" if failed else f"all written to {options.out}")
     return 1 if failed else 0

@@ -127,6 +127,7 @@ def summary(results: Results) -> dict[str, Any]:
     plan, reference = found.plan, found.backward.cost
     least = int(local.manipulability.argmin())
     peaks = {name: motion.peak_joint_rates() for name, motion in results.tabled.items()}
+    at_peaks = {name: np.degrees(motion.accelerations_at_peaks()) for name, motion in results.tabled.items()}
 
     def solved(solution: Any) -> dict[str, Any]:
         difference = solution.cost - reference
@@ -143,6 +144,7 @@ def summary(results: Results) -> dict[str, Any]:
         "pseudo_inverse": {
             "peak_joint_velocity_deg_s": np.degrees(peaks["pseudo-inverse"][0]),
             "peak_time_s": peaks["pseudo-inverse"][1],
+            "joint_acceleration_at_peak_deg_s2": at_peaks["pseudo-inverse"],
             "largest_joint_acceleration_deg_s2": np.degrees(results.near_peaks.largest_accelerations),
             "min_manipulability": local.manipulability[least],
             "min_manipulability_time_s": local.t[least],
@@ -160,6 +162,7 @@ def summary(results: Results) -> dict[str, Any]:
             "certified": {name: one.passed for name, one in found.certificates.items()},
             "peak_joint_velocity_deg_s": np.degrees(peaks["optimum"][0]),
             "peak_time_s": peaks["optimum"][1],
+            "joint_acceleration_at_peak_deg_s2": at_peaks["optimum"],
             "min_manipulability": results.optimal.manipulability.min(),
             "momentum_drift": results.laws.momentum_drift,
             "center_of_mass_drift_m": results.laws.center_of_mass_drift,

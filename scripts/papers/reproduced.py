@@ -1,0 +1,185 @@
+"""Every number that the papers print of their results, beside ours, out of the summaries that the scripts write.
+
+A number counts as reproduced where ours is within 1 % of it, or within a unit of its last printed digit. Where it is
+not, the row says why. Inputs that a paper prints, and its figures without numbers, are not counted; of figures that
+show a motion to its end the time of that end is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scripts.papers.blend.example import PAPER_GAMMA, PAPER_SPEED_ERROR, PAPER_TIMES
+from scripts.papers.run import Row, Table, text_table, write
+
+__all__ = ["READERS", "SHARE", "Printed", "read", "table", "text", "write_table"]
+
+SHARE = 0.01
+"""Of a printed number, by which ours may differ."""
+END = 6.283
+"""2π s, at which the motions of the standing machine end."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number of a paper and ours.
+
+    Attributes:
+        paper: Its script. place: Table or figure. quantity: What it is, with its unit.
+        printed, ours: The values. decimals: That it is printed with.
+        why: Why ours differs; said only where it is not reproduced.
+    """
+
+    paper: str
+    place: str
+    quantity: str
+    printed: float
+    ours: float
+    decimals: int
+    why: str = ""
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether ours is within 1 % or a unit of the last printed digit."""
+        return abs(self.ours - self.printed) <= max(SHARE * abs(self.printed), 10.0**-self.decimals)
+
+
+def _free_floating(told: Mapping[str, Any]) -> Iterator[Printed]:
+    printed, caveats = told["paper"], told["caveats"]
+    ours = {"pseudo-inverse": told["pseudo_inverse"], "optimum": told["optimal"]}
+    reasons = {
+        "pseudo-inverse": "link length and mount are not printed: 2.1 mm of length make up for all of the first peak",
+        "optimum": "the horizon is not printed, ours is 5 s; no extremal found at other horizons has these peaks",
+    }
+    for method, why in reasons.items():
+        key = "peak_joint_velocity_deg_s"
+        pairs = zip(printed[key][method], ours[method][key], strict=True)
+        for joint, (value, found) in enumerate(pairs, 1):
+            quantity = f"{method}: peak velocity of joint {joint}, deg/s"
+            yield Printed("free_floating", "Table 1", quantity, value, found, 3, why)
+    for method, decimals in (("pseudo-inverse", 1), ("optimum", 4)):
+        values = printed["joint_acceleration_at_peak_deg_s2"][method]
+        pairs = zip(values, ours[method]["joint_acceleration_at_peak_deg_s2"], strict=True)
+        why = caveats["accelerations"][method]
+        for joint, (value, found) in enumerate(pairs, 1):
+            quantity = f"{method}: acceleration of joint {joint} at that peak, deg/s²"
+            yield Printed("free_floating", "Table 2", quantity, value, found, decimals, why)
+    found = told["pseudo_inverse"]["min_manipulability_time_s"]
+    yield Printed("free_floating", "Figure 13", "pseudo-inverse: least manipulability at, s", 3.0, found, 0)
+
+
+def _standing(told: Mapping[str, Any]) -> Iterator[Printed]:
+    why = (
+        "pinning the zero moment point is unstable at the level of accelerations: {} there. With the sign of C as "
+        "printed in (22) the motion of Figure 4 goes on, with an index that is not 1"
+    )
+    words = {"lift_off": "the machine lifts off", "divergence": "the joint rates diverge"}
+    cases = {
+        "Figure 4": ("table1", "augmented", "zero moment point"),
+        "Figure 5": ("table1", "joint_limits", "zero moment point and joint limits"),
+        "Figure 6": ("table1", "all_layers", "zero moment point, joint limits, manipulability"),
+        "Figure 11": ("table2", "augmented_spring", "zero moment point against a spring"),
+    }
+    for place, (group, law, title) in cases.items():
+        found = told[group][law]
+        reason = why.format(words.get(found["reason"], found["reason"]))
+        yield Printed("standing", place, f"{title}: stands until, s", END, found["reaches_s"], 3, reason)
+
+
+def _blend(told: Mapping[str, Any]) -> Iterator[Printed]:
+    columns = ("alpha 30 mm, 90 deg", "lambda 1, 90 deg", "lambda 1, 45 deg")
+    for remaining, *found in told["gamma_table"]:
+        for name, value, ours in zip(columns, PAPER_GAMMA[remaining], found, strict=True):
+            yield Printed("blend", "Table 2", f"gamma, Lr {remaining} mm, {name}", value, ours, 3)
+    why = (
+        "no reading of the mean acceleration gives all four: the ramp to the first one is not printed; the durations "
+        "of both blends agree to 2.5 ms"
+    )
+    for number, (value, ours) in enumerate(zip(PAPER_TIMES, told["blend_times_s"], strict=True), 1):
+        yield Printed("blend", "Figure 14", f"begin or end of a blend, {number} of 4, s", value, ours, 3, why)
+    errors = told["speed_error_mm_s"]
+    ours = errors["predictor_corrector_2ms"]
+    yield Printed("blend", "Figure 18", "largest error of the line speed, mm/s", PAPER_SPEED_ERROR, ours, 1)
+
+
+def _cts(told: Mapping[str, Any]) -> Iterator[Printed]:
+    printed, ours = told["paper"]["table6_s"], told["arithmetic_seconds_of_200_targets"]
+    why = "the time of another computer; ours is arithmetic alone, compiled"
+    for name, mine in (("jacobian", "jacobian, gain 20"), ("combined", "combined")):
+        yield Printed("cts", "Table 6", f"200 targets, {name}, s", printed[name], ours[mine], 4, why)
+    why = (
+        "neither link lengths nor the gain of the null term are printed, and the iterations depend on both: "
+        f"{told['time_ratio_jacobian_over_combined']:.3g} with gain 20 (shown), "
+        f"{told['time_ratio_jacobian_over_combined_gain_1']:.3g} with gain 1, "
+        f"{told['time_ratio_in_python']:.3g} with calls from Python"
+    )
+    ratio = told["time_ratio_jacobian_over_combined"]
+    yield Printed("cts", "Table 6", "times of both, ratio", printed["jacobian"] / printed["combined"], ratio, 2, why)
+
+
+READERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Printed]]] = {
+    "free_floating": _free_floating,
+    "standing": _standing,
+    "blend": _blend,
+    "cts": _cts,
+}
+
+
+def read(out: Path, papers: Sequence[str] = tuple(READERS)) -> tuple[list[Printed], list[str]]:
+    """The numbers of the papers whose summaries lie in `out`, and what is missing, in words."""
+    found: list[Printed] = []
+    missing = []
+    for name in papers:
+        if name not in READERS:
+            continue
+        file = out / name / "summary.json"
+        try:
+            found += READERS[name](json.loads(file.read_text(encoding="utf-8")))
+        except OSError:
+            missing.append(f"{name}: there is no {file}")
+        except (ValueError, KeyError, TypeError) as error:
+            missing.append(f"{name}: {file} is not what its script writes: {type(error).__name__} {error}")
+    return found, missing
+
+
+def table(found: Sequence[Printed]) -> list[Row]:
+    """Rows of all numbers."""
+    return [
+        {
+            "paper": one.paper,
+            "place": one.place,
+            "quantity": one.quantity,
+            "printed": one.printed,
+            "ours": one.ours,
+            "difference": one.ours - one.printed,
+            "reproduced": one.reproduced,
+            "why": "" if one.reproduced else one.why,
+        }
+        for one in found
+    ]
+
+
+def text(found: Sequence[Printed], missing: Sequence[str]) -> str:
+    """The table for the terminal: every number, the reasons below it once each, and how many are reproduced."""
+    lines = []
+    if found:
+        rows = table(found)
+        reasons = list(dict.fromkeys(row["why"] for row in rows if row["why"]))
+        marks = {why: f"({number})" for number, why in enumerate(reasons, 1)}
+        shown = [{**{k: v for k, v in row.items() if k != "why"}, "why": marks.get(row["why"], "")} for row in rows]
+        lines += [text_table(shown, digits=5), ""]
+        lines += [f"{mark} {why}" for why, mark in marks.items()]
+    lines += [f"missing: {words}" for words in missing]
+    count = sum(one.reproduced for one in found)
+    lines.append(f"{count} of {len(found)} numbers of the papers are reproduced, to 1 % or a unit of their last digit")
+    return "\n".join(lines)
+
+
+def write_table(out: Path, found: Sequence[Printed]) -> None:
+    """Write the rows to `out`/reproduced.csv, where there are any."""
+    if found:
+        write(out / "reproduced.csv", Table(table(found), digits=6))
