@@ -80,3 +80,8 @@ def test_a_change_of_our_number_changes_the_count(tmp_path: Path) -> None:
     (tmp_path / "blend" / "summary.json").write_text(json.dumps(told), encoding="utf-8")
     after, _ = read(tmp_path, ["blend"])
     assert sum(one.reproduced for one in after) == sum(one.reproduced for one in before) - 1
+
+
+def test_the_printed_ratio_of_times_is_that_of_the_printed_times() -> None:
+    (ratio,) = (one for one in read(RESULTS, ["cts"])[0] if one.quantity == "times of both, ratio")
+    assert abs(ratio.printed - 8.45) < 0.01  # printed in the paper's text, too
