@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark test sweep crowded redundancy global brute passages check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test sweep crowded redundancy global brute passages check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -41,6 +41,11 @@ gallery: $(VENV)/gallery.stamp ## real robots: plan, audit and draw each example
 
 benchmark: $(VENV)/peers.stamp $(VENV)/gallery.stamp ## time model functions, builds, solves and plans, beside other packages
 	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
+
+site: $(VENV)/site.stamp ## build the documentation into build/site, its tutorials run, and look at every link
+	rm -rf build/site
+	$(BIN)/python -m sphinx -q -E -a -j $(WORKERS) --fail-on-warning --keep-going -d build/doctrees scripts/site build/site
+	$(BIN)/python -m scripts.site.links build/site
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)

@@ -28,6 +28,8 @@ from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.tightening import tighten
 
+__version__ = "0.1.0"
+
 __all__ = [
     "Anywhere",
     "Audit",

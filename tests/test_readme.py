@@ -1,4 +1,4 @@
-"""The README's Python blocks run, each alone and all in their order, as a reader would type them."""
+"""The README's Python and the site's runs, each block alone and all of a page in order, as a reader would type them."""
 
 from __future__ import annotations
 
@@ -7,58 +7,77 @@ from pathlib import Path
 
 import pytest
 
+from scripts.site.executed import blocks
+
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
-FENCE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SITE = ROOT / "scripts" / "site"
+PAGES = (README, *sorted(SITE.rglob("*.md")))
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
-MAKE = re.compile(r"\bmake ([a-z]+)")
+MAKE = re.compile(r"(?:`|^)make ([a-z]+)", re.MULTILINE)
+FENCED = re.compile(r"^(```+).*?^\1$", re.MULTILINE | re.DOTALL)
+
+ALONE = {
+    f"{page.relative_to(ROOT)}:{line}": (page, line, source)
+    for page in PAGES
+    for line, alone, source in blocks(page.read_text(encoding="utf-8"))
+    if alone
+}
+SEVERAL = [page for page in PAGES if sum(block.alone for block in blocks(page.read_text(encoding="utf-8"))) > 1]
+"""Pages of one block say the same alone and in order."""
 
 
-def python_blocks(text: str) -> list[tuple[int, str]]:
-    """The fenced Python blocks of a Markdown text, each with the line number of its first line."""
-    return [(text.count("\n", 0, match.start(1)) + 1, match.group(1)) for match in FENCE.finditer(text)]
+def run(page: Path, line: int, source: str, namespace: dict[str, object]) -> None:
+    # The padding makes a traceback point at the line in the page.
+    exec(compile("\n" * (line - 1) + source, str(page), "exec"), namespace)
 
 
-BLOCKS = python_blocks(README.read_text(encoding="utf-8"))
-
-
-def run(line: int, source: str, namespace: dict[str, object]) -> None:
-    # The padding makes a traceback point at the line in README.md.
-    exec(compile("\n" * (line - 1) + source, str(README), "exec"), namespace)
-
-
-@pytest.mark.parametrize(("line", "source"), BLOCKS, ids=[f"line {line}" for line, _ in BLOCKS])
-def test_a_python_block_runs_alone(line: int, source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("place", ALONE)
+def test_a_python_block_runs_alone(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # what a block writes must not land in the repository
     monkeypatch.syspath_prepend(tmp_path)  # as a script's own folder is
-    run(line, source, {"__name__": "__main__"})
+    run(*ALONE[place], {"__name__": "__main__"})
 
 
-def test_the_python_blocks_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", SEVERAL, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_python_blocks_run_in_their_order(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    assert BLOCKS, "README.md has no Python block: the pattern or the fences are wrong"
     namespace: dict[str, object] = {"__name__": "__main__"}
-    for line, source in BLOCKS:
-        run(line, source, namespace)
+    for line, alone, source in blocks(page.read_text(encoding="utf-8")):
+        if alone:
+            run(page, line, source, namespace)
 
 
-def test_every_make_target_named_in_the_readme_exists() -> None:
-    named = set(MAKE.findall(" ".join(re.findall(r"`[^`]+`", README.read_text(encoding="utf-8")))))
+def test_the_readme_plans_and_the_tutorials_do_what_they_are_about() -> None:
+    assert [page for page, _, _ in ALONE.values()].count(README) == 1
+    tutorials = {page.stem for page, _, _ in ALONE.values() if page.parent.name == "tutorials"}
+    assert tutorials == {page.stem for page in (SITE / "tutorials").glob("*.md")}
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_every_make_target_named_in_the_readme_and_on_the_site_exists() -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    assert {"reproduce", "test"} <= named
-    assert named <= targets
+    for page in PAGES:
+        named = set(MAKE.findall(page.read_text(encoding="utf-8")))
+        assert named <= targets, page
+        assert page != README or {"reproduce", "test", "site"} <= named
 
 
-def test_every_local_link_of_the_readme_leads_to_a_file() -> None:
-    links = [link for link in LINK.findall(README.read_text(encoding="utf-8")) if "://" not in link]
-    assert links, "README.md shows no local file: not even a picture"
-    missing = [link for link in links if not (ROOT / link).exists()]
-    assert not missing, f"README.md points at files that do not exist: {missing}"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_local_link_leads_to_a_file(page: Path) -> None:
+    text = FENCED.sub("", page.read_text(encoding="utf-8"))
+    links = [link for link in LINK.findall(text) if "://" not in link]
+    assert links or page != README, "README.md shows no local file: not even a picture"
+    missing = [link for link in links if not (page.parent / link).exists()]
+    assert not missing, f"{page} points at files that do not exist: {missing}"
 
 
 def test_the_list_of_modules_is_the_tree_as_it_is() -> None:
-    house = README.read_text(encoding="utf-8").partition("## The house")[2].partition("```\n")[2].partition("```")[0]
+    house = (SITE / "house.md").read_text(encoding="utf-8").partition("```\n")[2].partition("```")[0]
     listed: dict[str, list[str]] = {}
     package = room = ""
     for line in house.splitlines():

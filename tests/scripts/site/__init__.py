@@ -1,0 +1,1 @@
+"""The site: its pages, what they run, and where they lead."""
