@@ -20,6 +20,7 @@ from ocp.local.laws import Layer, Stabiliser
 from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
 from ocp.planning import Candidate, DeadEnd, Plan, WaypointPlan, plan, plan_waypoints
+from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Solution
@@ -48,6 +49,7 @@ __all__ = [
     "Layer",
     "Limits",
     "MultipleShooting",
+    "Phases",
     "Pinned",
     "Plan",
     "Problem",

@@ -15,6 +15,8 @@ import numpy as np
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, floats, unknown_name
+from ocp.problem.formulation import Formulation
+from ocp.problem.phases import own_of
 from ocp.problem.problem import Problem
 from ocp.storage import read_arrays, write_arrays
 
@@ -53,6 +55,7 @@ HEAD = {
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 MOST_LINES = 15  # of a solution that is printed
 AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
+GAUSS = 8  # points in a piece, of the cost of a phase
 PLAIN = ("t", "variables", "multipliers")
 PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
@@ -241,6 +244,68 @@ class Solution:
         for pool, interpolant in ((self.states, self.state_interpolant), (self.controls, self.control_interpolant)):
             values |= unstack(pool, interpolant(flat))
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
+
+    @property
+    def phases(self) -> dict[str, tuple[float, float]]:
+        """When each phase begins and ends, s, by name; empty of a problem without any (:mod:`ocp.problem.phases`)."""
+        declared = {} if self.problem is None else self.problem.declared.phases
+        if not declared:
+            return {}
+        times = self._sampled(
+            [part for phase in declared.values() for part in (phase.begin, phase.duration)], np.ones(1)
+        )
+        begins, lengths = (np.ravel(times[k::2]) for k in (0, 1))
+        return {name: (float(b), float(b + n)) for name, b, n in zip(declared, begins, lengths, strict=True)}
+
+    def phase(self, name: str) -> Solution:
+        """A phase as a plan over its own time, from 0 to its duration, states and controls by their names in it.
+
+        Its cost is its own share; it comes without a problem: what is audited is the whole.
+
+        Raises:
+            ProblemError: There is no such phase.
+        """
+        times = self.phases
+        begin, end = by_name("phase", name, times)
+        pools = {pool: own_of(name, getattr(self, pool)) for pool in ("states", "controls", "costates")}
+        curves = {}
+        for pool, kind in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
+            columns = [each.startswith(f"{name}.") for each in getattr(self, pool)]
+            sizes = [values.shape[1] for values in getattr(self, pool).values()]
+            curve = getattr(self, kind)
+            curves[kind] = replace(curve, values=curve.values[:, :, np.repeat(columns, sizes)])
+        own = self.problem.declared.phases[name]
+        grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
+        places, weights = np.polynomial.legendre.leggauss(GAUSS)
+        at = (grid[:-1, None] + np.diff(grid)[:, None] * (places + 1) / 2).ravel()
+        density = self._sampled([own.running], at)[0].reshape(-1, GAUSS)
+        cost = float(density @ weights @ np.diff(grid)) / 2 + float(self._sampled([own.terminal], np.ones(1))[0].item())
+        return replace(
+            self,
+            name=f"{self.name}: {name}",
+            cost=cost,
+            horizon=end - begin,
+            t=self.t / self.horizon * (end - begin),
+            **pools,
+            **curves,
+            cost_gradients={},
+            variables=np.zeros(0),
+            multipliers=np.zeros(0),
+            problem=None,
+            problem_lost=f"phase {name!r} of {self.name!r} is audited with the whole",
+            refinement=None,
+            drawn_in=None,
+        )
+
+    def _sampled(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
+        """Expressions of what its problem declares, at fractions (M,) of the plan; each (M, n)."""
+        form = Formulation.of(self.problem)
+        plan = in_order_of(form, self)
+        x, u = plan.state_interpolant(fractions), plan.control_interpolant(fractions)
+        p = form.parameter_vector(self.parameters)
+        first = (form.x0, plan.state_interpolant(np.zeros(1))[0]), (form.u0, plan.control_interpolant(np.zeros(1))[0])
+        flat = [form.flat(expression) for expression in expressions]
+        return form.sampled(flat, x, u, fractions * self.horizon, self.horizon, p, *first)
 
     @interruptible
     def audit(self, problem: Any = None, **settings: Any) -> Any:

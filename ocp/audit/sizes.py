@@ -2,7 +2,8 @@
 
 The size of a state or a control is its spread, the largest less the smallest of its values along the plan and of those
 declared at its ends: neither its distance from the origin nor the width of its bounds, so that moving the origin,
-changing a unit or naming a distant bound changes no verdict. The size of a constraint is that of what it is made of.
+changing a unit or naming a distant bound changes no verdict. A free parameter, which has no spread, is as large as its
+value. The size of a constraint is that of what it is made of.
 """
 
 from __future__ import annotations
@@ -122,9 +123,9 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
         np.where(low == high, low, np.nan) for low, high in (_of(bounds, places[k]) for k in ("initial", "terminal"))
     ]
     declared = _of(bounds, places["state"])
-    state, moves = _sizes_of(np.vstack([grid.states, *ends]), declared, ends)
+    state, moves = _sizes_of(np.vstack([grid.states, *ends]), declared, ends, form.free_parameters)
     declared = _of(bounds, places["control"])
-    control, acts = _sizes_of(grid.controls, declared, [])
+    control, acts = _sizes_of(grid.controls, declared, [], np.zeros(form.nu, dtype=bool))
     entries = np.concatenate([state, control]), np.concatenate([moves, acts])
     here = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
     running, rows, way = form.sampled([form.running, form.path.expression, form.watch_way], *here, kept="along a plan")
@@ -150,9 +151,15 @@ def _of(bounds: Bounds, index: np.ndarray) -> Bounds:
     return bounds[0][index], bounds[1][index]
 
 
-def _sizes_of(values: np.ndarray, declared: Bounds, ends: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes of entries (n,) whose values are (M, n), and which of them move, or are told to be anywhere but at zero."""
+def _sizes_of(
+    values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of entries (n,) whose values are (M, n), and which of them move, or are told to be anywhere but at zero.
+
+    What is ``free`` (n,) cannot move along a plan: it is as large as it is, as a horizon is.
+    """
     spread, largest = _spread(values)
+    spread = np.where(free, largest, spread)
     known = np.zeros(spread.shape, dtype=bool)
     for end in ends:
         known |= np.abs(np.nan_to_num(end)) > STILL

@@ -113,6 +113,7 @@ class Formulation:
             bears the name of a variable of another unit.
         bounds: The bound table.
         horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
+        free_parameters: Which states stand still whatever is done. Shape (nx,), bool.
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
         ties_ends: Whether anything at the end refers to the start.
         indifferent: Whether the cost is a constant, so that every plan that meets the constraints is optimal.
@@ -144,10 +145,11 @@ class Formulation:
         self.horizon_is_free = not horizon.fixed
         self.horizon_guess = horizon.guess
 
-        self.f = self._flat(ca.vertcat(*[declared.dynamics[name] for name in self.states]))
-        self.running = self._flat(0 if declared.running is None else declared.running)
-        self.terminal = self._flat(0 if declared.terminal is None else declared.terminal)
-        self.horizon_value = self._flat(horizon.lower)  # of use where it is fixed
+        self.f = self.flat(ca.vertcat(*[declared.dynamics[name] for name in self.states]))
+        self.free_parameters = np.array([rate.is_zero() for rate in ca.vertsplit(self.f)], dtype=bool)
+        self.running = self.flat(0 if declared.running is None else declared.running)
+        self.terminal = self.flat(0 if declared.terminal is None else declared.terminal)
+        self.horizon_value = self.flat(horizon.lower)  # of use where it is fixed
         self._signal = self._signal_function()
         self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
@@ -155,11 +157,11 @@ class Formulation:
         self.start = self._rows("start", declared.start, 0.0)
         self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)
-        self.apart = {name: self._flat(each.placements) for name, each in declared.apart.items()}
+        self.apart = {name: self.flat(each.placements) for name, each in declared.apart.items()}
         watched = declared.watch.values()
         self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
         ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
-        self.watch_way = self._flat(ca.vertcat(problem.symbols(0, 1), *ways))
+        self.watch_way = self.flat(ca.vertcat(problem.symbols(0, 1), *ways))
         inner = ca.vertcat(self.f, self.running, self.path.expression)
         self.autonomous = not ca.depends_on(inner, ca.vertcat(self.t, self.w))
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
@@ -335,7 +337,7 @@ class Formulation:
 
     # ---- flattening ------------------------------------------------------------------------------------------
 
-    def _flat(self, expression: Any) -> Any:
+    def flat(self, expression: Any) -> Any:
         """An expression of the declared symbols as one of the stacked symbols."""
         d = self._declared
         old: list[Any] = [self.problem.time]
@@ -375,7 +377,7 @@ class Formulation:
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
         """Rows of a place; at an ``end``, 0 or 1, of the horizon the signals are numbers."""
         symbols = self.problem.symbols
-        expression = self._flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
+        expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:
             values = symbols(ca.DM(self.signals_at(np.array([end * self.duration]))[0]))
             expression = ca.densify(ca.substitute([expression], [self.w], [values])[0])
@@ -426,7 +428,7 @@ class Formulation:
         for name, (lower, _) in parts.items():
             places[name] = np.arange(offset, offset + lower.numel())
             offset += lower.numel()
-        table = [self._flat(ca.vertcat(*[part[i] for part in parts.values()])) for i in (0, 1)]
+        table = [self.flat(ca.vertcat(*[part[i] for part in parts.values()])) for i in (0, 1)]
         return BoundTable(ca.Function("bounds", [self.p], table), places)
 
 

@@ -152,6 +152,23 @@ class Horizon:
     fixed: bool
 
 
+@dataclass(frozen=True)
+class PhaseTimes:
+    """When a phase is, of a problem of several one after the other (:mod:`ocp.problem.phases`).
+
+    Attributes:
+        name: Of the phase. What belongs to it bears names that begin with it and a dot.
+        begin, duration: Expressions of states that stand still, and of parameters. Scalars, s.
+        running, terminal: Its own share of the cost: density over the fraction of the phase, and what comes at its end.
+    """
+
+    name: str
+    begin: Any
+    duration: Any
+    running: Any
+    terminal: Any
+
+
 @dataclass
 class Declarations:
     """Everything declared so far, by kind and name, in order of declaration."""
@@ -166,6 +183,7 @@ class Declarations:
     end: dict[str, Constraint] = field(default_factory=dict)
     watch: dict[str, Constraint] = field(default_factory=dict)
     apart: dict[str, Separation] = field(default_factory=dict)
+    phases: dict[str, PhaseTimes] = field(default_factory=dict)
     at_start: dict[str, Any] = field(default_factory=dict)
     horizon: Horizon | None = None
     running: Any = None
@@ -212,7 +230,7 @@ class Problem:
         Raises:
             ProblemError: It is something else.
         """
-        kinds = (Variable, Signal, Constraint, Horizon, Declarations, Separation, Hull)
+        kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = restored(state, kinds)
         self.formulated = None
 
@@ -292,6 +310,51 @@ class Problem:
         size = checked_count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
+
+    @_about_its_name
+    def free_parameter(
+        self,
+        name: str,
+        size: int | None = None,
+        *,
+        lower: Value = None,
+        upper: Value = None,
+        guess: Value = None,
+        unit: str = "",
+    ) -> Any:
+        """Declare a number that is sought with the motion, a state that stands still; return its symbol, shape (n, 1).
+
+        Arguments as for :meth:`state`; its bounds hold, its costate at the start is the derivative of the cost in it.
+        """
+        if callable(guess):
+            raise ProblemError(f"free parameter {name!r}: guess must be a value, not a function", value=guess)
+        symbol = self.state(name, size, lower=lower, upper=upper, guess=guess, unit=unit)
+        self.dynamics(symbol, np.zeros(symbol.numel()))
+        return symbol
+
+    @_about_its_name
+    def integral(self, name: str, rate: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> Any:
+        """Declare ``lower <= integral of rate dt <= upper`` over the horizon; return the integral so far, a state.
+
+        Args:
+            name: Unique among states and constraints.
+            rate: As of :meth:`dynamics`.
+            lower, upper: Bounds; may be expressions of parameters. None on both sides: it is only integrated, to stand
+                in the terminal cost, say.
+            unit: Of the integral.
+        """
+        what = f"integral {name!r}"
+        size = self._expression(what, rate, self._inner()).numel()
+        if size == 0:
+            raise ProblemError(f"{what} is empty")
+        if lower is not None or upper is not None:  # all is looked at before anything is declared
+            self._unused_constraint("integral", name)
+            self._bounds(what, size, lower, upper)
+        state = self.state(name, size, initial=0.0, unit=unit)
+        self.dynamics(state, rate)
+        if lower is not None or upper is not None:
+            self.end(name, state, lower, upper, unit=unit)
+        return state
 
     @_about_its_name
     def signal(self, name: str, track: Callable[[Any], Any]) -> Any:
