@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as dataclass_fields
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,7 @@ __all__ = [
     "unstack",
 ]
 
+T = TypeVar("T")
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 2
@@ -267,13 +268,12 @@ class Solution:
         """
         times = self.phases
         begin, end = by_name("phase", name, times)
-        pools = {pool: own_of(name, getattr(self, pool)) for pool in ("states", "controls", "costates")}
-        curves = {}
+        parts: dict[str, Any] = {pool: own_of(name, getattr(self, pool)) for pool in ("states", "controls", "costates")}
         for pool, kind in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
             columns = [each.startswith(f"{name}.") for each in getattr(self, pool)]
             sizes = [values.shape[1] for values in getattr(self, pool).values()]
             curve = getattr(self, kind)
-            curves[kind] = replace(curve, values=curve.values[:, :, np.repeat(columns, sizes)])
+            parts[kind] = replace(curve, values=curve.values[:, :, np.repeat(columns, sizes)])
         own = self.problem.declared.phases[name]
         grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
         places, weights = np.polynomial.legendre.leggauss(GAUSS)
@@ -286,8 +286,7 @@ class Solution:
             cost=cost,
             horizon=end - begin,
             t=self.t / self.horizon * (end - begin),
-            **pools,
-            **curves,
+            **parts,
             cost_gradients={},
             variables=np.zeros(0),
             multipliers=np.zeros(0),
@@ -466,7 +465,7 @@ def read_head(path: Any, text: np.ndarray) -> Any:
     return json.loads(text.tobytes().decode())
 
 
-def by_name(kind: str, name: Any, pool: Mapping[str, np.ndarray]) -> np.ndarray:
+def by_name(kind: str, name: Any, pool: Mapping[str, T]) -> T:
     """An entry of a pool; ProblemError, which lists the near ones, where nothing bears the name."""
     if not isinstance(name, str) or name not in pool:
         raise unknown_name(kind, name, pool)

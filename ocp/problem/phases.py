@@ -86,7 +86,7 @@ class Phases(Problem):
     """
 
     def __init__(self, name: str, phases: Mapping[str, Problem]) -> None:
-        if not isinstance(phases, Mapping) or not phases:
+        if not _by_name("phases", phases):
             raise ProblemError(f"problem {name!r}: problems by the names of their phases are expected", name="phases")
         for each, problem in phases.items():
             if not checked_text(f"problem {name!r}: name of a phase", each) or "." in each:
@@ -108,14 +108,14 @@ class Phases(Problem):
 
     def __getitem__(self, name: str) -> Phase:
         """A phase by its name."""
-        if name not in self.declared.phases:
+        if not isinstance(name, str) or name not in self.declared.phases:
             raise unknown_name("phase", name, self.declared.phases)
         times = self.declared.phases[name]
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
         """States and controls of a phase, by their names in it."""
-        return own_of(phase, {**self.declared.states, **self.declared.controls})
+        return own_of(self[phase].name, {**self.declared.states, **self.declared.controls})
 
     def join(self, before: str, after: str, states: Mapping[str, Any] | None = None) -> None:
         """A phase goes on from where another ends: states of the same name have the same values.
@@ -131,7 +131,7 @@ class Phases(Problem):
             ProblemError: An unknown phase or state, an expression of the wrong size, joined twice, nothing to join.
         """
         one, other = self[before], self[after]
-        said = dict(states or {})
+        said = dict(_by_name("states", {} if states is None else states))
         begins = {name: v for name, v in own_of(after, self.declared.states).items() if name != DURATION}
         ends = own_of(before, self.declared.states)
         for name in said:
@@ -165,8 +165,10 @@ class Phases(Problem):
     def guess(self, plans: Mapping[str, Any]) -> dict[str, Any]:
         """A guess of the whole from plans of phases made one by one, :class:`ocp.solution.Solution`, by their names."""
         found: dict[str, Any] = {}
-        for phase, plan in plans.items():
-            own = self.of(self[phase].name)
+        for phase, plan in _by_name("plans", plans).items():
+            own = self.of(phase)
+            if not all(hasattr(plan, part) for part in ("states", "controls", "at_fraction")):
+                raise ProblemError(f"phase {phase!r}: a plan is expected, not {plan!r}", name=phase, value=plan)
             for name in own:
                 if name in plan.states or name in plan.controls:
                     found[f"{phase}.{name}"] = lambda s, plan=plan, name=name: plan.at_fraction(s)[name]
@@ -330,6 +332,12 @@ def own_of(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
     """What of a pool belongs to a phase, by the names in it."""
     head = f"{phase}."
     return {name.removeprefix(head): value for name, value in pool.items() if name.startswith(head)}
+
+
+def _by_name(what: str, given: Any) -> Mapping[str, Any]:
+    if not isinstance(given, Mapping):
+        raise ProblemError(f"{what}: a mapping by name is expected, not {given!r}", name=what, value=given)
+    return given
 
 
 def _stretched(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:

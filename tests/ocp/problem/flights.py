@@ -76,7 +76,8 @@ def equinoctial_rates(x: Any, thrust: Any) -> Any:
 
 def flown() -> dict[str, Callable[[float], Any]]:
     """Elements over the time of each leg, with the guessed thrust: where the search starts."""
-    state, found = np.array([*PARKING, 1.0]), {}
+    state = np.array([*PARKING, 1.0])
+    found: dict[str, Callable[[float], Any]] = {}
     y = ca.SX.sym("y", 7)
     for name, (_, _, duration, angles) in LEGS.items():
         thrust = None if angles is None else (_acceleration(y[6]), *np.deg2rad(angles))
@@ -102,8 +103,10 @@ def two_burns() -> Phases:
     guesses, legs = flown(), {}
     for name, (least, most, guess, angles) in LEGS.items():
         leg = legs[name] = Problem(name)
-        ends = {"initial": PARKING} if name == "coast" else {"terminal": TARGET} if name == "insert" else {}
-        box = {"lower": [0.4, -1, -1, -1, -1, np.pi], "upper": [10, 1, 1, 1, 1, 30 * np.pi]}
+        ends: dict[str, Any] = (
+            {"initial": PARKING} if name == "coast" else {"terminal": TARGET} if name == "insert" else {}
+        )
+        box: dict[str, Any] = {"lower": [0.4, -1, -1, -1, -1, np.pi], "upper": [10, 1, 1, 1, 1, 30 * np.pi]}
         x = leg.state("x", 6, guess=guesses[name], **box, **ends)
         thrust = None
         if angles is not None:

@@ -9,7 +9,19 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, prepare, refine, solve, tighten
+from ocp import (
+    Collocation,
+    Indirect,
+    MultipleShooting,
+    Phases,
+    Problem,
+    Solution,
+    certificate,
+    prepare,
+    refine,
+    solve,
+    tighten,
+)
 from tests.bad_values import (
     CHOICE,
     COUNT,
@@ -87,6 +99,11 @@ def plan() -> Solution:
     return made()[1]
 
 
+@cache
+def plan_of_phases() -> Solution:
+    return solve(Phases("a", {"one": line()}), PLAN, parameters={"p": 1.0})
+
+
 def declared() -> Problem:
     return made()[0]
 
@@ -104,6 +121,14 @@ def about_blank(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
     return Case(f"Problem.{name}", call, good, bad)
 
 
+def about_phases(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
+    """What is asked of two phases."""
+    return Case(
+        f"Phases.{name}", lambda **given: getattr(Phases("a", {"one": line(), "two": line()}), name)(**given), good, bad
+    )
+
+
+PHASES: Bad = MAPPING | {"no problem": {"b": 1}, "half": {"b": blank()}, "dot": {"b.c": line()}, "number": {3: line()}}
 DECLARATIONS = [
     Case("Problem", Problem, {"name": "a"}, {"name": NAME, "symbols": INSTANCE}),
     about_blank(
@@ -169,6 +194,37 @@ DECLARATIONS = [
         way=but(EXPRESSION, "None") | {"two": [1.0, 2.0]},
         unit=UNIT,
     ),
+    about_blank(
+        "free_parameter",
+        {"name": "y"},
+        name=RESERVED,
+        size=COUNT,
+        lower=BOUND | {"inf": INF},
+        upper=BOUND | {"minus inf": -INF},
+        guess=GUESS | {"function": lambda t: t},
+        unit=UNIT,
+    ),
+    about_blank(
+        "integral",
+        {"name": "y", "rate": "the state", "upper": 1.0},
+        name=RESERVED,
+        rate=EXPRESSION,
+        lower=BOUND | {"inf": INF, "above": 2.0},
+        upper=BOUND | {"minus inf": -INF},
+        unit=UNIT,
+    ),
+    Case("Phases", Phases, {"name": "a", "phases": {"b": line()}}, {"name": NAME, "phases": PHASES}),
+    about_phases(
+        "join",
+        {"before": "one", "after": "two"},
+        before=NAME | {"unknown": "three"},
+        after=NAME | {"unknown": "three"},
+        states=but(MAPPING, "None") | {"unknown": {"y": 0.0}, "two": {"x": [0.0, 1.0]}, "text": {"x": "x"}},
+    ),
+    about_phases("minimize", {"terminal": 0.0}, running={"one": 1.0}, terminal=EXPRESSION | {"two": [1.0, 2.0]}),
+    about_phases("__getitem__", {"name": "one"}, name=NAME | {"unknown": "three"}),
+    about_phases("of", {"phase": "one"}, phase=NAME | {"unknown": "three"}),
+    about_phases("guess", {"plans": {}}, plans=MAPPING | {"no plan": {"one": 1.0}, "unknown": {"three": None}}),
     about_blank("minimize", {"running": "the state"}, running=EXPRESSION | {"two": [1.0, 2.0]}, terminal=EXPRESSION),
 ]
 
@@ -325,6 +381,7 @@ FRONTS = [
     method(plan, "costate", {"name": "x"}, name=NAME | {"unknown": "y"}),
     method(plan, "cost_gradient", {"name": "p"}, name=NAME | {"unknown": "q"}),
     method(plan, "__getitem__", {"name": "x"}, name=NAME | {"unknown": "y"}),
+    method(plan_of_phases, "phase", {"name": "one"}, name=NAME | {"unknown": "three"}),
     method(
         plan,
         "at",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from functools import cache
@@ -364,7 +365,7 @@ def test_what_cannot_be_joined_is_named() -> None:
     wide.horizon(1.0)
     apart = Phases("apart", {"first": regulator(1.0), "wide": wide})
     strange = Phases("strange", {"first": regulator(1.0)})
-    refused = {
+    refused: dict[str, Callable[[], Any]] = {
         "joined twice": lambda: phases.join("first", "second"),
         "phase": lambda: phases.join("first", "third"),
         "state of phase 'second'": lambda: phases.join("first", "second", {"y": 0.0}),
@@ -399,7 +400,7 @@ def _half() -> Problem:
 
 def test_two_burns_raise_an_orbit_as_published() -> None:
     """Betts' transfer: a weight of 0.2367249 arrives (PSOPT)."""
-    plan = solve(two_burns(), Collocation(40, 4))
+    plan = solve(two_burns(), Collocation(40, 4), guess=solve(two_burns(), Collocation(20, 5)))
     assert -plan.cost == pytest.approx(0.2367249, abs=1e-7)
     assert plan.audit().feasible
 
