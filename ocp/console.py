@@ -194,7 +194,10 @@ def check_time() -> None:
 
 
 class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate."""
+    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate.
+
+    ``meanwhile`` is called at each.
+    """
 
     def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
@@ -202,6 +205,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
         self.title, self.show = title, show
         self.stopped, self.iterate, self.iterations = "", np.zeros(n), 0
         self.bar: Any = None
+        self.meanwhile: Callable[[], object] = lambda: None
         self.construct("progress", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -233,6 +237,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
                 self.bar.set_postfix_str(f"cost {cost:.6g}, infeasibility {worst:.1e}", refresh=False)
                 self.bar.update()
             self.stopped = reason_to_stop()
+            self.meanwhile()
         except KeyboardInterrupt:  # CasADi would make another error of it
             self.stopped = INTERRUPTED
         self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
@@ -246,13 +251,14 @@ class Progress(ca.Callback):  # type: ignore[misc]
 class Watch(ca.Callback):  # type: ignore[misc]
     """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
 
-    For a solver that has no iteration callback.
+    For a solver that has no iteration callback. ``meanwhile`` is called at each iterate.
     """
 
     def __init__(self, n: int, title: str) -> None:
         ca.Callback.__init__(self)
         self.n, self.title, self.stopped = n, title, ""
         self.iterate, self.iterations = np.zeros(n), 0
+        self.meanwhile: Callable[[], object] = lambda: None
         self.construct("watch", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -274,6 +280,7 @@ class Watch(ca.Callback):  # type: ignore[misc]
     def eval(self, arguments: list[Any]) -> list[float]:
         try:
             self.stopped = self.stopped or reason_to_stop()
+            self.meanwhile()
         except KeyboardInterrupt:
             self.stopped = INTERRUPTED
         self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)

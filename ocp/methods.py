@@ -43,7 +43,7 @@ class Method(Protocol):
         *,
         solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool = False,
+        compiled: bool | str = "auto",
         scaling: bool = True,
     ) -> PreparedProblem:
         """Build a problem once, to be solved many times; see :func:`prepare`."""
@@ -57,7 +57,7 @@ def prepare(
     *,
     solver: str = "ipopt",
     options: ByName = None,
-    compiled: bool = False,
+    compiled: bool | str = "auto",
     scaling: bool = True,
 ) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
@@ -68,7 +68,12 @@ def prepare(
             (an active-set method, to confirm a plan, started there). For the indirect method, of the direct solution
             that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
-        compiled: Compile the block functions with the machine's C compiler: seconds to build, faster solves.
+        compiled: Whether the functions of the problem and their derivatives go through the machine's C compiler (that
+            of the environment's CC, else cc), which makes solves several times faster and changes no number. What was
+            compiled is kept for all meshes, processes and runs (``selfmotion cache``). True: now, which takes seconds.
+            False: never. ``auto``: what is kept is taken, and the rest is compiled in the background once solves have
+            taken longer than that is expected to. Without a compiler functions are interpreted, which is told once;
+            for sleqp they always are.
         scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where
             these are far from 1; all that is reported stays in the units of the problem.
 
@@ -80,8 +85,10 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    for what, flag in (("compiled", compiled), ("scaling", scaling)):
-        checked_flag(f"prepare: {what}", flag)
+    if not isinstance(compiled, bool | np.bool_) and not (isinstance(compiled, str) and compiled == "auto"):
+        words = f"prepare: compiled must be True, False or 'auto', not {compiled!r}"
+        raise ProblemError(words, name="compiled", value=compiled)
+    checked_flag("prepare: scaling", scaling)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 

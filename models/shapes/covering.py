@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
+from models.cache import keep, kept, key_of
 from models.errors import ModelError
-from models.shapes.cache import keep, kept, key_of
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Box, Capsule
 
@@ -63,7 +63,7 @@ class Cover:
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
     """Capsules, or a box, in which every point of a mesh lies.
 
-    The same mesh has the same cover. It is fitted once and kept in a file by its content, see `models.shapes.cache`.
+    The same mesh has the same cover. It is fitted once and kept in a file by its content, see `models.cache`.
 
     Args:
         vertices: Shape (n, 3), m.

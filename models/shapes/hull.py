@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array, frozen
+from models.cache import keep, kept, key_of
 from models.errors import ModelError
-from models.shapes.cache import keep, kept, key_of
 
 FLAT = 1e-10
 """Share of the size of all points: thinner is flat, and what stands out less counts as inside."""
@@ -70,7 +70,7 @@ def convex_hull(points: Array) -> Hull:
 
 
 def kept_hull(points: Array) -> Hull:
-    """The convex hull of points, sought once and kept in a file by their content, see `models.shapes.cache`.
+    """The convex hull of points, sought once and kept in a file by their content, see `models.cache`.
 
     Args, Raises: As `convex_hull`.
     """

@@ -22,11 +22,11 @@ from models.arrays import (
     checked_nonnegative,
     one_for_each,
 )
+from models.cache import keep, kept, key_of
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
 from models.shapes.bodies import Body
-from models.shapes.cache import keep, kept, key_of
 from models.shapes.distance import distance
 from models.shapes.rigid_parts import RigidParts, Step, arms
 from models.shapes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere

@@ -9,9 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, HalfSpace, Robot, locked, rectangle, with_load
+from models import FixedBase, FreeFloating, HalfSpace, Robot, cache, locked, rectangle, with_load
 from models.arrays import Array
-from models.shapes import cache
 from models.spatial import rotation_from_rpy
 from ocp.app.planned import WRITERS, check_period, export, run_task
 from ocp.app.progress import Progress

@@ -6,8 +6,9 @@ the whole by a constant sparse matrix. No colouring of the whole program, no gra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from ocp.direct.fragment import Block, Fragment
 from ocp.problem.values import symbols_of
 
-__all__ = ["Program", "assemble"]
+__all__ = ["Derivatives", "Program", "assemble", "derivatives"]
 
 LARGE = 50_000
 """Instructions: to look for equal ones among more takes longer than a solve with all of them."""
@@ -43,114 +44,123 @@ class Program:
     parametric: Any
 
 
-@dataclass(frozen=True)
-class Derived:
-    """A block with its derivative functions (nonzeros only) and where the nonzeros belong."""
+class Derivatives(NamedTuple):
+    """A block function with its derivatives, as casadi Functions of (v, d, p).
 
-    block: Block
+    Attributes:
+        value: -> (cost, g). gradient: Of the cost, -> (1, n). jacobian: Of g, -> (m, n).
+        hessian: (v, d, p, sigma, lam) -> upper triangle (n, n) of that of sigma cost + lam . g.
+        slope: (v, d, p, lam) -> gradient (n_p, 1) of cost + lam . g in the parameters.
+    """
+
     value: Any
     gradient: Any
     jacobian: Any
     hessian: Any
-    gradient_at: np.ndarray
-    jacobian_at: tuple[np.ndarray, np.ndarray]
-    hessian_at: tuple[np.ndarray, np.ndarray, np.ndarray]
+    slope: Any
 
 
-def assemble(fragment: Fragment, parameters: int, options: dict[str, Any] | None = None) -> Program:
-    """Derive and assemble. ``options`` go to the casadi Functions of the blocks, for example to compile them."""
-    derived = [derive(block, options or {}) for block in fragment.blocks]
+def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
+    """The program of a fragment, from the derivatives of its blocks, which are made where they are not given."""
+    blocks = fragment.blocks
+    if functions is None:
+        functions = [derivatives(block.function) for block in blocks]
     n, m = fragment.size, fragment.n_rows
     x, p = ca.MX.sym("x", n), ca.MX.sym("p", parameters)
     sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
+    calls = [(block, each, [*inputs(block, x), p]) for block, each in zip(blocks, functions, strict=True)]
 
-    calls = [(d, inputs(d.block, x)) for d in derived]
-    rows = [np.asarray(d.block.rows).ravel(order="F") for d in derived]
-    outputs = [mapped(d.value, d.block, [*call, p]) for d, call in calls]
+    outputs = [mapped(each.value, block, call) for block, each, call in calls]
     f = sum((ca.sum2(out[0]) for out in outputs), ca.MX(0))
-    nonlinear = scatter(rows, [out[1] for out in outputs], m)
+    nonlinear = scatter([block.rows.ravel(order="F") for block in blocks], [ca.densify(out[1]) for out in outputs], m)
     g = nonlinear + ca.mtimes(sparse(*fragment.linear, (m, n)), x)
 
-    def gradient(part: list[tuple[Derived, list[Any]]]) -> Any:
-        pieces = [mapped(d.gradient, d.block, [*call, p])[0] for d, call in part]
-        return scatter([d.gradient_at for d, _ in part], pieces, n)
+    pieces = [mapped(each.gradient, block, call)[0] for block, each, call in calls]
+    places = [gradient_at(each.gradient.sparsity_out(0), block) for block, each, _ in calls]
+    gradient = scatter(places, pieces, n)
+    inner = [i for i, block in enumerate(blocks) if not block.ends]
+    inside = scatter([places[i] for i in inner], [pieces[i] for i in inner], n)
 
-    jac_pieces = [mapped(d.jacobian, d.block, [*call, p])[0] for d, call in calls]
-    jac = scatter_matrix([d.jacobian_at for d in derived], jac_pieces, fragment.linear, (m, n))
+    pieces = [mapped(each.jacobian, block, call)[0] for block, each, call in calls]
+    spots = [jacobian_at(each.jacobian.sparsity_out(0), block) for block, each, _ in calls]
+    jac = scatter_matrix(spots, pieces, fragment.linear, (m, n))
 
-    hess_pieces = [
-        mapped(d.hessian, d.block, [*call, p, repeat(sigma, d.block), gather(lam, d.block.rows)])[0]
-        for d, call in calls
+    pieces = [
+        mapped(each.hessian, block, [*call, repeat(sigma, block), gather(lam, block.rows)])[0]
+        for block, each, call in calls
     ]
     nothing = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
-    factors = [d.hessian_at[2] for d in derived]
-    hess = scatter_matrix([d.hessian_at[:2] for d in derived], hess_pieces, nothing, (n, n), factors)
+    both = [hessian_at(each.hessian.sparsity_out(0), block) for block, each, _ in calls]
+    hess = scatter_matrix([at for at, _ in both], pieces, nothing, (n, n), [factors for _, factors in both])
 
-    inside = [(d, call) for d, call in calls if not d.block.ends]
+    slope = ca.MX.zeros(parameters)
+    if parameters:
+        slope += sum(ca.sum2(mapped(each.slope, b, [*call, gather(lam, b.rows)])[0]) for b, each, call in calls)
     return Program(
         nlp={"x": x, "p": p, "f": f, "g": g},
-        gradient=ca.Function("nlp_grad_f", [x, p], [f, gradient(calls)], ["x", "p"], ["f", "grad_f_x"]),
+        gradient=ca.Function("nlp_grad_f", [x, p], [f, gradient], ["x", "p"], ["f", "grad_f_x"]),
         jacobian=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
         hessian=ca.Function(
             "nlp_hess_l", [x, p, sigma, lam], [hess], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
         ),
         values=ca.Function("values", [x, p], [f, g]),
-        inside=ca.Function("inside", [x, p], [gradient(inside)]),
-        parametric=ca.Function("parametric", [x, p, lam], [parametric(fragment, x, p, lam)]),
+        inside=ca.Function("inside", [x, p], [inside]),
+        parametric=ca.Function("parametric", [x, p, lam], [slope]),
     )
 
 
-def parametric(fragment: Fragment, x: Any, p: Any, lam: Any) -> Any:
-    """Gradient in the parameters, block by block."""
-    total = ca.MX.zeros(p.numel())
-    if p.numel() == 0:
-        return total
-    for block in fragment.blocks:
-        function = block.function
-        symbol = symbols_of(function).sym
-        v, d, q = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
-        cost, g = function(v, d, q)
-        mu = symbol("mu", g.numel())
-        slope = ca.Function("slope", [v, d, q, mu], [ca.densify(ca.gradient(cost + ca.dot(mu, g), q))])
-        total += ca.sum2(mapped(slope, block, [*inputs(block, x), p, gather(lam, block.rows)])[0])
-    return total
+# ---- one block ---------------------------------------------------------------------------------------------------
 
 
-def derive(block: Block, options: dict[str, Any]) -> Derived:
-    """Derivatives of one block, exact and symbolic."""
-    function = block.function
+def derivatives(function: Any) -> Derivatives:
+    """A block function with its derivatives, exact and symbolic."""
     symbol = symbols_of(function).sym
     v, d, p = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
     cost, g = function(v, d, p)
     sigma, lam = symbol("sigma"), symbol("lam", g.numel())
-    gradient = ca.jacobian(cost, v)
-    jacobian = ca.jacobian(g, v)
     hessian = ca.triu(ca.hessian(sigma * cost + ca.dot(lam, g), v)[0])
+    slope = ca.densify(ca.gradient(cost + ca.dot(lam, g), p))
+    return Derivatives(
+        without_repeats("value", [v, d, p], [cost, g]),
+        without_repeats("gradient", [v, d, p], [ca.jacobian(cost, v)]),
+        without_repeats("jacobian", [v, d, p], [ca.jacobian(g, v)]),
+        without_repeats("hessian", [v, d, p, sigma, lam], [hessian]),
+        without_repeats("slope", [v, d, p, lam], [slope]),
+    )
 
-    _, gradient_at = (np.array(part, dtype=int) for part in gradient.sparsity().get_triplet())
-    row, column = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
-    first, second = (np.array(part, dtype=int) for part in hessian.sparsity().get_triplet())
-    where, rows = block.variables, block.rows
+
+def gradient_at(pattern: Any, block: Block) -> np.ndarray:
+    """The variable of the program that each nonzero of a block's gradient is of, application by application."""
+    return np.asarray(block.variables[places_of(pattern)[1]].ravel(order="F"))
+
+
+def jacobian_at(pattern: Any, block: Block) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column in the program of each nonzero of a block's Jacobian, application by application."""
+    row, column = places_of(pattern)
+    return block.rows[row].ravel(order="F"), block.variables[column].ravel(order="F")
+
+
+def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Row and column in the program's upper triangle of each nonzero of a block's, and its factor there."""
+    first, second = places_of(pattern)
+    where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
     lower = np.maximum(where[first], where[second]).ravel(order="F")
     # an off-diagonal entry of the block that falls on the diagonal stands for both its mirror images
     doubled = np.where((upper == lower) & np.tile(first != second, where.shape[1]), 2.0, 1.0)
-    return Derived(
-        block,
-        without_repeats("value", [v, d, p], [cost, g], options),
-        without_repeats("gradient", [v, d, p], [gradient.nz[:]], options),
-        without_repeats("jacobian", [v, d, p], [jacobian.nz[:]], options),
-        without_repeats("hessian", [v, d, p, sigma, lam], [hessian.nz[:]], options),
-        where[gradient_at].ravel(order="F"),
-        (rows[row].ravel(order="F"), where[column].ravel(order="F")),
-        (upper, lower, doubled),
-    )
+    return (upper, lower), doubled
 
 
-def without_repeats(name: str, given: list[Any], outputs: list[Any], options: dict[str, Any]) -> Any:
+def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of each nonzero."""
+    row, column = pattern.get_triplet()
+    return np.array(row, dtype=int), np.array(column, dtype=int)
+
+
+def without_repeats(name: str, given: list[Any], outputs: list[Any]) -> Any:
     """A casadi Function in which nothing is computed twice, unless it is LARGE."""
     large = ca.Function(name, given, outputs).n_instructions() > LARGE
-    return ca.Function(name, given, outputs, {"cse": not large, **options})
+    return ca.Function(name, given, outputs, {"cse": not large})
 
 
 def inputs(block: Block, x: Any) -> list[Any]:
@@ -177,10 +187,16 @@ def mapped(function: Any, block: Block, arguments: list[Any]) -> Any:
     return function.map(function.name() + "_map", "serial", count, [2], []).call(arguments)
 
 
+def nonzeros(pieces: list[Any]) -> Any:
+    """The nonzeros of all pieces in one vector."""
+    flat = [ca.sparsity_cast(piece, ca.Sparsity.dense(piece.nnz(), 1)) for piece in pieces]
+    return ca.vertcat(ca.MX(0, 1), *flat)
+
+
 def scatter(places: list[np.ndarray], pieces: list[Any], size: int) -> Any:
     """A vector with each entry of ``pieces`` added at its place."""
     where = np.concatenate([np.zeros(0, int), *places])
-    values = ca.vertcat(ca.MX(0, 1), *[ca.vec(piece) for piece in pieces])
+    values = nonzeros(pieces)
     collect = sparse(where, np.arange(where.size), np.ones(where.size), (size, where.size))
     return ca.densify(ca.mtimes(collect, values))  # solvers ask for dense vectors
 
@@ -201,7 +217,7 @@ def scatter_matrix(
     base = np.bincount(number[:fixed], weights=constant[2], minlength=entries.size)
     weights = np.ones(number.size - fixed) if factors is None else np.concatenate([np.zeros(0), *factors])
     collect = sparse(number[fixed:], np.arange(weights.size), weights, (entries.size, weights.size))
-    values = ca.vertcat(ca.MX(0, 1), *[ca.vec(piece) for piece in pieces])
+    values = nonzeros(pieces)
     return ca.MX(pattern, ca.mtimes(collect, values) + ca.MX(ca.DM(base)))
 
 

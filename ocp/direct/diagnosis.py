@@ -239,6 +239,8 @@ def elastic_plan(
         "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(share * slope, soft.prices)], ["x", "p"], ["f", "g"]),
         "jac_g": ca.Function("j", [x, p], [g, jac], ["x", "p"], ["g", "j"]),
         "hess_lag": ca.Function("h", [x, p, sigma, lam], [ca.diagcat(curved, ca.DM(k, k))]),
+        "no_nlp_grad": True,  # compiled functions have no derivatives but those that are ready
+        "calc_lam_p": False,
         "print_time": False,
         "error_on_fail": False,
         "show_eval_warnings": False,

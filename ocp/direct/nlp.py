@@ -106,6 +106,7 @@ def build_solver(
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
     if solver == "ipopt":
+        settings["no_nlp_grad"] = True  # compiled functions have no derivatives but those that are ready
         settings |= {"jac_g": program.jacobian, "grad_f": program.gradient, "hess_lag": program.hessian}
     elif solver == "sleqp":
         # like fatrop's, its interface looks for ready-made derivatives in its cache
@@ -172,6 +173,13 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
             [lagrangian, hessian],
             ["x", "p", "lam_f", "lam_g"],
             ["grad_gamma_x", "hess_gamma_x_x"],
+        ),
+        ca.Function(
+            "nlp_grad",  # of which the gradient in x is asked alone
+            [x, p, sigma, lam],
+            [*program.values(x, p), lagrangian, ca.MX(n_p, 1)],
+            ["x", "p", "lam_f", "lam_g"],
+            ["f", "g", "grad_gamma_x", "grad_gamma_p"],
         ),
     )
     return {function.name(): function for function in functions}

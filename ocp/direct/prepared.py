@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from ocp.console import INTERRUPTED, OUT_OF_TIME, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import assemble
+from ocp.direct.compiled import Blocks, stop_compiling
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
@@ -81,7 +81,7 @@ class DirectMethod(ABC):
         *,
         solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool = False,
+        compiled: bool | str = "auto",
         scaling: bool = True,
     ) -> Prepared:
         """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
@@ -172,23 +172,37 @@ class Prepared:
     """
 
     def __init__(
-        self, problem: Problem, method: DirectMethod, solver: str, options: ByName, compiled: bool, scaling: bool = True
+        self,
+        problem: Problem,
+        method: DirectMethod,
+        solver: str,
+        options: ByName,
+        compiled: bool | str = "auto",
+        scaling: bool = True,
     ) -> None:
         began = time.monotonic()
         self.problem, self.method, self.solver_name = problem, method, solver
         self.formulation = Formulation.of(problem)
         checked_choice("solver", solver, SOLVERS)
         self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
-        self.program = assemble(self.fragment, self.formulation.np, compiler_options() if compiled else None)
-        own = checked_mapping("options", options)
-        self.scaled = scaled_program(self.program)
-        self._solver, self._progress = build_solver(self.scaled, solver, own, self.fragment.stages, problem.name)
-        self._own_options, self._pattern = own, Pattern(self.formulation, self.fragment, self.program)
-        self._scaling, self._known = scaling, Known(self.formulation, self.fragment, self.program)
-        self._most = largest_number_of_iterations(solver, own)
-        self._made_of = problem, method, solver, own, compiled, scaling
+        self._own_options, self._scaling = checked_mapping("options", options), scaling
+        # sleqp asks for products with the Hessian, which compiled functions do not have
+        self._blocks = Blocks(self.fragment, compiled if solver != "sleqp" else False)
+        self._build()
+        self._most = largest_number_of_iterations(solver, self._own_options)
+        self._made_of = problem, method, solver, self._own_options, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
+
+    def _build(self) -> None:
+        """The program and its solver, of the functions of the blocks that are at hand."""
+        form, fragment = self.formulation, self.fragment
+        self.program = assemble(fragment, form.np, self._blocks.functions)
+        self.scaled = scaled_program(self.program)
+        how = self.solver_name, self._own_options, fragment.stages, self.problem.name
+        self._solver, self._progress = build_solver(self.scaled, *how)
+        self._pattern = Pattern(form, fragment, self.program)
+        self._known = Known(form, fragment, self.program)
 
     def __reduce__(self) -> Any:
         """Pickled and copied as what it was prepared of, to be prepared again."""
@@ -211,7 +225,13 @@ class Prepared:
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
         with limited(checked_time_limit(time_limit)), self._lock:
-            return self._solve(parameters, guess, check, tighter)
+            if self._blocks.seconds > self.seconds and self._blocks.renewed():
+                self._build()
+            try:
+                return self._solve(parameters, guess, check, tighter)
+            except KeyboardInterrupt:
+                stop_compiling()
+                raise
 
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None
@@ -302,9 +322,11 @@ class Prepared:
         own = scales.inside(relaxed)
         try:
             run, progress = solver or (self._solver, self._progress)
+            progress.meanwhile = partial(self._blocks.working, time.monotonic())
             outcome = call_solver(run, progress, own)
         except RuntimeError as error:
             outcome = broken_down(own, error)
+        self._blocks.worked(outcome.seconds)
         outcome = scales.outside(outcome)
         outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
         try:
@@ -454,12 +476,6 @@ def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> N
             middle = np.where(room & np.isfinite(high - low), (low + high) / 2, np.nan)
         arguments[f"lb{kind}"] = np.where(room, np.fmin(low + by[f"lb{kind}"], middle), low)
         arguments[f"ub{kind}"] = np.where(room, np.fmax(high - by[f"ub{kind}"], middle), high)
-
-
-def compiler_options() -> dict[str, Any]:
-    """ByName that make casadi compile a function with the machine's C compiler, its files in the temporary folder."""
-    shell = {"flags": ["-O1"], "directory": tempfile.gettempdir() + os.sep}
-    return {"jit": True, "compiler": "shell", "jit_name": "selfmotion", "jit_options": shell}
 
 
 def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:

@@ -81,7 +81,7 @@ class Indirect:
         *,
         solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool = False,
+        compiled: bool | str = "auto",
         scaling: bool = True,
     ) -> PreparedIndirect:
         """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.

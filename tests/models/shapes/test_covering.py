@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from models import ModelError
+from models import ModelError, cache
 from models.arrays import Array
-from models.shapes import cache, covering
+from models.shapes import covering
 from models.shapes.bodies import capsule_around
 from models.shapes.covering import Cover, cover, cut, fitted, inside
 from models.shapes.hull import convex_hull

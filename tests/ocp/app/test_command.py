@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.shapes import cache as kept
+from models import cache as kept
 from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.progress import Progress
