@@ -178,11 +178,12 @@ class Solution:
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
         """States and controls over time, with their bounds; see :func:`ocp.app.plots.plot_solution`.
 
-        The solution is blue; another one of the same states and controls, or several by name, orange. A notebook shows
-        the figure, ``.savefig("plan.png")`` writes it; ``figure=plt.figure()`` draws into a window.
+        The solution is blue; what it is compared with, another one of the same states and controls or what ``resolve``
+        made of the same joints, or several by name, orange. A notebook shows the figure, ``.savefig("a.png")`` writes
+        it; ``figure=plt.figure()`` draws into a window.
 
         Raises:
-            ProblemError: No solution, or of other states and controls.
+            ProblemError: Nothing that can be compared, or of other states and controls.
         """
         from ocp.app.plots import plot_solution
 

@@ -125,22 +125,24 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
 
     Args:
         solution: In blue.
-        against: A solution of the same states and controls, or several by name, in orange.
+        against: A solution of the same states and controls, what `resolve` made of the same joints, or several by name,
+            in orange. Costs are told; what `resolve` tells is the integral of half the squared joint rates.
         figure: As of a plan.
 
     Returns:
         The figure.
 
     Raises:
-        ProblemError: No solution, or of other states and controls.
+        ProblemError: Nothing that can be compared, or of other states and controls.
     """
     others = _named(against)
     shapes = _widths(solution)
     for name, other in others.items():
-        checked_instance(f"plot: {name}", other, Solution)
-        if _widths(other) != shapes:
-            words = f"plot: {name!r} has states and controls {_widths(other)}, the solution has {shapes}"
-            raise ProblemError(words, name="against", value=_widths(other), limit=shapes)
+        told = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
+        wanted = {what: shapes.get(what) for what in (told if isinstance(other, LocalSolution) else shapes)}
+        if told != wanted:
+            words = f"plot: {name!r} has {told}, the solution has {shapes}"
+            raise ProblemError(words, name="against", value=told, limit=shapes)
     entries = [(name, k) for name, width in shapes.items() for k in range(width)]
     left_out, entries = entries[MOST:], entries[:MOST]
     bounds, units = _bounds(solution)
@@ -152,12 +154,14 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         grid: Any = made.subplots(rows, min(COLUMNS, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
-        curves = [(one.horizon, *_along(one)) for one in (solution, *others.values())]
+        curves = [_along(one) for one in (solution, *others.values())]
         for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
-            for number, (horizon, at, values) in reversed([*enumerate(curves)]):
-                ax.plot(horizon * at, values[name][:, k], **look(number))
+            for number, curve in reversed([*enumerate(curves)]):
+                if name in curve:
+                    times, values = curve[name]
+                    ax.plot(times, values[:, k], **look(number))
             lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            show_limits(ax, lower, upper, NOTHING * max(np.abs(values[name]).max() for _, _, values in curves))
+            show_limits(ax, lower, upper, NOTHING * max(np.abs(c[name][1]).max() for c in curves if name in c))
             ax.set_title(name if shapes[name] == 1 else f"{name} [{k}]")
             ax.set_ylabel(units.get(name, ""), fontsize=7)
             ax.margins(x=0.01)
@@ -166,7 +170,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
             ax.tick_params(labelbottom=True)
         if others:
             add_names(made, ["solution", *others])
-    costs = "".join(f", that of {name} {other.cost:.6g}" for name, other in others.items())
+    costs = "".join(f", that of {name} {np.ravel(other.cost)[-1]:.6g}" for name, other in others.items())
     rest = f"; {len(left_out)} entries are not drawn" if left_out else ""
     made.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)
     return made
@@ -183,12 +187,37 @@ def _widths(solution: Solution) -> dict[str, int]:
     return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
 
 
-def _along(solution: Solution) -> tuple[Array, Mapping[str, Array]]:
-    """Fractions of the horizon, both sides of every node among them, and the values there."""
-    nodes = solution.control_interpolant.breaks[1:-1]
+def _local_widths(name: str, other: Any) -> dict[str, int]:
+    """What is known of a motion that `resolve` made, by the names that `minimum_velocity_problem` gives."""
+    if not isinstance(other, LocalSolution):
+        words = (
+            f"plot: {name!r} is a {type(other).__name__}; a solution is compared with a solution, or what resolve made"
+        )
+        raise ProblemError(words, name="against", value=other)
+    return {what: values.shape[1] for what, values in _local(other).items()}
+
+
+def _local(other: LocalSolution) -> dict[str, Array]:
+    named = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
+    return {what: values for what, values in named.items() if values.shape[1]}
+
+
+def _along(one: Any) -> dict[str, tuple[Array, Array]]:
+    """By name times, both sides of every node of a solution among them, s, and the values there.
+
+    States and controls of a phase are told over its own stretch of time.
+    """
+    if isinstance(one, LocalSolution):
+        return {name: (one.t, values) for name, values in _local(one).items()}
+    nodes = one.control_interpolant.breaks[1:-1]
     even = np.linspace(0.0, 1.0, SAMPLES + 1)
     at = np.unique(np.concatenate([even, nodes - AFTER, nodes + AFTER]))
-    return at, solution.at_fraction(at)
+    spans = one.phases
+    found = {}
+    for name, values in one.at_fraction(at).items():
+        begin, end = spans.get(name.partition(".")[0], (0.0, one.horizon))
+        found[name] = (begin + (end - begin) * at, values)
+    return found
 
 
 def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:

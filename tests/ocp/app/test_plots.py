@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from models import FixedBase, Joint, Robot, planar_chain
 from ocp import (
     Collocation,
+    Phases,
     Plan,
     Problem,
     ProblemError,
@@ -24,6 +25,7 @@ from ocp import (
     TipTask,
     WaypointPlan,
     certificate,
+    minimum_velocity_problem,
     plan,
     resolve,
     solve,
@@ -145,11 +147,44 @@ def test_the_curves_of_a_solution_are_its_states_and_controls_with_their_bounds(
         assert at == ([-10.0, 6.5] if name == "u" else [])  # u goes from 6 to -6
 
 
+def test_what_a_phase_does_is_drawn_when_it_does_it() -> None:
+    def leg(**place: Any) -> Problem:
+        problem = Problem("leg")
+        x, u = problem.state("x", **place), problem.control("u")
+        problem.dynamics(x, u)
+        problem.horizon(2.0)
+        problem.minimize(running=u**2)
+        return problem
+
+    both = Phases("way", {"there": leg(initial=0.0, terminal=1.0), "back": leg(terminal=0.0)})
+    both.join("there", "back")
+    axes = {ax.get_title(): ax for ax in solve(both, Collocation(intervals=3, degree=2)).plot().axes}
+    for name, ends, values in (("there.x", (0.0, 2.0), (0.0, 1.0)), ("back.x", (2.0, 4.0), (1.0, 0.0))):
+        (line,) = curves(axes[name], PLAN)
+        times, found = line.get_data()
+        np.testing.assert_allclose((times[0], times[-1]), ends)
+        np.testing.assert_allclose((found[0], found[-1]), values, atol=1e-7)
+
+
 def test_a_solution_without_its_problem_is_drawn_without_bounds_and_beside_another() -> None:
     bare = sprint().with_problem(None)
     for ax in bare.plot([sprint(), sprint()]).axes:
         assert not curves(ax, LIMIT)
         assert len(curves(ax, COMPARED)) == 2
+
+
+def test_a_solution_is_compared_with_the_pseudo_inverse_in_what_both_have() -> None:
+    problem = minimum_velocity_problem(arm(), task=TASK, start_joints=START, horizon=1.0)
+    solution = solve(problem, Collocation(intervals=8, degree=3))
+    figure = solution.plot(local())
+    assert f"that of the other {local().cost[-1]:.6g}" in figure.get_suptitle()
+    for ax in figure.axes:
+        name, k = ax.get_title()[:-1].split(" [")
+        (line,) = curves(ax, COMPARED)
+        wanted = {"joints": local().joints, "rates": local().joint_rates}[name][:, int(k)]
+        np.testing.assert_array_equal(line.get_data(), [local().t, wanted])
+    with pytest.raises(ProblemError, match="has"):
+        sprint().plot(local())
 
 
 @pytest.mark.parametrize("wrong", [3, "plan", object(), [None], {"one": 2.0}])
@@ -166,7 +201,7 @@ def test_motions_of_other_joints_are_refused() -> None:
         with pytest.raises(ProblemError, match="joints") as caught:
             motion().plot(wrong)
         assert caught.value.name == "against"
-    with pytest.raises(ProblemError, match="states and controls"):
+    with pytest.raises(ProblemError, match="the solution has"):
         sprint().plot(motion().solution)
 
 
