@@ -278,13 +278,17 @@ class Watch(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.n, 1)
 
     def eval(self, arguments: list[Any]) -> list[float]:
+        return [float(self.may_go_on(np.asarray(arguments[0].full()).reshape(-1)))]
+
+    def may_go_on(self, iterate: np.ndarray) -> bool:
+        """Whether the solver may go on from an iterate (n,), which is kept."""
         try:
             self.stopped = self.stopped or reason_to_stop()
             self.meanwhile()
         except KeyboardInterrupt:
             self.stopped = INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [float(not self.stopped)]
+        self.iterations, self.iterate = self.iterations + 1, iterate
+        return not self.stopped
 
 
 # ---- CasADi's own words ------------------------------------------------------------------------------------------

@@ -39,11 +39,14 @@ class Built(Protocol):
     """What was built of a problem; ``scaled`` is its program as it is solved."""
 
     problem: Problem
-    solver_name: str
     formulation: Formulation
     fragment: Fragment
     program: Program
-    scaled: Program
+
+    @property
+    def scaled(self) -> Program:
+        """The program as it is solved."""
+        ...
 
 
 def diagnosis(
@@ -70,7 +73,7 @@ def diagnosis(
         status = f"{status.partition(':')[0]}: badly scaled: {badly_scaled}; {REMEDY}"
     elif elastic is not None and not found:  # it is not the constraints
         status = status.partition(":")[0]
-    lines = [f"problem {built.problem.name!r}: {built.solver_name} ended with {status}"]
+    lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {status}"]
     if found:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
         lines += [f"  {conflict}" for conflict in found[:WORST]]

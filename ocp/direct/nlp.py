@@ -18,6 +18,7 @@ from ocp.errors import ProblemError, SolveError, checked_choice
 
 __all__ = [
     "ADVICE",
+    "DEFAULTS",
     "ROUNDING",
     "SOLVERS",
     "Outcome",
@@ -42,8 +43,9 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
+NATIVE = {"tol": 1e-10, "print_level": 0, "max_iter": 300}
 SLEQP = {"print_level": 0, "max_iter": 1000}
-DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp": SLEQP}
+DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "native": NATIVE, "fatrop": FATROP, "sleqp": SLEQP}
 SOLVERS = tuple(DEFAULTS)
 
 ADVICE = {
@@ -61,6 +63,8 @@ ADVICE = {
 }
 FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
 FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
+KINDS = {"IpoptInterface": "ipopt", "NativeSolver": "native", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
+"""Names of solvers by the class that calls them."""
 HUGE = 1e20
 ROUNDING = 1e-8  # of the residuals at which ipopt cannot move any more, relative to variables and multipliers
 SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -71,7 +75,7 @@ class Outcome:
     """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word.
 
     ``regularised``: whether the cost did not curve upwards where it ended, as far as the solver saw: its last step was
-    made with a Hessian that it had changed, or it made none.
+    made with a Hessian that it had changed, or it made none. ``solver``: Its name.
     """
 
     variables: np.ndarray
@@ -83,6 +87,7 @@ class Outcome:
     iterations: int
     seconds: float
     regularised: bool = False
+    solver: str = ""
 
 
 def build_solver(
@@ -193,17 +198,18 @@ def finite(expression: Any) -> Any:
 def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
-    kind = solver.class_name()
+    kind = KINDS[solver.class_name()]
     progress.open(arguments["lbg"], arguments["ubg"])
     progress.iterate = np.asarray(arguments["x0"])
     tell(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
         # SLEQP tells of each subproblem that it gives up
-        with listening(), quiet() if kind == "SLEQPInterface" else nullcontext():
-            result = solver(**(tightened(arguments) if kind == "FatropInterface" else arguments))
+        with listening(), quiet() if kind == "sleqp" else nullcontext():
+            relaxing = kind in ("fatrop", "native")
+            result = solver(**(tightened(arguments) if relaxing else arguments))
     except RuntimeError as error:
         words = str(error).lower()
-        if progress.stopped or kind == "SLEQPInterface":  # SLEQP's interface raises wherever it fails
+        if progress.stopped or kind == "sleqp":  # SLEQP's interface raises wherever it fails
             return stopped(solver, progress, arguments, began)
         if "option not supported" in words or "type mismatch" in words:  # fatrop looks at its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
@@ -218,7 +224,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
         word = "Solved_To_Acceptable_Level"
     word = progress.stopped or word
     success = not progress.stopped and (bool(stats["success"]) or word in SUCCESSES)
-    values = {key: np.asarray(result[key].full()).reshape(-1) for key in ("x", "f", "g", "lam_g")}
+    values = {key: np.asarray(result[key], dtype=float).reshape(-1) for key in ("x", "f", "g", "lam_g")}
     if success and not all(np.all(np.isfinite(v)) for v in values.values()):
         success, word = False, "Invalid_Number_Detected"
     if word == "Solved_To_Acceptable_Level" and missed(values, arguments) > ROUNDING:
@@ -227,7 +233,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     cost, status = float(values["f"][0]), word if success else advised(word)
     tell(f"solved {progress.title!r}: {word}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
     found = values["x"], cost, values["g"], values["lam_g"]
-    return Outcome(*found, success, status, iterations, seconds, regularised(stats))
+    return Outcome(*found, success, status, iterations, seconds, regularised(stats), kind)
 
 
 def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
@@ -236,7 +242,8 @@ def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray],
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
     word = at.stopped or "Error_In_Step_Computation"
     tell(f"stopped {at.title!r}: {word}, {at.iterations} iterations, {seconds:.3g} s")
-    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(word), at.iterations, seconds)
+    kind = KINDS[solver.class_name()]
+    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(word), at.iterations, seconds, False, kind)
 
 
 def advised(word: str) -> str:
@@ -257,11 +264,11 @@ def regularised(stats: dict[str, Any]) -> bool:
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
 
-def broken_down(arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
+def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
     """The outcome of a solver that a function of the program threw out, as an integrator does: its start."""
     rows = np.full(arguments["lbg"].shape, np.nan)
     word = f"Invalid_Number_Detected: {last_line(error)}"
-    return Outcome(arguments["x0"], np.nan, rows, rows, False, word, 0, 0.0)
+    return Outcome(arguments["x0"], np.nan, rows, rows, False, word, 0, 0.0, False, KINDS[solver.class_name()])
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:

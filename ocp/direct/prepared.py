@@ -8,20 +8,30 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
 
-from ocp.console import INTERRUPTED, OUT_OF_TIME, interruptible, limited
+from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Watch, interruptible, limited
 from ocp.curves import PiecewisePolynomial
-from ocp.direct.assembly import assemble
+from ocp.direct.assembly import Program, assemble
 from ocp.direct.compiled import Blocks, stop_compiling
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
+from ocp.direct.kkt import curves_upwards
 from ocp.direct.known import Known
-from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
+from ocp.direct.native import NativeSolver, why_not
+from ocp.direct.nlp import (
+    DEFAULTS,
+    SOLVERS,
+    Outcome,
+    broken_down,
+    build_solver,
+    call_solver,
+    largest_number_of_iterations,
+)
 from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.direct.starts import ELASTIC, GUESS, other_starts
 from ocp.errors import (
@@ -44,6 +54,7 @@ from ocp.solution import ByName, Guess, Solution
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
+COMMON = ("tol", "max_iter", "print_level")  # options that all solvers but sleqp take
 MOST_ELSEWHERE = 200  # iterations from each other start
 
 
@@ -166,8 +177,8 @@ class Prepared:
     """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
-        formulation, fragment, program: What was built. scaled: The program as it is solved, see
-            :func:`ocp.direct.scaling.scaled_program`.
+        formulation, fragment, program: What was built.
+        solver_name: The solver, ``ipopt`` where ``native`` was asked for and cannot be had.
         seconds: Wall time of the build.
     """
 
@@ -181,28 +192,54 @@ class Prepared:
         scaling: bool = True,
     ) -> None:
         began = time.monotonic()
-        self.problem, self.method, self.solver_name = problem, method, solver
+        self.problem, self.method = problem, method
         self.formulation = Formulation.of(problem)
         checked_choice("solver", solver, SOLVERS)
-        self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
-        self._own_options, self._scaling = checked_mapping("options", options), scaling
+        self.solver_name, self.fragment = transcribed(self.formulation, method, solver)
+        own = checked_mapping("options", options)
+        if self.solver_name != solver:
+            own = {name: value for name, value in own.items() if name in COMMON}
+        self._own_options, self._scaling = own, scaling
         # sleqp asks for products with the Hessian, which compiled functions do not have
         self._blocks = Blocks(self.fragment, compiled if solver != "sleqp" else False)
         self._build()
-        self._most = largest_number_of_iterations(solver, self._own_options)
-        self._made_of = problem, method, solver, self._own_options, compiled, scaling
+        self._most = largest_number_of_iterations(self.solver_name, own)
+        self._made_of = problem, method, solver, options, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
 
     def _build(self) -> None:
         """The program and its solver, of the functions of the blocks that are at hand."""
         form, fragment = self.formulation, self.fragment
+        for made_of_others in ("scaled", "_ipopt"):
+            self.__dict__.pop(made_of_others, None)
         self.program = assemble(fragment, form.np, self._blocks.functions)
-        self.scaled = scaled_program(self.program)
-        how = self.solver_name, self._own_options, fragment.stages, self.problem.name
-        self._solver, self._progress = build_solver(self.scaled, *how)
+        self._solver, self._progress = self._built_solver(self.solver_name, self._own_options)
         self._pattern = Pattern(form, fragment, self.program)
         self._known = Known(form, fragment, self.program)
+
+    @cached_property
+    def scaled(self) -> Program:
+        """The program as it is solved, see :func:`ocp.direct.scaling.scaled_program`."""
+        return scaled_program(self.program)
+
+    @property
+    def second(self) -> str:
+        """The solver that goes on where the first one fails."""
+        return "ipopt" if self.solver_name == "native" else self.solver_name
+
+    @cached_property
+    def _ipopt(self) -> tuple[Any, Any]:
+        """The second solver, for the same start."""
+        return self._built_solver(self.second, {k: v for k, v in self._own_options.items() if k in COMMON})
+
+    def _built_solver(self, solver: str, options: dict[str, Any]) -> tuple[Any, Any]:
+        """A solver, and what ends it where it must end."""
+        fragment, title = self.fragment, self.problem.name
+        if solver != "native":
+            return build_solver(self.scaled, solver, options, fragment.stages, title)
+        watch, own = Watch(fragment.size, title), {**DEFAULTS["native"], **options}
+        return NativeSolver(self.formulation, fragment, self._blocks.functions, own, watch), watch
 
     def __reduce__(self) -> Any:
         """Pickled and copied as what it was prepared of, to be prepared again."""
@@ -252,6 +289,8 @@ class Prepared:
         point = initial_point(form, fragment, guess, bounds)
         told = names_told(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
+        if self.solver_name == "native":
+            first = self._confirmed(first, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
         attempts, left = [first], self._most
@@ -291,10 +330,21 @@ class Prepared:
             self._badness(told_of, bounds),
         ) from told_of.error
 
+    def _confirmed(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> Attempt:
+        """What native found; where it missed its tolerance or failed, what ipopt finds from the same start."""
+        outcome = first.outcome
+        out_of_time = outcome.status.startswith(OUT_OF_TIME)
+        asked = "max_iter" in self._own_options and outcome.status.startswith("Maximum_Iterations_Exceeded")
+        if outcome.status == "Solve_Succeeded":
+            return first.with_curvature(not curves_upwards(self.program, outcome, first.arguments, first.scales))
+        if out_of_time or asked:
+            return first
+        second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
+        return second if second.found is not None or first.found is None else first
+
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
-        options = {**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)}
-        return build_solver(self.scaled, self.solver_name, options, self.fragment.stages, self.problem.name)
+        return self._built_solver(self.second, {**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)})
 
     def _attempt(
         self,
@@ -320,12 +370,12 @@ class Prepared:
                 scales = dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         relaxed = self._known.relaxed(arguments)
         own = scales.inside(relaxed)
+        run, progress = solver or (self._solver, self._progress)
         try:
-            run, progress = solver or (self._solver, self._progress)
             progress.meanwhile = partial(self._blocks.working, time.monotonic())
             outcome = call_solver(run, progress, own)
         except RuntimeError as error:
-            outcome = broken_down(own, error)
+            outcome = broken_down(run, own, error)
         self._blocks.worked(outcome.seconds)
         outcome = scales.outside(outcome)
         outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
@@ -366,7 +416,7 @@ class Prepared:
         return Solution(
             name=form.name,
             method={"type": type(self.method).__name__, **settings},
-            solver=self.solver_name,
+            solver=outcome.solver,
             success=outcome.success,
             status=outcome.status,
             cost=outcome.cost,
@@ -457,6 +507,12 @@ class Attempt:
         """Whether no other start is to be tried: it succeeded, or there is no time left."""
         return self.found is not None or self.outcome.status.startswith(OUT_OF_TIME)
 
+    def with_curvature(self, regularised: bool) -> Attempt:
+        """The same, and whether the cost does not curve upwards there."""
+        outcome = dataclasses.replace(self.outcome, regularised=regularised)
+        found = None if self.solution is None else dataclasses.replace(self.solution, regularised=regularised)
+        return dataclasses.replace(self, outcome=outcome, solution=found)
+
     @property
     def is_broken(self) -> bool:
         """Whether a function was not finite, or an integrator broke down."""
@@ -465,6 +521,20 @@ class Attempt:
     def __str__(self) -> str:
         word = self.outcome.status.partition(":")[0]
         return f"from the {self.start}: {word} after {self.outcome.iterations} iterations"
+
+
+def transcribed(form: Formulation, method: DirectMethod, solver: str) -> tuple[str, Fragment]:
+    """The program of a problem for a solver, and the solver: ``ipopt`` where ``native`` cannot be had, told once."""
+    if solver != "native":
+        return solver, method.transcribe(form, staged=solver == "fatrop")
+    why = why_not()
+    if not why:
+        try:
+            return solver, method.transcribe(form, staged=True)
+        except ProblemError as error:
+            why = str(error)
+    LOG.info("problem %r is solved by ipopt, not by native: %s", form.name, why)
+    return "ipopt", method.transcribe(form)
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

@@ -1,0 +1,102 @@
+"""The conditions of first order at an optimum as a linear system: which limits push, and does the cost curve upwards.
+
+Nocedal, Wright 2006, Numerical Optimization, chapters 12 and 16.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ocp.direct.assembly import Program
+from ocp.direct.nlp import Outcome
+from ocp.direct.scaling import Scales
+
+__all__ = ["Conditions", "curves_upwards"]
+
+PUSHES = 1e-8
+"""Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
+PRICES = (1e3, 1e6)
+"""Of what misses the constraints, against the largest curvature, where it is asked whether the rest curves upwards."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """First and second derivatives of a program at a plan, in units of the solver.
+
+    Attributes:
+        hessian: Of the Lagrangian, both halves. Shape (n, n). jacobian: Of the rows. Shape (m, n).
+        of_bounds: Multipliers of the bounds of the variables (n,). of_rows: Of the rows (m,).
+        held, fixed: Which rows and which variables stand at a limit that pushes, or are given.
+    """
+
+    hessian: sp.csc_array
+    jacobian: sp.csr_array
+    of_bounds: np.ndarray
+    of_rows: np.ndarray
+    held: np.ndarray
+    fixed: np.ndarray
+
+
+def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
+    """The conditions at what a solver found under these arguments (p and bounds)."""
+    v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
+    a, b, c = scales.variables, scales.rows, scales.cost
+    slope = np.asarray(program.gradient(v, p)[1].full()).ravel() * a / c
+    jacobian = sp.diags_array(1 / b) @ matrix(program.jacobian(v, p)[1]) @ sp.diags_array(a)
+    half = sp.diags_array(a / c) @ matrix(program.hessian(v, p, 1.0, lam)) @ sp.diags_array(a)
+    hessian = half + sp.triu(half, 1).T
+    of_rows = lam * b / c
+    of_bounds = -(slope + jacobian.T @ of_rows)
+    held = at_limit(outcome.rows / b, arguments["lbg"] / b, arguments["ubg"] / b, of_rows)
+    fixed = at_limit(v / a, arguments["lbx"] / a, arguments["ubx"] / a, of_bounds)
+    return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
+
+
+def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:
+    """Which values are given, or held by a limit that pushes more than it is away."""
+    with np.errstate(invalid="ignore"):
+        below = (push < -PUSHES) & (value - lower < -push)
+        above = (push > PUSHES) & (upper - value < push)
+    return np.asarray((lower == upper) | below | above)
+
+
+def curves_upwards(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> bool:
+    """Whether the cost curves upwards along all that the limits at which a plan stands leave free.
+
+    That is so exactly if the Hessian is positive definite once missing these limits costs enough (Finsler). No is said
+    too where it is so only at a price beyond what rounding allows.
+    """
+    at = conditions(program, outcome, arguments, scales)
+    largest = max(float(np.abs(at.hessian.data).max(initial=0.0)), np.finfo(float).tiny)
+    if not np.all(np.isfinite(at.hessian.data)) or not np.all(np.isfinite(at.jacobian.data)):
+        return False
+    free = np.flatnonzero(~at.fixed)
+    rows = at.jacobian[np.flatnonzero(at.held)][:, free]
+    size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+    rows = sp.diags_array(1 / np.where(size > 0, size, 1.0)) @ rows
+    missing, own = sp.coo_array(rows.T @ rows), sp.coo_array(at.hessian[free][:, free] / largest)
+    return any(positive_definite(sp.coo_array(own + price * missing)) for price in PRICES)
+
+
+def positive_definite(symmetric: sp.coo_array) -> bool:
+    """Whether a banded matrix is."""
+    below = symmetric.row >= symmetric.col
+    row, column, value = symmetric.row[below], symmetric.col[below], symmetric.data[below]
+    band = np.zeros((int((row - column).max(initial=0)) + 1, symmetric.shape[0]))
+    band[row - column, column] = value
+    try:
+        la.cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
+    except la.LinAlgError:
+        return False
+    return True
+
+
+def matrix(found: ca.DM) -> sp.csc_array:
+    """A matrix of casadi as one of scipy."""
+    pattern = found.sparsity()
+    return sp.csc_array((np.array(found.nonzeros()), pattern.row(), pattern.colind()), shape=found.shape)

@@ -1,0 +1,329 @@
+"""Fatrop through its own C interface: the optimum of ipopt with its multipliers, by tables that state the program."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
+from ocp.direct import native
+from ocp.direct.kkt import conditions
+from ocp.direct.nlp import Outcome
+from ocp.direct.prepared import Prepared
+from ocp.direct.scaling import unscaled
+from tests.ocp.direct.test_nlp import INTERRUPTED, obstacle, run, soft_lander, too_far
+from tests.ocp.problems import METHODS, SWING, Method, energy, relative, swing, van_der_pol
+
+FINE: dict[str, Method] = {
+    "radau": Collocation(10),
+    "radau-held": Collocation(10, 2, control="held"),
+    "legendre": Collocation(10, scheme="legendre"),
+    "rk4-held": MultipleShooting(12, steps=2),
+    "rk4-linear": MultipleShooting(12, steps=2, control="linear"),
+}
+
+
+def moved() -> Problem:
+    """Bounds, an end and a horizon that are parameters; a cost of the end."""
+    problem = Problem("moved")
+    x, v = problem.state("x", initial=0.0), problem.state("v", initial=0.0, upper=problem.parameter("fastest"))
+    u = problem.control("u", lower=-problem.parameter("strength"), upper=2.0)
+    problem.dynamics(x, v)
+    problem.dynamics(v, u - 0.3 * v * ca.fabs(v) - ca.sin(x))
+    problem.horizon(problem.parameter("duration"))
+    way = problem.parameter("way")
+    problem.end("there", x, way, way)
+    problem.path("power", u * v, upper=0.8)
+    problem.minimize(running=u**2, terminal=v**2)
+    return problem
+
+
+MOVED = {"fastest": 0.75, "strength": 1.0, "duration": 3.0, "way": 1.4}
+PROBLEMS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "lander": (soft_lander, {}),
+    "obstacle": (obstacle, {}),
+    "swing": (swing, SWING),
+    "moved": (moved, MOVED),
+    "van der pol": (van_der_pol, {}),
+    "energy": (lambda: energy(lower=-5.0, upper=5.0), {}),
+}
+every_problem = pytest.mark.parametrize("name", PROBLEMS)
+every_method = pytest.mark.parametrize("method", FINE)
+
+
+def built(problem: Problem, method: Method, **options: Any) -> Prepared:
+    prepared = prepare(problem, method, solver="native", **options)
+    assert isinstance(prepared, Prepared)
+    return prepared
+
+
+# ---- the optimum -------------------------------------------------------------------------------------------------
+
+
+@every_problem
+@every_method
+def test_the_optimum_and_its_multipliers_are_those_of_ipopt(name: str, method: str) -> None:
+    problem, parameters = PROBLEMS[name]
+    a, b = (solve(problem(), FINE[method], solver=s, parameters=parameters) for s in ("ipopt", "native"))
+    # with Legendre's points the obstacle leaves fatrop 1e-9 short of its tolerance, at the optimum all the same
+    assert b.solver == ("ipopt" if (name, method) == ("obstacle", "legendre") else "native")
+    assert b.cost == pytest.approx(a.cost, rel=1e-9, abs=1e-9)
+    assert b.horizon == pytest.approx(a.horizon, rel=1e-7)
+    for pool in ("states", "controls", "costates", "cost_gradients"):
+        for entry, values in getattr(a, pool).items():
+            assert relative(getattr(b, pool)[entry], values) < 1e-5, f"{pool} {entry}"
+
+
+@every_problem
+@every_method
+def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, method: str) -> None:
+    """Against the derivatives that other solvers are given: no table of stages is in between."""
+    problem, parameters = PROBLEMS[name]
+    prepared = built(problem(), FINE[method])
+    plan = prepared.solve(parameters)
+    form, fragment = prepared.formulation, prepared.fragment
+    p = form.parameter_vector(parameters)
+    low, high = form.bound_values(p)
+    arguments = {"p": p}
+    for kind, index in (("x", fragment.variable_bounds), ("g", fragment.row_bounds)):
+        arguments |= {f"lb{kind}": low[index], f"ub{kind}": high[index]}
+    rows = np.asarray(prepared.program.values(plan.variables, p)[1].full()).ravel()
+    outcome = Outcome(plan.variables, plan.cost, rows, plan.multipliers, True, "", 0, 0.0)
+    at = conditions(prepared.program, outcome, arguments, unscaled(fragment))
+    for value, push, lower, upper in (
+        (plan.variables, at.of_bounds, arguments["lbx"], arguments["ubx"]),
+        (rows, at.of_rows, arguments["lbg"], arguments["ubg"]),
+    ):
+        assert np.all(value >= lower - 1e-9)
+        assert np.all(value <= upper + 1e-9)
+        given = lower == upper
+        # what pushes stands at its limit, and at the right one
+        assert np.all(np.maximum(push, 0)[~given] * np.minimum(1.0, (upper - value)[~given]) < 1e-8)
+        assert np.all(np.maximum(-push, 0)[~given] * np.minimum(1.0, (value - lower)[~given]) < 1e-8)
+
+
+@pytest.mark.parametrize("name", ["lander", "swing", "moved"])
+def test_plans_pass_their_audit(name: str) -> None:
+    problem, parameters = PROBLEMS[name]
+    method = Collocation(40, control="held") if name == "lander" else Collocation(24)
+    by = {s: solve(problem(), method, parameters=parameters, solver=s) for s in ("ipopt", "native")}
+    assert by["native"].solver == "native"
+    audits = {s: plan.audit() for s, plan in by.items()}
+    assert audits["native"].passed == audits["ipopt"].passed
+    assert audits["native"].feasible == audits["ipopt"].feasible
+
+
+@pytest.mark.parametrize("method", ["cvodes-held", "points"])
+def test_functions_that_are_no_expressions_are_solved(method: str) -> None:
+    transcription = MultipleShooting(3, integrator="cvodes") if method == "cvodes-held" else Collocation(5, 9)
+    a, b = (solve(van_der_pol(), transcription, solver=s) for s in ("ipopt", "native"))
+    assert b.solver == "native"
+    assert b.cost == pytest.approx(a.cost, rel=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_copies_are_no_variables_where_one_row_defines_them(method: str) -> None:
+    """Only what integrates at the end of its interval keeps a copy there: Radau's last point."""
+    prepared = built(van_der_pol(), METHODS[method])
+    tables = prepared._solver.tables
+    copies = len(prepared.fragment.variable_role) - tables.first[-1]
+    intervals = METHODS[method].intervals
+    assert copies == (0 if "radau" in method else 2 * intervals)
+
+
+def test_units_of_states_controls_and_cost_do_not_matter() -> None:
+    rng = np.random.default_rng(0)
+    for scale, strength, price in 10.0 ** rng.uniform(-5, 5, (6, 3)):
+        problem = Problem("in units")
+        q, w = problem.state("q", initial=0.0, terminal=scale), problem.state("w", initial=0.0, terminal=0.0)
+        u = problem.control("u", lower=-5 * strength, upper=5 * strength)
+        problem.dynamics(q, w)
+        problem.dynamics(w, u * scale / strength)
+        problem.horizon(1.0)
+        problem.minimize(running=price * (u / strength) ** 2)
+        a, b = (solve(problem, Collocation(8), solver=s) for s in ("ipopt", "native"))
+        assert b.cost == pytest.approx(a.cost, rel=1e-7)
+        assert relative(b.costates["q"], a.costates["q"]) < 1e-5
+
+
+def test_other_parameters_may_make_equalities_of_limits() -> None:
+    """A control that a parameter pins down, and one that it lets go again: each has a solver of its own."""
+    problem = Problem("pinned")
+    x = problem.state("x", initial=1.0)
+    reach = problem.parameter("reach")
+    u = problem.control("u", 2, lower=ca.vertcat(-1.0, -reach), upper=ca.vertcat(1.0, reach))
+    problem.dynamics(x, u[0] + u[1])
+    problem.horizon(1.0)
+    problem.minimize(running=x**2 + 0.1 * ca.sumsqr(u))
+    prepared, other = built(problem, Collocation(6)), prepare(problem, Collocation(6))
+    for value in (0.0, 0.5, 0.0, 50.0, 0.5):
+        found = prepared.solve({"reach": value})
+        assert found.solver == "native"
+        assert found.cost == pytest.approx(other.solve({"reach": value}).cost, rel=1e-9)
+        if value == 0.0:
+            np.testing.assert_allclose(found["u"][:, 1], 0.0, atol=1e-12)
+
+
+# ---- where it cannot ---------------------------------------------------------------------------------------------
+
+
+def test_ipopt_takes_over_by_name_where_controls_at_the_end_are_tied() -> None:
+    method = FINE["rk4-held"]
+    plan = solve(swing(control_ties=True), method, solver="native", parameters=SWING)
+    assert plan.solver == "ipopt"
+    assert plan.cost == pytest.approx(solve(swing(control_ties=True), method, parameters=SWING).cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("compiler", ["false", "no-such-compiler"])
+def test_ipopt_takes_over_by_name_without_a_compiler(
+    compiler: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", compiler)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.library.cache_clear()
+    try:
+        prepared = built(van_der_pol(), Collocation(5), options={"tol": 1e-9})
+        assert prepared.solver_name == "ipopt"
+        assert prepared.solve().solver == "ipopt"
+    finally:
+        monkeypatch.undo()
+        native.library.cache_clear()
+
+
+def test_ipopt_takes_over_by_name_where_the_tolerance_is_missed() -> None:
+    """The ceiling of Bryson-Denham: its contact on the nodes leaves no freedom, and its bound does not push there."""
+    problem = Problem("Bryson-Denham")
+    x, v = problem.state("x", initial=0.0, terminal=0.0, upper=1 / 9), problem.state("v", initial=1.0, terminal=-1.0)
+    u = problem.control("u")
+    problem.dynamics(x, v)
+    problem.dynamics(v, u)
+    problem.horizon(1.0)
+    problem.minimize(running=u**2 / 2)
+    plan = solve(problem, Collocation(12), solver="native")
+    assert plan.solver == "ipopt"
+    assert plan.cost == pytest.approx(4.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("method", ["radau", "rk4-held"])
+def test_infeasible_problems_are_refused_as_by_ipopt(method: str) -> None:
+    told = {}
+    for solver in ("ipopt", "native"):
+        with pytest.raises(SolveError) as caught:
+            solve(too_far(), METHODS[method], solver=solver)
+        told[solver] = caught.value
+    assert "problem 'too far': ipopt ended with " in str(told["native"])
+    names = {s: [(c.label, round(c.amount, 5)) for c in error.conflicts] for s, error in told.items()}
+    assert names["native"] == names["ipopt"]
+    assert names["native"]
+
+
+def test_functions_that_are_not_finite_are_told() -> None:
+    """In a process of its own, because fatrop loops for ever on what is not a number."""
+    code = """
+    from ocp import Collocation, SolveError, solve
+    from tests.ocp.direct.test_nlp import rooted
+    try:
+        solve(rooted(), Collocation(3), solver="native")
+    except SolveError as error:
+        print("told:", error)
+    """
+    done = run(code, timeout=30)
+    assert "told: problem 'rooted'" in done.stdout, done.stderr
+
+
+def test_a_stationary_plan_that_is_no_minimum_is_left() -> None:
+    """x'' = x + u from rest at 0, max x(T)^2: to stay at rest is stationary, and the worst there is."""
+    problem = Problem("hilltop")
+    x, v = problem.state("x", initial=0.0), problem.state("v", initial=0.0)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, v)
+    problem.dynamics(v, x + u)
+    problem.horizon(2.0)
+    problem.minimize(terminal=-(x**2))
+    plan = solve(problem, Collocation(10), solver="native")
+    assert plan.start == "downhill"
+    assert plan.cost == pytest.approx(-((np.cosh(2.0) - 1) ** 2), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "options", [{"max_itr": 5}, {"max_iter": "many"}, {1: 2}, {"max_iter": 2.5}, {"tol": np.nan}, {"tol": None}]
+)
+def test_options_that_it_does_not_take_are_named(options: Any) -> None:
+    with pytest.raises(ProblemError, match="native does not take this option"):
+        solve(energy(), Collocation(2), solver="native", options=options)
+
+
+# ---- to be stopped -----------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_stops_a_solve_and_carries_the_last_iterate() -> None:
+    # with check, what is interrupted may be ipopt's build
+    done = run(f"SOLVER = 'native'\n{INTERRUPTED.replace('(False, True)', '(False, False)')}")
+    assert done.stdout.splitlines() == [
+        "False User_Requested_Stop: interrupted (2401, 2)",
+        "restored True",
+        "False User_Requested_Stop: interrupted (2401, 2)",
+        "restored True",
+        "afterwards True",
+        "Ctrl-C works as before",
+    ], done.stdout + done.stderr
+
+
+def test_a_time_limit_stops_a_solve() -> None:
+    prepared = built(van_der_pol(), Collocation(300, 4))
+    began = time.monotonic()
+    with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded"):
+        prepared.solve(time_limit=0.01)
+    assert time.monotonic() - began < 5
+    assert prepared.solve().solver == "native"
+
+
+def test_options_reach_it() -> None:
+    plan = solve(van_der_pol(), Collocation(5), solver="native", options={"max_iter": 2}, check=False)
+    assert not plan.success
+    assert plan.status.startswith("Maximum_Iterations_Exceeded")
+    assert plan.solver == "native"
+    assert plan.iterations <= 3
+
+
+def test_two_threads_solve_at_once() -> None:
+    prepared = [built(van_der_pol(), Collocation(n)) for n in (20, 30)]
+    expected = [one.solve().cost for one in prepared]
+    found: list[list[float]] = [[], []]
+
+    def work(i: int) -> None:
+        for _ in range(10):
+            found[i].append(built(van_der_pol(), Collocation((20, 30)[i])).solve().cost)
+            found[i].append(prepared[i].solve().cost)
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [set(costs) for costs in found] == [{cost} for cost in expected]
+
+
+def test_memory_is_given_back() -> None:
+    """Solvers that are thrown away take their memory in C with them."""
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    def work(n: int) -> None:
+        for _ in range(n):
+            prepared._solver._handles.clear()
+            prepared.solve()
+
+    prepared = built(van_der_pol(), Collocation(100))
+    work(5)
+    before = resident()
+    work(20)
+    assert resident() - before < 20e6  # one of them has 4e6
