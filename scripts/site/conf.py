@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "scripts.site.executed",
     "scripts.site.formulas",
+    "scripts.site.numbers",
     "scripts.site.docstrings",
 ]
 root_doc = "index"

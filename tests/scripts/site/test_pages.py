@@ -12,8 +12,10 @@ from xml.etree import ElementTree
 import pytest
 from latex2mathml.converter import convert
 
+from scripts.papers.reproduced import read
 from scripts.site.docstrings import prepared
 from scripts.site.executed import blocks, executed
+from scripts.site.numbers import MARK, listed
 
 SITE = Path(__file__).resolve().parents[3] / "scripts" / "site"
 PAGES = sorted(SITE.rglob("*.md"))
@@ -115,3 +117,19 @@ def test_docstrings_mean_nothing_but_what_they_say() -> None:
     assert told[0] == "Half \\|v\\|^2, `a|b` and ``c*d``, x\\_ \\* y."
     assert told[2:6] == ["::", "", "    q = |a| * b", "    + c*"]
     assert told[-1] == "    n: \\|n\\| of `a_`."
+
+
+def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None:
+    found, _ = read(SITE.parents[1] / "results")
+    told = listed(found)
+    assert f"**{sum(one.reproduced for one in found)} of {len(found)} numbers" in told
+    for paper, part in zip(dict.fromkeys(one.paper for one in found), told.split("### ")[1:], strict=True):
+        assert part.startswith(f"{paper}\n")
+        for one in (one for one in found if one.paper == paper):
+            (line,) = (line for line in part.splitlines() if f"| {one.place} | {one.quantity} |" in line)
+            if one.reproduced:
+                assert line.endswith("| yes |")
+            else:
+                number = int(line.partition("no (")[2].partition(")")[0])
+                assert f"\n{number}. {one.why}.\n" in part
+    assert sum(MARK in page.read_text(encoding="utf-8") for page in PAGES) == 1
