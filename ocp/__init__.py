@@ -23,7 +23,7 @@ from ocp.planning import Candidate, DeadEnd, Plan, WaypointPlan, plan, plan_wayp
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
-from ocp.solution import Solution
+from ocp.solution import Sensitivity, Solution
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
@@ -55,6 +55,7 @@ __all__ = [
     "Problem",
     "ProblemError",
     "RefinementWarning",
+    "Sensitivity",
     "Solution",
     "SolveError",
     "Stabiliser",

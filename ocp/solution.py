@@ -25,6 +25,7 @@ __all__ = [
     "Guess",
     "Refinement",
     "Sample",
+    "Sensitivity",
     "Solution",
     "check_belongs",
     "check_structure",
@@ -85,6 +86,48 @@ class Refinement:
     errors: dict[str, tuple[float, ...]]
     tolerance: float
     reached: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """How a plan moves with a parameter of k entries, to first order.
+
+    Attributes:
+        name, value: Of the parameter, (k,).
+        t: The reported times, s. Shape (M,).
+        states, controls: Derivatives in the entries of the parameter, at fixed fractions of the horizon. (M, n, k).
+        horizon, cost: Derivatives of the horizon, s, and of the optimal cost. Shape (k,) each.
+        lower, upper: Between which values of an entry, the others held, the same limits push and all others hold, to
+            first order; infinite where nothing ends it. Shape (k,) each.
+        limits: For each entry what ends this below and above, "" where nothing does.
+    """
+
+    name: str
+    value: np.ndarray
+    t: np.ndarray
+    states: dict[str, np.ndarray]
+    controls: dict[str, np.ndarray]
+    horizon: np.ndarray
+    cost: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    limits: tuple[tuple[str, str], ...]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Derivative of a state or control at the reported times. Shape (M, n, k)."""
+        return by_name("state or control", name, {**self.states, **self.controls})
+
+    def __str__(self) -> str:
+        """The valid range of each entry, a line each."""
+        lines = []
+        for k, (below, above) in enumerate(self.limits):
+            entry = self.name if len(self.value) == 1 else f"{self.name}[{k}]"
+            why = "; ".join(f"{word} {what}" for word, what in (("below", below), ("above", above)) if what)
+            lines.append(
+                f"{entry} = {self.value[k]:.6g}: the same limits push from {self.lower[k]:.6g} to {self.upper[k]:.6g}"
+                + (f" ({why})" if why else "")
+            )
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +251,21 @@ class Solution:
     def costate(self, name: str) -> np.ndarray:
         """Costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""
         return by_name("state", name, self.costates)
+
+    @interruptible
+    def sensitivity(self, name: str) -> Sensitivity:
+        """How this plan moves with a parameter, to first order, and from which to which value that is so.
+
+        One linear system in the derivatives of variables and multipliers, with the limits that push held; for plans of
+        direct methods. See :mod:`ocp.direct.sensitivity`.
+
+        Raises:
+            ProblemError: An unknown parameter; no optimum of a direct method under the bounds of its problem; or limits
+                that contradict each other when the parameter moves.
+        """
+        from ocp.direct.sensitivity import sensitivity
+
+        return sensitivity(self, name)
 
     def cost_gradient(self, name: str) -> np.ndarray:
         """Derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""

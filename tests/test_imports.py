@@ -49,10 +49,11 @@ FLOORS = {
 SEES_MODELS = {"tasks", "local", "builders", "planning", "batch", "files", "app"}
 LAZY = {
     ("ocp.solution", "ocp.audit.audit"),
+    ("ocp.solution", "ocp.direct.sensitivity"),
     ("ocp.solution", "ocp.app.plots"),
     ("ocp.planning.motion", "ocp.app.plots"),
 }
-"""Imports that go up, when `Solution.audit`, or `plot` of a solution or a plan, is called."""
+"""Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
 SEEN_BY_ALL = {"models.cache"}
 """What all of ocp may import of models: it knows no machine."""
 FOREIGN = {"models": {"casadi", "numpy"}}
