@@ -82,7 +82,11 @@ def kept_library(key: str) -> Path | None:
     One that is damaged, or belongs to somebody else, is none; damaged ones are removed.
     """
     with suppress(*UNREADABLE):
-        for file in folder().glob(f"{key}.*.so"):
+        place = folder()
+        for name in os.listdir(place):
+            if not (name.startswith(key) and name.endswith(".so")):
+                continue
+            file = place / name
             with suppress(*UNREADABLE):
                 if file.stat().st_uid not in (0, os.geteuid()):
                     continue  # it would be run

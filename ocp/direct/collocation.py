@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ocp.curves import PiecewisePolynomial, differentiation_matrix, lagrange, quadrature_weights
-from ocp.direct.fragment import Block, Fragment
+from ocp.curves import differentiation_matrix, lagrange, quadrature_weights
+from ocp.direct.fragment import Block, Fragment, Interpolants
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
 from ocp.errors import checked_choice
@@ -154,10 +154,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
         at_nodes = np.full((n, 1), -1.0)
         costate_scale = np.concatenate([np.hstack([at_nodes, scale]).ravel(), [-1.0]])
 
-    def interpolants(
-        values: np.ndarray, parameters: np.ndarray, horizon: float
-    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        return (PiecewisePolynomial(mesh, nodes, values[states]), PiecewisePolynomial(mesh, samples, values[controls]))
-
+    by_point, by_sample = states.reshape(n, -1).T, controls.reshape(n, -1).T
+    interpolants = Interpolants(mesh, nodes, by_point, mesh, samples, by_sample, np.zeros((0, n)))
     costate_nodes = report[0] + (report[1] == 1.0)
     return build.finish(report, report_states, costate_rows, costate_nodes, costate_scale, interpolants)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -30,12 +31,12 @@ from typing import Any
 import casadi as ca
 
 from models import cache
-from ocp.console import LOG, check_time
+from ocp.console import LOG, check_time, quiet
 from ocp.direct import assembly
 from ocp.direct.assembly import Derivatives, derivatives
 from ocp.direct.fragment import Fragment
 
-__all__ = ["Background", "Blocks", "CompilerError", "Library", "built", "code", "kept", "stop_compiling"]
+__all__ = ["Background", "Blocks", "CompilerError", "Library", "built", "code", "generated", "kept", "stop_compiling"]
 
 VERSION = "1"  # of what is made of contents
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
@@ -94,13 +95,29 @@ def code(functions: Iterable[Any], source: str = "") -> str:
     Raises:
         CompilerError: One of them has no C.
     """
-    generator = ca.CodeGenerator("unit.c")
+    return f"{generated(functions, 'unit', header=False)[0]}\n{source}"
+
+
+def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
+    """The texts NAME.c and NAME.h of casadi Functions.
+
+    Raises:
+        CompilerError: One of them has no C.
+    """
+    files = [f"{name}.c", f"{name}.h"] if header else [f"{name}.c"]
     try:
-        for function in functions:
-            generator.add(function)
-        return f"{generator.dump()}\n{source}"
+        with tempfile.TemporaryDirectory() as place, quiet():
+            generator = ca.CodeGenerator(files[0], {"with_header": header})
+            for function in functions:
+                generator.add(function)
+            generator.generate(f"{place}/")
+            texts = [(Path(place) / file).read_text(encoding="utf-8") for file in files]
     except RuntimeError as error:
         raise CompilerError(str(error).strip().splitlines()[-1]) from error
+    if gap := re.search(r"^ *#error (.*)", texts[0], re.MULTILINE):
+        raise CompilerError(gap[1])
+    # where nothing is mapped CasADi adds to a null pointer, which gcc takes for an error from version 14 on
+    return [text.replace("0+ i*0", "0") for text in texts]
 
 
 def kept(library: Library) -> Path | None:

@@ -7,17 +7,15 @@ so building costs the same for 10 intervals and for 1000. Fragments of several p
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 
-__all__ = ["Block", "Fragment", "InterpolantMaker", "Stages", "shifted"]
-
-InterpolantMaker: TypeAlias = Callable[[np.ndarray, np.ndarray, float], tuple[PiecewisePolynomial, PiecewisePolynomial]]
+__all__ = ["Block", "Fragment", "Interpolants", "Stages", "shifted"]
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,49 @@ class Stages:
 
 
 @dataclass(frozen=True)
+class Interpolants:
+    """States and controls over fractions of the horizon, piece by piece, as the variables of a phase make them.
+
+    Attributes:
+        breaks: Where the pieces of the states begin and end, the same number in every interval. Shape (K + 1,).
+        nodes: Places of the values in a piece. Shape (d,).
+        variables: What the states of each interval are made of. Shape (n, N).
+        mesh, control_nodes: The same of the controls, a piece an interval. Shapes (N + 1,), (c,).
+        controls: Values of the controls of each interval, node by node. Shape (c nu, N).
+        data: Constants of each interval. Shape (nd, N).
+        values: casadi Function (v (n), data (nd), T, p) -> values of the states in the pieces of an interval, (nx, .),
+            node by node; None where they are the variables.
+    """
+
+    breaks: np.ndarray
+    nodes: np.ndarray
+    variables: np.ndarray
+    mesh: np.ndarray
+    control_nodes: np.ndarray
+    controls: np.ndarray
+    data: np.ndarray
+    values: Any = None
+
+    def __call__(
+        self, variables: np.ndarray, parameters: np.ndarray, horizon: float
+    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        """The curves of states and controls at the variables of a program."""
+        found = variables[self.variables].T
+        if self.values is not None:
+            inputs = variables[self.variables], self.data, horizon, parameters
+            found = np.asarray(self.mapped(*inputs).full()).T
+        states = found.reshape(len(self.breaks) - 1, len(self.nodes), -1)
+        controls = variables[self.controls].T.reshape(len(self.mesh) - 1, len(self.control_nodes), -1)
+        by_state = PiecewisePolynomial(self.breaks, self.nodes, states)
+        return by_state, PiecewisePolynomial(self.mesh, self.control_nodes, controls)
+
+    @cached_property
+    def mapped(self) -> Any:
+        """``values`` of all intervals side by side."""
+        return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
+
+
+@dataclass(frozen=True)
 class Fragment:
     """The nonlinear program of one phase.
 
@@ -68,7 +109,7 @@ class Fragment:
         costate_rows: Rows whose multipliers are the costates at the reported points; -1 where a point is the node
             that ``costate_nodes`` (M,) names and its costate is what the next intervals say. Shape (M, nx).
         costate_scale: Factor from multiplier to costate. Shape (M,).
-        interpolants: (variables, parameters, horizon) -> interpolants of states and controls over fractions.
+        interpolants: The curves that the variables make.
         stages: Stage structure, where the program is stage-ordered.
     """
 
@@ -91,7 +132,7 @@ class Fragment:
     costate_rows: np.ndarray
     costate_nodes: np.ndarray
     costate_scale: np.ndarray
-    interpolants: InterpolantMaker
+    interpolants: Interpolants
     stages: Stages | None
 
     @property

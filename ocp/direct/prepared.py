@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +19,7 @@ from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Watch, interruptible, lim
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.compiled import Blocks, stop_compiling
+from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
@@ -50,6 +53,7 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
+from ocp.storage import checked_path
 
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
@@ -270,6 +274,29 @@ class Prepared:
                 stop_compiling()
                 raise
 
+    @interruptible
+    def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
+        """Write the problem's functions as C, with a plan and a program of it; see :mod:`ocp.direct.controller`.
+
+        Args:
+            folder: Is made, and returned; files of the same names are replaced.
+            parameters: Values at which the guess is evaluated.
+            guess: As of :meth:`solve`; a solution of this problem prepared, to have its very plan in the C.
+
+        Raises:
+            ProblemError: Wrong arguments, or something of the problem has no C, such as cvodes.
+            OSError: The folder cannot be written.
+        """
+        form, fragment = self.formulation, self.fragment
+        place = Path(checked_path(folder))
+        bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
+        with self._lock:
+            point = initial_point(form, fragment, guess, bounds)
+            if isinstance(guess, Solution) and guess.method == self._told_method:
+                # of this very grid; a layout in stages has more variables than one without
+                point = guess.variables if guess.variables.size == point.size else point
+            return write_controller(form, fragment, point, place)
+
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None
     ) -> Solution:
@@ -396,6 +423,11 @@ class Prepared:
         sizes = sizes_along(self._pattern, x0, attempt.told, bounds, p)
         return badness(self._pattern, x0, p, attempt.scales, sizes)
 
+    @property
+    def _told_method(self) -> dict[str, Any]:
+        settings = {k: v for k, v in dataclasses.asdict(self.method).items() if v is not None}  # type: ignore[call-overload]
+        return {"type": type(self.method).__name__, **settings}
+
     def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
         index = self.fragment.horizon
         return float(self.formulation.horizon_at(p) if index is None else outcome.variables[index])
@@ -412,10 +444,9 @@ class Prepared:
         costates = self._costates(outcome, p)
         by_parameter = self._cost_gradient(outcome, p) if form.np else np.zeros(0)
         x, u = v[fragment.report_states], controls_at(controls, fragment, piece, place)
-        settings = {k: v for k, v in dataclasses.asdict(self.method).items() if v is not None}  # type: ignore[call-overload]
         return Solution(
             name=form.name,
-            method={"type": type(self.method).__name__, **settings},
+            method=self._told_method,
             solver=outcome.solver,
             success=outcome.success,
             status=outcome.status,

@@ -11,8 +11,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.curves import PiecewisePolynomial, integrator, rk4_step
-from ocp.direct.fragment import Block, Fragment
+from ocp.curves import integrator, rk4_step
+from ocp.direct.fragment import Block, Fragment, Interpolants
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
 from ocp.errors import checked_choice
@@ -103,38 +103,12 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fra
     report = (np.concatenate([stages, [n - 1]]), np.concatenate([np.zeros(n), [1.0]]))
     costate_rows = np.vstack([np.full((1, nx), -1), rows.T])
     costate_scale = np.concatenate([[1.0], np.full(n, -1.0)])
-    dense = dense_function(form, method).map(n, "serial")
-
-    def interpolants(
-        values: np.ndarray, parameters: np.ndarray, horizon: float
-    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        everything = np.tile(parameters[:, None], (1, n))
-        inputs = (values[first], values[controls.reshape(-1, n)], data, np.full((1, n), horizon), everything)
-        states, slopes = (np.asarray(out.full()).reshape(nx, n, method.steps + 1) for out in dense(*inputs))
-        return hermite(mesh, states, slopes, horizon), held_or_linear(mesh, values[controls])
-
+    breaks = np.append((mesh[:-1, None] + width[:, None] * np.arange(method.steps) / method.steps).ravel(), 1.0)
+    read, placed = np.vstack([first, *controls]), np.array([0.0, 1.0] if linear else [0.5])
+    dense = dense_function(form, method)
+    interpolants = Interpolants(breaks, THIRDS, read, mesh, placed, np.vstack([*controls]), data, dense)
     nodes = np.arange(n + 1)
     return build.finish(report, lay.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
-
-
-def held_or_linear(mesh: np.ndarray, controls: np.ndarray) -> PiecewisePolynomial:
-    """Controls (1 or 2, nu, n) as a piecewise constant or linear function."""
-    nodes = np.array([0.5]) if len(controls) == 1 else np.array([0.0, 1.0])
-    return PiecewisePolynomial(mesh, nodes, controls.transpose(2, 0, 1))
-
-
-def hermite(mesh: np.ndarray, states: np.ndarray, slopes: np.ndarray, horizon: float) -> PiecewisePolynomial:
-    """Cubic Hermite curves through states and slopes (nx, n, steps + 1), kept as values at thirds."""
-    nx, _, knots = states.shape
-    steps = knots - 1
-    breaks = (mesh[:-1, None] + np.diff(mesh)[:, None] * np.arange(steps) / steps).ravel()
-    breaks = np.concatenate([breaks, [1.0]])
-    h = np.diff(breaks)[:, None, None] * horizon
-    a, b = (states[:, :, i : i + steps].reshape(nx, -1).T[:, None, :] for i in (0, 1))
-    da, db = (slopes[:, :, i : i + steps].reshape(nx, -1).T[:, None, :] * h for i in (0, 1))
-    s = THIRDS[None, :, None]
-    curve = (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * da + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * db
-    return PiecewisePolynomial(breaks, THIRDS, curve)
 
 
 # ---- integration of one interval -----------------------------------------------------------------------------
@@ -207,8 +181,9 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """(x, w, d, T, p) -> states and their derivatives at the ``steps + 1`` knots of an interval, side by side."""
-    x, w, d = ca.MX.sym("x", form.nx), ca.MX.sym("w", controls_of(form, method)), ca.MX.sym("d", 2)
+    """([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval, (nx, .)."""
+    v, d = ca.MX.sym("v", form.nx + controls_of(form, method)), ca.MX.sym("d", 2)
+    x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
     if method.integrator == "cvodes":
         places = (np.arange(1, method.steps + 1) / method.steps).tolist()
@@ -218,9 +193,16 @@ def dense_function(form: Formulation, method: MultipleShooting) -> Any:
         for i in range(method.steps):
             knots.append(step(knots[-1], w, d, i, horizon, p)[0])
     rate = form.function("rate", [form.f], ["f"])
+    h = d[1] * horizon / method.steps
     slopes = []
     for i, state in enumerate(knots):
         place = i / method.steps
         time = (d[0] + d[1] * place) * horizon
-        slopes.append(rate(state, control_at(form, method, w, place), time, horizon, p))
-    return ca.Function("dense", [x, w, d, horizon, p], [ca.horzcat(*knots), ca.horzcat(*slopes)])
+        slopes.append(h * rate(state, control_at(form, method, w, place), time, horizon, p))
+    curves = []
+    for a, b, da, db in zip(knots[:-1], knots[1:], slopes[:-1], slopes[1:], strict=True):
+        for s in THIRDS:
+            curves.append(
+                (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * da + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * db
+            )
+    return ca.Function("dense", [v, d, horizon, p], [ca.horzcat(*curves)])

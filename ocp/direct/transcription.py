@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.direct.fragment import Block, Fragment, InterpolantMaker, Stages
+from ocp.direct.fragment import Block, Fragment, Interpolants, Stages
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 
@@ -288,7 +288,7 @@ class FragmentBuilder:
         costate_rows: np.ndarray,
         costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
-        interpolants: InterpolantMaker,
+        interpolants: Interpolants,
     ) -> Fragment:
         """Number the rows stage by stage and return the fragment."""
         order = np.concatenate(self._order)
