@@ -133,3 +133,18 @@ def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None
                 number = int(line.partition("no (")[2].partition(")")[0])
                 assert f"\n{number}. {one.why}.\n" in part
     assert sum(MARK in page.read_text(encoding="utf-8") for page in PAGES) == 1
+
+
+def test_blocks_that_stand_alone_are_told_from_those_that_go_on() -> None:
+    found = blocks("a\n```python\nx = 1\n```\nb\n```py\nx + 1\n```\n```python3\nno\n```\n")
+    assert [(line, alone) for line, alone, _ in found] == [(3, True), (7, False)]
+    assert [source for _, _, source in found] == ["x = 1\n", "x + 1\n"]
+
+
+def test_of_what_is_long_the_beginning_is_shown() -> None:
+    told = executed("```python\nfor k in range(61):\n    print('line', k)\n```\n", "page")
+    assert "line 59\n... and 1 lines more" in told
+    assert "line 60" not in told
+    told = executed("```python\nfor k in range(60):\n    print('line', k)\n```\n", "page")
+    assert "line 59" in told
+    assert "lines more" not in told
