@@ -149,7 +149,14 @@ def _name(key: str, library: bytes) -> str:
 
 
 def _make_room(newest: Path) -> None:
-    """Remove the libraries that were not used for longest, until the others and the newest are MOST_KEPT at most."""
+    """Remove the libraries that were not used for longest, until the others and the newest are MOST_KEPT at most.
+
+    And the locks of processes that are no more.
+    """
+    for lock in newest.parent.glob("*.lock"):
+        with suppress(OSError), open(lock, "rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while somebody has it
+            lock.unlink()
     found = []
     for file in newest.parent.glob("*.so"):
         with suppress(OSError):

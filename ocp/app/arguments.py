@@ -75,8 +75,9 @@ REPORT = """One HTML file about a plan: the verdict in a sentence, pictures, cur
 It asks nothing from another host."""
 REPORT_EXAMPLES = """examples:
   selfmotion report seam.npz seam.html --title "Seam 4, cell 2\""""
-CACHE = """What is dear to compute and depends on nothing but its input (covers of meshes, pairs that never touch) is
-kept in $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. Cleared, it is computed again."""
+CACHE = """What is dear to compute and depends on nothing but its input (covers of meshes, pairs that never touch, the
+functions of problems as the C compiler made them) is kept in $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion.
+Cleared, it is computed again. Compiled functions take 256 MB at most: those not used for longest make room."""
 CACHE_EXAMPLES = """examples:
   selfmotion cache
   selfmotion cache clear"""
@@ -293,8 +294,15 @@ def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         for file in files:
             file.unlink(missing_ok=True)
     word = "cleared" if options.action == "clear" else "kept"
-    told = {"folder": str(cache.folder()), "files": len(files), "bytes": size, "cleared": options.action == "clear"}
-    return 0, f"{cache.folder()}: {len(files)} files, {size / 1e6:.3g} MB {word}", told
+    told = {
+        "folder": str(cache.folder()),
+        "files": len(files),
+        "libraries": sum(file.suffix == ".so" for file in files),
+        "bytes": size,
+        "cleared": options.action == "clear",
+    }
+    words = f"{len(files)} files, {told['libraries']} of them compiled functions, {size / 1e6:.3g} MB {word}"
+    return 0, f"{cache.folder()}: {words}", told
 
 
 def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:

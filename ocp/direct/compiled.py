@@ -14,7 +14,6 @@ import platform
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -49,11 +48,12 @@ FEW = 10  # instructions of a block, which take as long to call as to do
 SERIALISED = "casadi:"  # before the text of a function
 NICE = 10  # of the compiler in the background
 SECONDS_A_LIBRARY, SECONDS_AN_INSTRUCTION = 0.2, 1.5e-4  # of what the compiler may take, with gcc 12 at -O1
-WATCHED = (
-    'exec 3<&0; "$@" </dev/null 3<&- & work=$!; (read -r _ <&3; rm -rf "$PWD"; kill -9 0) & watch=$!; '
-    "wait $work; status=$?; kill $watch; exit $status"
-)
-"""Shell words that run a command until their input ends, then end it and remove the folder: also where Python dies."""
+WATCHED = """
+exec 3<&0
+(trap "" TERM; read -r _ <&3; kill 0; rm -rf "$PWD"; kill -9 0) &
+exec "$@" </dev/null 3<&-
+"""
+"""Shell words that run a command; when their input ends, as where Python is killed, they end it, its folder too."""
 
 
 class CompilerError(RuntimeError):
@@ -199,22 +199,27 @@ def _compiled(text: str, library: Library, ask: Callable[[], Any], nice: int) ->
         raise CompilerError(f"{len(text)} characters of C are more than {MOST}")
     speed = "-O1" if len(text) <= LARGE else "-O0"
     place = Path(tempfile.mkdtemp(prefix="selfmotion-"))
+    process = None
     try:
         (place / "unit.c").write_text(text, encoding="utf-8")
         include = [f"-I{folder}" for folder in library.include]
         words = [*shlex.split(compiler()[0]), speed, *FLAGS, *include, "unit.c", "-o", "unit.so", *library.link]
-        if _run(words, place, ask, nice):
+        process = begun(words, place, nice)
+        if wait(process, ask):
             told = (place / "words").read_text(errors="replace").strip().splitlines()
             raise CompilerError(f"{words[0]} fails: {told[-1] if told else 'it does not say why'}")
         return (place / "unit.so").read_bytes()
     except OSError as error:  # no room, or no process
         raise CompilerError(f"nothing can be compiled: {error}") from error
     finally:
+        if process is not None and process.stdin is not None:
+            process.stdin.close()
+            process.wait()
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _run(words: list[str], place: Path, ask: Callable[[], Any], nice: int) -> int:
-    """Run a command in a folder, where what it says is kept too; its exit status. It ends where ``ask`` raises."""
+def begun(words: list[str], place: Path, nice: int) -> subprocess.Popen[bytes]:
+    """A command that runs in a folder, where what it says is kept too, until its input is closed."""
     with open(place / "words", "wb") as told:
         process = subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],
@@ -225,19 +230,17 @@ def _run(words: list[str], place: Path, ask: Callable[[], Any], nice: int) -> in
             stderr=told,
             start_new_session=True,
         )
-    try:
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PGRP, process.pid, nice)
-        while True:
-            ask()
-            with suppress(subprocess.TimeoutExpired):
-                return process.wait(0.05)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        assert process.stdin is not None
-        process.stdin.close()
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PGRP, process.pid, nice)
+    return process
+
+
+def wait(process: subprocess.Popen[bytes], ask: Callable[[], Any]) -> int:
+    """The exit status of a process. ``ask`` is called every 50 ms, and may raise."""
+    while True:
+        ask()
+        with suppress(subprocess.TimeoutExpired):
+            return process.wait(0.05)
 
 
 # ---- in the background -------------------------------------------------------------------------------------------

@@ -232,8 +232,7 @@ def test_a_folder_that_may_only_be_read_serves(own: Path, monkeypatch: pytest.Mo
     def refused(*_: Any, **__: Any) -> Any:
         raise PermissionError
 
-    for name in ("utime", "unlink"):
-        monkeypatch.setattr(os, name, refused)
+    monkeypatch.setattr(os, "utime", refused)
     monkeypatch.setattr(cache, "NamedTemporaryFile", refused)
     assert built(number(5)) == library
     assert told(built(number(6))) == 6
@@ -342,8 +341,26 @@ def test_what_is_stopped_leaves_nothing(own: Path, tmp_path: Path, monkeypatch: 
     work.join(2.0)
     assert not work.is_alive()
     assert is_gone(pid)
-    assert list((tmp_path / "temporary").iterdir()) == []
+    assert is_empty(tmp_path / "temporary")
     assert [file.suffix for file in own.iterdir()] == []
+
+
+def test_what_is_done_leaves_nothing(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    work = Background([number(19), number(20)])
+    work.join(20.0)
+    assert [told(path) for path in work.found if isinstance(path, Path)] == [19, 20]
+    assert {file.name for file in tmp_path.iterdir()} == {"cache"}
+    assert [file.suffix for file in own.iterdir()] == [".so", ".so"]
+
+
+def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
+    built(number(21))
+    (own / "left.lock").touch()
+    with cache.alone("taken"):
+        built(number(22))
+        assert {file.name for file in own.glob("*.lock")} == {"taken.lock"}
+    assert not list(own.glob("*.lock"))
 
 
 def test_a_time_limit_ends_the_wait(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,10 +395,7 @@ def test_a_process_that_ends_takes_its_compiler_along(
     process.communicate()
     assert time.monotonic() - began < 3.0
     assert is_gone(pid)
-    deadline = time.monotonic() + 2.0
-    while list((tmp_path / "temporary").iterdir()) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert list((tmp_path / "temporary").iterdir()) == []
+    assert is_empty(tmp_path / "temporary")
     assert kept(number(18)) is None
 
 
@@ -392,6 +406,14 @@ def appears(file: Path) -> int:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     return int(file.read_text())
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder is, or becomes within two seconds, empty."""
+    deadline = time.monotonic() + 2.0
+    while list(folder.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return not list(folder.iterdir())
 
 
 def is_gone(pid: int) -> bool:
