@@ -4,6 +4,7 @@ from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate
 from ocp.builders.clearance import Clear
 from ocp.builders.cts import roll_problem, spline_targets
+from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem, joint_torques
 from ocp.builders.joint_spline import joint_path
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.builders.standing.plan import plan_standing
@@ -40,12 +41,14 @@ __all__ = [
     "Clear",
     "Collocation",
     "DeadEnd",
+    "Effort",
     "Finding",
     "Following",
     "FreeTime",
     "InFoot",
     "IndexAtLeast",
     "Indirect",
+    "JointFriction",
     "Layer",
     "Limits",
     "MultipleShooting",
@@ -64,8 +67,10 @@ __all__ = [
     "WaypointPlan",
     "Weights",
     "certificate",
+    "dynamics_problem",
     "inverse_kinematics",
     "joint_path",
+    "joint_torques",
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan",

@@ -379,7 +379,7 @@ def bounds_of(
         for k, name in enumerate(robot.joint_names):
             limits[k] = by_name.get(name, by_name.get("", limits[k]))
         given[what] = limits
-    return JointBounds(robot.lower, robot.upper, **given)
+    return JointBounds(robot.lower, robot.upper, power=free, **given)
 
 
 def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -> tuple[list[Row], list[Fault]]:

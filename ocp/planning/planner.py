@@ -276,7 +276,7 @@ def _checked(
             words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
-    for what in ("acceleration", "jerk", "torque"):
+    for what in ("acceleration", "jerk", "torque", "power"):
         if getattr(told, what) is not None:
             words = f"limits: least joint velocity knows no {what}; leave it out, and schedule the path under it"
             raise ProblemError(words, name=what, value=getattr(told, what))

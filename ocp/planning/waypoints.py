@@ -146,7 +146,7 @@ def plan_waypoints(
     if not ((heavy >= 0).all() and heavy.any()):
         raise ProblemError(f"weights {heavy.tolist()} must be positive, or 0", name="weights", value=heavy, limit=0.0)
     checked_choice("cost", cost, get_args(WayCost))
-    for what in ("velocity", "acceleration", "jerk", "torque"):
+    for what in ("velocity", "acceleration", "jerk", "torque", "power"):
         if getattr(told, what) is not None and not (what == "velocity" and cost == "time"):
             words = f"limits: a way through waypoints has no time, so no {what}; leave it out, or give a step"
             raise ProblemError(words, name=what, value=getattr(told, what))

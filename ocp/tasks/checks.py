@@ -28,6 +28,7 @@ __all__ = [
     "checked_weights",
     "dependent_rows",
     "ignorable_joints",
+    "rates_at_rest",
 ]
 
 TRACK_SAMPLES = 201
@@ -389,3 +390,29 @@ def _turn(spin: Array, step: float) -> float:
             turn = (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ turn
     axial = np.array([turn[i, j] - turn[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
     return float(np.arctan2(np.linalg.norm(axial) / 2, (np.trace(turn) - 1) / 2))
+
+
+def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
+    """Joint velocities to ask for where a motion ends at rest, nan where free. Shape (n,).
+
+    A tip whose acceleration is prescribed comes to rest by itself, one whose velocity is prescribed too: as many joints
+    as the tasks have such rows then follow the others, and demanding rest of them too would be redundant. Those that
+    move the tip best are left out.
+
+    Args:
+        base, joints: Configuration about there.
+        rows: Which rows of the tasks come to rest by themselves; all if None. Shape (size,).
+    """
+    rest = np.zeros(len(joints))
+    jacobian = np.array(ca.DM(equations.jacobian(ca.DM(base), joints)))
+    if rows is not None:
+        jacobian = jacobian[rows]
+    for _ in range(len(jacobian)):
+        best = int((jacobian**2).sum(axis=0).argmax())
+        length = np.linalg.norm(jacobian[:, best])
+        if length < IGNORABLE:  # singular: the joints left out move the tip all ways that there are
+            break
+        direction = jacobian[:, best] / length
+        jacobian = jacobian - np.outer(direction, direction @ jacobian)
+        rest[best] = np.nan
+    return rest

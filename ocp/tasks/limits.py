@@ -15,11 +15,11 @@ __all__ = ["JointBounds", "Limits"]
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite where there are none. Shape (n,) each, rad or m and seconds, N m or N.
+    """Limits of every joint, infinite where there are none. Shape (n,) each, rad or m and seconds, N m or N, W.
 
     Attributes:
         lower, upper: Of the positions.
-        velocity, acceleration, jerk, torque: The greatest sizes.
+        velocity, acceleration, jerk, torque: The greatest sizes. power: What a drive gives at most.
     """
 
     lower: Array
@@ -28,14 +28,16 @@ class JointBounds(NamedTuple):
     acceleration: Array
     jerk: Array
     torque: Array
+    power: Array
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What joints and ground bear; None means what the robot says, which is nothing of accelerations and jerks.
+    """What joints and ground bear; None means what the robot says, which is nothing of accelerations, jerks and power.
 
     Attributes:
         velocity, acceleration, jerk, torque: Of each joint, or one number for all; inf for no limit.
+        power: What each drive gives at most, W, likewise; braking is free.
         joints: Whether the robot's position limits hold.
         vertical_force: Least vertical force of the ground on a standing machine, N; a tenth of its weight if None.
         friction: Coefficient of friction of the ground.
@@ -48,12 +50,13 @@ class Limits:
     acceleration: Any = None
     jerk: Any = None
     torque: Any = None
+    power: Any = None
     joints: bool = True
     vertical_force: float | None = None
     friction: float = np.inf
 
     def __post_init__(self) -> None:
-        for what in ("velocity", "acceleration", "jerk", "torque"):
+        for what in ("velocity", "acceleration", "jerk", "torque", "power"):
             value = getattr(self, what)
             if value is not None and not (_numbers(value) > 0).all():
                 words = f"limits: {what} must be positive, one number or one for each joint, not {value!r}"
@@ -77,7 +80,7 @@ class Limits:
         """
         robot, n = machine.robot, machine.joint_size
         free = np.full(n, np.inf)
-        given = {"velocity": robot.velocity, "acceleration": free, "jerk": free, "torque": robot.effort}
+        given = {"velocity": robot.velocity, "acceleration": free, "jerk": free, "torque": robot.effort, "power": free}
         for what, own in given.items():
             value = getattr(self, what)
             if value is not None:

@@ -46,8 +46,15 @@ from ocp.builders.standing.start import check_freedom, check_loads, check_slope,
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
 from ocp.problem.problem import Problem
-from ocp.tasks.checks import check_length, check_rest, checked_configuration, checked_horizon, checked_tasks
-from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.checks import (
+    check_length,
+    check_rest,
+    checked_configuration,
+    checked_horizon,
+    checked_tasks,
+    rates_at_rest,
+)
+from ocp.tasks.equations import bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import (
@@ -165,6 +172,9 @@ def standing_problem(
     weights = Weights() if weights is None else checked_instance("standing_problem: weights", weights, Weights)
     limits = Limits() if limits is None else checked_instance("standing_problem: limits", limits, Limits)
     checked_instance("standing_problem: machine", machine, Standing)
+    if limits.power is not None:
+        words = "limits: standing plans know no power; limit the torques"
+        raise ProblemError(words, name="power", value=limits.power)
     checked_choice("control", control, ("acceleration", "jerk"))
     checked_choice("along", along, ("time", "parameter"))
     checked_choice("tip_level", tip_level, ("position", "acceleration"))
@@ -197,7 +207,13 @@ def standing_problem(
 
     problem = Problem("standing plan", symbols=symbols)
     final = _horizon(problem, horizon)
-    resting = None if end == "free" else _rest(equations, guess["joints"].values[-1], tip_level)
+    resting = (
+        None
+        if end == "free"
+        else rates_at_rest(
+            equations, (), guess["joints"].values[-1], ~equations.posed if tip_level == "position" else None
+        )
+    )
     motion, jerks = _motion(problem, machine.robot, bounds, begin, start, resting, end_joints, control, guess)
     joints, velocities, accelerations = motion
     progress: tuple[Any, ...] = (problem.time,)
@@ -288,28 +304,6 @@ def _progress(problem: Problem, start: str, end: str, guess: Mapping[str, Any]) 
     problem.dynamics(at, rate)
     problem.dynamics(rate, push)
     return at, rate, push
-
-
-def _rest(equations: TaskEquations, joints: Array, tip_level: str) -> Array:
-    """Joint velocities at the end, nan where free. Shape (n,).
-
-    A tip whose acceleration is prescribed comes to rest by itself, one whose velocity is prescribed too: as many joints
-    as the tasks have such rows then follow the others, and demanding rest of them too would be redundant. Those that
-    move the tip best are left out.
-    """
-    rest = np.zeros(len(joints))
-    jacobian = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints)))
-    if tip_level == "position":
-        jacobian = jacobian[~equations.posed]
-    for _ in range(len(jacobian)):
-        best = int((jacobian**2).sum(axis=0).argmax())
-        length = np.linalg.norm(jacobian[:, best])
-        if length < 1e-9:  # singular: the joints left out move the tip all ways that there are
-            break
-        direction = jacobian[:, best] / length
-        jacobian = jacobian - np.outer(direction, direction @ jacobian)
-        rest[best] = np.nan
-    return rest
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:

@@ -11,18 +11,22 @@ import pytest
 from models import FixedBase, Link, Standing, planar_chain, rectangle, reference_rig, reference_tunnel
 from ocp import (
     Collocation,
+    Effort,
     Following,
     FreeTime,
     IndexAtLeast,
     Indirect,
     InFoot,
+    JointFriction,
     Layer,
     Limits,
     Pinned,
     Stabiliser,
     TipTask,
     Weights,
+    dynamics_problem,
     inverse_kinematics,
+    joint_torques,
     minimum_velocity_problem,
     plan_minimum_velocity,
     plan_standing,
@@ -158,6 +162,7 @@ TASKS = [
             "acceleration": EACH,
             "jerk": EACH,
             "torque": EACH,
+            "power": EACH,
             "joints": FLAG,
             "vertical_force": POSITIVE,
             "friction": LIMIT | NOTHING,
@@ -401,7 +406,48 @@ ROLLS = [
         },
     ),
 ]
-CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS]
+FRICTION = {"negative": -1.0, "nan": NAN, "inf": INF, "text": "much", "empty": []}
+DYNAMICS = [
+    Case("JointFriction", JointFriction, {}, {"viscous": FRICTION, "coulomb": FRICTION, "slip": POSITIVE}),
+    Case(
+        "Effort",
+        Effort,
+        {"time": 1.0},
+        {
+            "torque": FRICTION,
+            "energy": NONNEGATIVE,
+            "acceleration": NONNEGATIVE,
+            "jerk": NONNEGATIVE,
+            "time": NONNEGATIVE,
+        },
+    ),
+    Case(
+        "dynamics_problem",
+        dynamics_problem,
+        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "end_joints": [0.3, 0.2, 0.1]},
+        {
+            "machine": INSTANCE | {"standing": STANDING},
+            "start_joints": but(array(3), "nan"),
+            "horizon": HORIZON,
+            "end_joints": but(array(3), "nan"),
+            "limits": but(INSTANCE, "None") | {"of two": Limits(torque=[1.0, 2.0]), "jerk": Limits(jerk=1.0)},
+            "effort": but(INSTANCE, "None") | {"of two": Effort(torque=[1.0, 2.0]), "jerk": Effort(jerk=1.0)},
+            "friction": but(INSTANCE, "None") | {"of two": JointFriction([1.0, 2.0])},
+            "control": CHOICE,
+            "start": CHOICE,
+            "end": CHOICE,
+            "clear": but(INSTANCE, "None"),
+            "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "joint_torques",
+        lambda machine: joint_torques(machine, (), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3)),
+        {"machine": ARM},
+        {"machine": INSTANCE | {"standing": STANDING}},
+    ),
+]
+CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS]
 LONG = ("along", "plan_minimum_velocity", "plan_standing")
 
 

@@ -1,0 +1,364 @@
+"""Motions by what drives them: torques, power, accelerations and jerks within limits, at the least effort or time.
+
+For arms on a fixed base and for free-floating ones. Joint accelerations (or jerks) are the control, and the torques are
+those of the inverse dynamics,
+
+    tau = M(q) q'' + h(q, q') - (what acts from outside) + d q' + c tanh(q' / w),
+
+with viscous friction d and Coulomb friction c, smoothed below the speed w. On a floating base the momentum is kept, the
+base moves as the joints make it move, and the torques are those of the joints alone. So no mass matrix is inverted, and
+limits of torque are path constraints like all others (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
+
+A motion goes from point to point, along tasks of the tool, or both; through points on the way and with loads that are
+picked up and put down as :class:`~ocp.problem.phases.Phases` of such problems, whose joints and velocities go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase, FreeFloating, Standing
+from models.arrays import Array
+from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
+from ocp.builders.clearance import Clear
+from ocp.builders.standing.problem import FreeTime
+from ocp.console import interruptible
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_instance, checked_nonnegative, floats
+from ocp.problem.problem import Problem
+from ocp.tasks.checks import (
+    check_length,
+    check_rest,
+    checked_configuration,
+    checked_horizon,
+    checked_tasks,
+    rates_at_rest,
+)
+from ocp.tasks.equations import TaskEquations, bind
+from ocp.tasks.limits import Limits
+from ocp.tasks.tip_task import TipTask
+
+__all__ = ["Effort", "JointFriction", "dynamics_problem", "joint_torques"]
+
+QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+Motors = FixedBase | FreeFloating
+"""Machines that are moved by the torques of their joints alone."""
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Friction in the joints, each one number or one for each joint.
+
+    Attributes:
+        viscous: N m s/rad or N s/m. coulomb: N m or N.
+        slip: Speed at which Coulomb friction has reached three quarters, rad/s or m/s: it is smooth for the solver.
+
+    Raises:
+        ProblemError: A coefficient below zero, a slip that is not positive.
+    """
+
+    viscous: Any = 0.0
+    coulomb: Any = 0.0
+    slip: float = 0.01
+
+    def __post_init__(self) -> None:
+        for what in ("viscous", "coulomb"):
+            _nonnegative(f"friction: {what}", getattr(self, what), None)
+        if not checked_nonnegative("friction: slip", self.slip) > 0:
+            raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
+
+    def torques(self, rates: Any) -> Any:
+        """What the joints must give against it. Shape (n, 1)."""
+        n = rates.numel()
+        viscous, coulomb = (
+            ca.DM(_nonnegative(f"friction: {what}", getattr(self, what), n)) for what in ("viscous", "coulomb")
+        )
+        return viscous * rates + coulomb * ca.tanh(rates / self.slip)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Weights of the parts of the cost, an integral over the motion plus `time` times the final time.
+
+    Attributes:
+        torque: Of the squared torques, one number or one for each joint: losses in the windings, 1/(N m)^2/s.
+        energy: Of what the drives give, the sum of max(torque times rate, 0): nothing is won back by braking, 1/J.
+        acceleration: Of the squared accelerations. jerk: Of the squared jerks, where they are the control.
+        time: Of the final time, 1/s.
+
+    Raises:
+        ProblemError: A weight below zero; none above.
+    """
+
+    torque: Any = 1.0
+    energy: float = 0.0
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        torque = _nonnegative("effort: torque", self.torque, None)
+        parts = [checked_nonnegative(f"effort: {what}", getattr(self, what)) for what in list(vars(self))[1:]]
+        if not (any(parts) or torque.any()):
+            raise ProblemError("effort: at least one weight must be above zero", name="effort", value=self, limit=0.0)
+
+
+def _nonnegative(what: str, value: Any, size: int | None) -> Array:
+    """One number or, where a size is told, as many; ProblemError where they are negative, not finite, or others."""
+    name = what.rpartition(" ")[2]
+    try:
+        found = floats(value).reshape(-1)
+    except NOT_NUMBERS as error:
+        words = f"{what}: one number or one for each joint is expected, not {value!r}"
+        raise ProblemError(words, name=name, value=value) from error
+    if not found.size or not (np.isfinite(found) & (found >= 0)).all():
+        raise ProblemError(f"{what} must be zero or above, and finite: {value!r}", name=name, value=value, limit=0.0)
+    if size is None:
+        return found
+    if found.size not in (1, size):
+        words = f"{what}: one number or {size} are expected, not {found.size}"
+        raise ProblemError(words, name=name, value=found.size, limit=size)
+    return np.array(np.broadcast_to(found, size))
+
+
+def joint_torques(
+    machine: Motors,
+    base: Any,
+    joints: Any,
+    rates: Any,
+    accelerations: Any,
+    *,
+    friction: JointFriction | None = None,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Any = None,
+) -> Any:
+    """Torques (forces of prismatic joints) of a motion. Shape (n, 1), N m or N.
+
+    Args:
+        machine: On a fixed base, or floating freely.
+        base, joints, rates: Symbols, (base_size, 1) and (n, 1) each: of a floating machine they are differentiated.
+        accelerations: Shape (n, 1).
+        friction: In the joints. wrenches: From outside.
+        gravity: Acceleration of free fall, m/s^2; None is GRAVITY on a fixed base and none for a machine that floats.
+    """
+    robot = _checked_motors("joint_torques", machine).robot
+    if isinstance(machine, FixedBase):
+        fall = GRAVITY if gravity is None else gravity
+        found = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
+    else:
+        fall = (0.0, 0.0, 0.0) if gravity is None else gravity
+        twist = machine.base_twist(base, joints, rates)
+        along = ca.vertcat(machine.base_rate(base, joints, rates), rates, accelerations)
+        changes = ca.jtimes(twist, ca.vertcat(base, joints, rates), along)
+        spatial = ca.DM.eye(6)[:, machine.twist_rows]
+        found = inverse_dynamics(
+            robot,
+            joints,
+            rates,
+            accelerations,
+            wrenches,
+            fall,
+            machine.world_from_base(base),
+            base_twist=spatial @ twist,
+            base_acceleration=spatial @ changes,
+        )
+    return found if friction is None else found + friction.torques(rates)
+
+
+@interruptible
+def dynamics_problem(
+    machine: Motors,
+    start_joints: Any,
+    horizon: float | FreeTime,
+    *,
+    end_joints: Any = None,
+    tasks: TipTask | Sequence[TipTask] = (),
+    start_base: Any = None,
+    limits: Limits | None = None,
+    effort: Effort | None = None,
+    friction: JointFriction | None = None,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Any = None,
+    control: Literal["acceleration", "jerk"] = "acceleration",
+    start: Literal["rest", "free"] = "rest",
+    end: Literal["rest", "free"] = "rest",
+    clear: Clear | None = None,
+    symbols: Any = ca.SX,
+) -> Problem:
+    """A motion within the limits of the drives, at the least effort, energy or time.
+
+    States "joints", "velocities" (and "accelerations" where the jerk is the control), "base" of a machine that floats;
+    controls "accelerations" or "jerks" (and "power", W, what drives give, where energy costs or power is limited). Path
+    constraints "torques", "power", and "tip" where there are tasks: the derivative of their velocities, with the gaps
+    of their poses fed back, which a start that is free has to begin with.
+
+    Args:
+        machine: A FixedBase, or a FreeFloating one whose momentum is kept.
+        start_joints: Shape (n,), rad or m; nan where free, and None for all, in a phase that is joined to another.
+        horizon: Final time, s, or FreeTime(...).
+        end_joints: Shape (n,), nan where free; all free if None.
+        tasks: A TipTask, or several that are done at once over the whole motion, of the time, s.
+        start_base: Configuration of the base at the start; home if None.
+        limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
+        effort: Weights of the cost; the squared torques if None.
+        friction, wrenches, gravity: As of `joint_torques`.
+        control: "jerk" makes accelerations continuous, zero at ends at rest.
+        start, end: Whether the joints are at rest there, or free to move.
+        clear: What the motion has to stay clear of, see `ocp.builders.clearance`.
+        symbols: casadi.SX, or casadi.MX when a task calls an interpolant.
+
+    Raises:
+        ProblemError: Sizes or options that do not fit, an end outside the limits, limits of jerk where accelerations
+            are the control, a task that does not begin at its tip or moves where the joints rest, a free horizon with
+            tasks, whose time is theirs.
+    """
+    _checked_motors("dynamics_problem", machine)
+    limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
+    effort = Effort() if effort is None else checked_instance("dynamics_problem: effort", effort, Effort)
+    if friction is not None:
+        checked_instance("dynamics_problem: friction", friction, JointFriction)
+    for what, given in (("start", start), ("end", end)):
+        checked_choice(what, given, ("rest", "free"))
+    checked_choice("control", control, ("acceleration", "jerk"))
+    robot, n = machine.robot, machine.joint_size
+    bounds = limits.bounds(machine)
+    if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
+        words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
+        raise ProblemError(words, name="control", value=control, limit="jerk")
+    first = _ends("start_joints", start_joints, bounds.lower, bounds.upper)
+    last = _ends("end_joints", end_joints, bounds.lower, bounds.upper)
+    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
+    _, home = checked_configuration(machine, known, start_base)
+    towards = np.where(np.isnan(last), known, last)
+
+    equations = bind(machine, tasks) if isinstance(tasks, TipTask) or tasks else None
+    resting = np.zeros(n) if equations is None else rates_at_rest(equations, home, towards)
+
+    problem = Problem("dynamics", symbols)
+    free = isinstance(horizon, FreeTime)
+    final = (
+        problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
+        if isinstance(horizon, FreeTime)
+        else problem.horizon(duration)
+    )
+    still = 0.0 if start == "rest" else None
+    last_rates = resting if end == "rest" else None
+
+    def between(order: int) -> Any:
+        """The quintic from rest to rest, or a derivative of it."""
+        shape = QUINTIC.deriv(order) if order else QUINTIC
+        return lambda t: known * (order == 0) + (towards - known) * shape(t / duration) / duration**order
+
+    joints = problem.state(
+        "joints", n, initial=first, terminal=last, lower=bounds.lower, upper=bounds.upper, guess=between(0),
+        unit=robot.unit(),
+    )  # fmt: skip
+    rates = problem.state(
+        "velocities", n, initial=still, terminal=last_rates, lower=-bounds.velocity, upper=bounds.velocity,
+        guess=between(1), unit=robot.unit("/s"),
+    )  # fmt: skip
+    push = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": between(2)}
+    if control == "jerk":
+        second = problem.state(
+            "accelerations",
+            n,
+            initial=still,
+            terminal=resting if end == "rest" else None,
+            unit=robot.unit("/s^2"),
+            **push,
+        )
+        jerks = problem.control("jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, jerks)
+    else:
+        second = problem.control("accelerations", n, unit=robot.unit("/s^2"), **push)
+        jerks = ca.DM(0, 1)
+    problem.dynamics(joints, rates)
+    problem.dynamics(rates, second)
+    base: Any = ca.DM(0, 1)
+    if machine.base_size:
+        free_base = None if start_joints is None else home
+        base = problem.state("base", machine.base_size, initial=free_base, guess=home)
+        problem.dynamics(base, machine.base_rate(base, joints, rates))
+
+    torques = joint_torques(machine, base, joints, rates, second, friction=friction, wrenches=wrenches, gravity=gravity)
+    limited = np.flatnonzero(np.isfinite(bounds.torque)).tolist()
+    if limited:
+        most = bounds.torque[limited]
+        problem.path("torques", torques[limited], lower=-most, upper=most, unit=robot.effort_unit)
+    running = effort.acceleration * ca.sumsqr(second) + effort.jerk * ca.sumsqr(jerks)
+    running += ca.dot(ca.DM(_nonnegative("effort: torque", effort.torque, n)), torques**2)
+    if effort.energy or np.isfinite(bounds.power).any():
+        given = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
+        problem.path("power", given - torques * rates, lower=0.0, unit="W")
+        running += effort.energy * ca.sum1(given)
+    if equations is not None:
+        if free:
+            raise ProblemError("tasks say their own time: give a horizon in s", name="horizon")
+        _declare_tasks(problem, equations, (home, first), (base, joints, rates, second), duration, start, end)
+    if clear is not None:
+        clear = checked_instance("dynamics_problem: clear", clear, Clear)
+        name = "base" if machine.base_size else ""
+        clear.declare(problem, base, joints, base_name=name, horizon=None if free else duration)
+    problem.minimize(running=running, terminal=effort.time * final)
+    return problem
+
+
+def _checked_motors(what: str, machine: Any) -> Motors:
+    if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
+        words = f"{what}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; what stands is "
+        words += "for standing_problem"
+        raise ProblemError(words, name="machine", value=machine)
+    return machine
+
+
+def _ends(what: str, given: Any, lower: Array, upper: Array) -> Array:
+    """Joints at an end, nan where free. Shape (n,).
+
+    Raises:
+        ProblemError: Other sizes, infinite, or outside the limits.
+    """
+    n = len(lower)
+    if given is None:
+        return np.full(n, np.nan)
+    try:
+        found = floats(given).reshape(-1)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"{what}: {n} numbers are expected, not {given!r}", name=what, value=given) from error
+    if found.shape != (n,) or np.isinf(found).any():
+        words = f"{what}: {n} numbers, nan where free, are expected, not {found.tolist()}"
+        raise ProblemError(words, name=what, value=found, limit=n)
+    for k in np.flatnonzero((found < lower) | (found > upper)):
+        words = f"{what}: joint {k} is at {found[k]:g}, its limits are [{lower[k]:g}, {upper[k]:g}]"
+        raise ProblemError(words, name=what, value=float(found[k]), limit=(float(lower[k]), float(upper[k])))
+    return found
+
+
+def _declare_tasks(
+    problem: Problem,
+    equations: TaskEquations,
+    begin: tuple[Array, Array],
+    motion: tuple[Any, Any, Any, Any],
+    duration: float,
+    start: str,
+    end: str,
+) -> None:
+    """Hold the tips to their tasks by their accelerations, and watch where they are."""
+    home, first = begin
+    base, joints, rates, second = motion
+    if not np.isnan(first).any():
+        checked_tasks(equations, home, first, duration)
+    check_length(equations, home, duration)
+    check_rest(equations, 0.0 if start == "rest" else None, duration if end == "rest" else None)
+    targets = equations.targets(problem.time)
+    if start == "free":
+        residual = equations.residual(base, joints, rates, targets)
+        problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
+    gap = equations.acceleration(base, joints, rates, second, problem.time)
+    problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
+    for name, stray in equations.strays(base, joints, rates, targets).items():
+        problem.watch(name, **stray)
