@@ -54,6 +54,7 @@ MADE_BY_THE_PACKAGE = {
     "TimedProgram",
     "WaypointPlan",
     "Waypoints",
+    "Sensitivity",
 }
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "paper_example", "reference_tunnel", "standing_example"}
