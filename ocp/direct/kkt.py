@@ -16,7 +16,7 @@ from ocp.direct.assembly import Program
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "curves_upwards"]
+__all__ = ["Conditions", "conditions", "curves_upwards", "held_by", "still_holds"]
 
 PUSHES = 1e-8
 """Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
@@ -55,6 +55,49 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     held = at_limit(outcome.rows / b, arguments["lbg"] / b, arguments["ubg"] / b, of_rows)
     fixed = at_limit(v / a, arguments["lbx"] / a, arguments["ubx"] / a, of_bounds)
     return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
+
+
+def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers of the bounds of the variables (n,) and of the rows (m,), in units of the solver."""
+    v, lam = outcome.variables, outcome.multipliers
+    slope = np.asarray(program.gradient(v, p)[1].full()).ravel()
+    slope += matrix(program.jacobian(v, p)[1]).T @ lam
+    return -slope * scales.variables / scales.cost, lam * scales.rows / scales.cost
+
+
+def held_by(
+    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
+) -> dict[str, np.ndarray]:
+    """On which side each variable (x) and row (g) stands at a limit that pushes: -1 below, 1 above, 0 at none."""
+    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
+    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    sides = {}
+    for kind, unit in units.items():
+        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
+        held = at_limit(values[kind] / unit, low, high, push[kind])
+        sides[kind] = np.where(held & (low < high), np.sign(push[kind]), 0.0)
+    return sides
+
+
+def still_holds(
+    program: Program,
+    outcome: Outcome,
+    arguments: dict[str, np.ndarray],
+    scales: Scales,
+    sides: dict[str, np.ndarray],
+    tolerance: float,
+) -> bool:
+    """Whether what was found with some limits held and others let go is right: none is missed, all held ones push."""
+    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
+    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    for kind, unit in units.items():
+        value, side = values[kind] / unit, sides[kind]
+        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
+        room = tolerance * np.maximum(1.0, np.abs(value))
+        idle = (side != 0) & (push[kind] * side <= PUSHES)  # it pulls, or others do its work
+        if np.any(value < low - room) or np.any(value > high + room) or np.any(idle):
+            return False
+    return True
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:

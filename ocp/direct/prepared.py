@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -23,11 +24,12 @@ from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
-from ocp.direct.kkt import curves_upwards
+from ocp.direct.kkt import curves_upwards, held_by, still_holds
 from ocp.direct.known import Known
 from ocp.direct.native import NativeSolver, why_not
 from ocp.direct.nlp import (
     DEFAULTS,
+    ROUNDING,
     SOLVERS,
     Outcome,
     broken_down,
@@ -59,6 +61,8 @@ __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
 COMMON = ("tol", "max_iter", "print_level")  # options that all solvers but sleqp take
+MOST_KEPT = 8  # plans, with what is known of them for solves that begin there
+MOST_STEPS = 20  # of Newton's, where the limits that push are held to be known
 MOST_ELSEWHERE = 200  # iterations from each other start
 
 
@@ -206,6 +210,7 @@ class Prepared:
         self._own_options, self._scaling = own, scaling
         # sleqp asks for products with the Hessian, which compiled functions do not have
         self._blocks = Blocks(self.fragment, compiled if solver != "sleqp" else False)
+        self._found: deque[tuple[np.ndarray, Scales, dict[str, np.ndarray]]] = deque(maxlen=MOST_KEPT)
         self._build()
         self._most = largest_number_of_iterations(self.solver_name, own)
         self._made_of = problem, method, solver, options, compiled, scaling
@@ -215,7 +220,7 @@ class Prepared:
     def _build(self) -> None:
         """The program and its solver, of the functions of the blocks that are at hand."""
         form, fragment = self.formulation, self.fragment
-        for made_of_others in ("scaled", "_ipopt"):
+        for made_of_others in ("scaled", "_ipopt", "_warm"):
             self.__dict__.pop(made_of_others, None)
         self.program = assemble(fragment, form.np, self._blocks.functions)
         self._solver, self._progress = self._built_solver(self.solver_name, self._own_options)
@@ -263,6 +268,8 @@ class Prepared:
 
         With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
         and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
+        From one of the last plans that ``native`` found here, the limits that pushed there are held first, and the
+        others let go, which takes a few steps; where others push at the new parameters it is solved as ever.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
         with limited(checked_time_limit(time_limit)), self._lock:
@@ -313,6 +320,9 @@ class Prepared:
         }
         if tighter is not None:
             draw_in(arguments, tighter)
+        again = self._again(guess, arguments, bounds)
+        if again is not None:
+            return again
         point = initial_point(form, fragment, guess, bounds)
         told = names_told(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
@@ -363,11 +373,47 @@ class Prepared:
         out_of_time = outcome.status.startswith(OUT_OF_TIME)
         asked = "max_iter" in self._own_options and outcome.status.startswith("Maximum_Iterations_Exceeded")
         if outcome.status == "Solve_Succeeded":
+            self._keep(first)
             return first.with_curvature(not curves_upwards(self.program, outcome, first.arguments, first.scales))
         if out_of_time or asked:
             return first
         second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
         return second if second.found is not None or first.found is None else first
+
+    def _keep(self, found: Attempt, sides: dict[str, np.ndarray] | None = None) -> None:
+        """Keep with a plan, for solves that begin there, which limits push in it; found out where they are not told."""
+        assert found.solution is not None
+        if sides is None:
+            sides = held_by(self.program, found.outcome, found.arguments, found.scales)
+        self._found.append((found.solution.variables, found.scales, sides))
+
+    def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds) -> Solution | None:
+        """The plan where the same limits push as in the guess, one of the last that native found here; None otherwise.
+
+        With these limits held and the others let go Newton's steps alone are left, from where the last ones ended.
+        """
+        kept = [each for each in self._found if isinstance(guess, Solution) and each[0] is guess.variables]
+        if not kept or not isinstance(guess, Solution):
+            return None
+        variables, scales, sides = kept[0]
+        own = dict(arguments)
+        for kind, side in sides.items():
+            low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
+            given = low == high
+            own[f"lb{kind}"] = np.where(given | (side < 0), low, np.where(side > 0, high, -np.inf))
+            own[f"ub{kind}"] = np.where(given | (side > 0), high, np.where(side < 0, low, np.inf))
+        found = self._attempt(GUESS, variables, set(), own, bounds, self._warm, scales)
+        if found.outcome.status != "Solve_Succeeded":
+            return None
+        if not still_holds(self.program, found.outcome, arguments, scales, sides, ROUNDING):
+            return None
+        self._keep(found, sides)
+        return found.with_curvature(guess.regularised).solution
+
+    @cached_property
+    def _warm(self) -> tuple[Any, Any]:
+        """The native solver for a few steps of Newton's."""
+        return self._built_solver("native", {**self._own_options, "max_iter": MOST_STEPS})
 
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
@@ -381,15 +427,16 @@ class Prepared:
         limits: dict[str, np.ndarray],
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
+        scales: Scales | None = None,
     ) -> Attempt:
-        """Run a solver, its own for None, once from a start, scaled by the sizes along it.
+        """Run a solver, its own for None, once from a start, scaled by the sizes along it where no scales are told.
 
         See :func:`sizes_along` for ``told``.
         """
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
-        scales = unscaled(self.fragment)
-        if self._scaling:
+        told_scales, scales = scales is not None, scales or unscaled(self.fragment)
+        if self._scaling and not told_scales:
             sizes = sizes_along(self._pattern, x0, told, bounds, p)
             scales = fitting_scales(self._pattern, sizes, x0, p)
             if getattr(self.method, "integrator", "") == "cvodes":

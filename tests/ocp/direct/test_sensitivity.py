@@ -58,7 +58,7 @@ CASES: dict[str, tuple[Callable[[], Problem], Method, dict[str, Any], str]] = {
     "payload, limited": (lambda: loaded(4.0), Collocation(8), {"payload": 0.5}, "payload"),
     "payload, shooting": (lambda: loaded(4.2), MultipleShooting(10, steps=2), {"payload": 0.4}, "payload"),
     "drag": (fastest, Collocation(8), {"drag": 0.3, "strength": 4.0}, "drag"),
-    "strength": (fastest, Collocation(8, 2, control="held"), {"drag": 0.3, "strength": 4.0}, "strength"),
+    "strength": (fastest, Collocation(8, 2, control="held"), {"drag": 0.3, "strength": 1.5}, "strength"),
     "start": (started_anywhere, Collocation(6), {"x0": [1.0, 0.3]}, "x0"),
     "start, limited": (lambda: started_anywhere(upper=0.4), Collocation(6), {"x0": [1.0, 0.3]}, "x0"),
     "swing": (swing, MultipleShooting(12, steps=2, control="linear"), {"k": [1.0, 1.1]}, "k"),
