@@ -16,7 +16,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 
 from scripts.papers.run import Table, command, progress, write
 
-PARTS = ("build_and_solve", "costate_rate", "audit", "planning", "batch", "schedules", "cts", "blend", "robots")
+PARTS = (
+    "build_and_solve",
+    "costate_rate",
+    "native",
+    "audit",
+    "planning",
+    "batch",
+    "schedules",
+    "cts",
+    "blend",
+    "robots",
+)
 """Modules of scripts/timing, each with run(repeats) -> numbers, plot(path, numbers) and report(numbers) -> text."""
 TOGETHER = PARTS[:2]
 """Those whose numbers stand in summary.json; the others have a file NAME.json."""
