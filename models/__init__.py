@@ -28,7 +28,7 @@ from models.robot.kinematics import (
     tip_pose,
 )
 from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
-from models.robot.parts import CollisionShape, Joint, Link, Mimic
+from models.robot.parts import CollisionShape, Joint, Link, Mimic, VisualShape
 from models.robot.rebuild import (
     attached,
     locked,
@@ -77,6 +77,7 @@ __all__ = [
     "Support",
     "Surroundings",
     "Tunnel",
+    "VisualShape",
     "Wrench",
     "attached",
     "base_reaction",

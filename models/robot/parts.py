@@ -6,7 +6,7 @@ Attributes that are arrays are given as anything numpy reads and stored as read-
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, Self, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
@@ -77,14 +77,45 @@ class CollisionShape:
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
         if not mesh:
-            warn_of_millimetres(size, owner, "size", "size")
+            self._check_size(size, owner)
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
 
-    def placed(self, rotation: Array, translation: Array) -> CollisionShape:
+    def _check_size(self, size: Array, owner: str) -> None:
+        warn_of_millimetres(size, owner, "size", "size")
+
+    def placed(self, rotation: Array, translation: Array) -> Self:
         """The same shape in a frame in which its link stands so. Shape (3, 3) and (3,)."""
         turn = checked_rotation(rotation, "placed shape", "rotation")
         shift = checked_array(translation, (3,), "placed shape", "translation") + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
+
+
+@dataclass(frozen=True, eq=False)
+class VisualShape(CollisionShape):
+    """A shape that a link, or a part of one, looks like; nothing is computed with it.
+
+    Attributes:
+        kind, size, file, translation, rotation, folder: As of CollisionShape, whatever its size.
+        color: Red, green, blue and opacity, 0 to 1; None where nothing is said of it. Shape (4,).
+
+    Raises:
+        ModelError: As of CollisionShape; a color that is none.
+    """
+
+    color: ArrayInput = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.color is None:
+            return
+        color = checked_array(self.color, (4,), f"visual {self.kind}", "color")
+        if not ((color >= 0) & (color <= 1)).all():
+            message = f"visual {self.kind}: color {color.tolist()} has entries outside 0 to 1"
+            raise ModelError(message, name="color", value=color, limit=(0.0, 1.0))
+        object.__setattr__(self, "color", color)
+
+    def _check_size(self, size: Array, owner: str) -> None:
+        """Whatever is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +129,7 @@ class Link:
         inertia: About the centre of mass, in link axes. Shape (3, 3), kg m^2.
         any_inertia: Take an inertia that no body has, as some robot descriptions give. It must still be symmetric.
         collisions: Shapes that stand for the body where it may touch something.
+        visuals: Shapes that it looks like.
 
     Raises:
         ModelError: Negative or non-finite mass, wrong sizes, an inertia that no mass distribution has (not
@@ -110,6 +142,7 @@ class Link:
     inertia: ArrayInput = field(default_factory=lambda: np.zeros((3, 3)))
     any_inertia: bool = False
     collisions: tuple[CollisionShape, ...] = ()
+    visuals: tuple[VisualShape, ...] = ()
 
     def __post_init__(self) -> None:
         owner = f"link {checked_name(self.name, 'link', 'name')!r}"
@@ -122,6 +155,7 @@ class Link:
         warn_of_millimetres(self.center_of_mass, owner, self.name, "center_of_mass")
         object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
         object.__setattr__(self, "collisions", checked_each(self.collisions, CollisionShape, owner, "collisions"))
+        object.__setattr__(self, "visuals", checked_each(self.visuals, VisualShape, owner, "visuals"))
 
 
 @dataclass(frozen=True)

@@ -256,7 +256,8 @@ def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
     """One link of several, shapes and all, the others placed in its frame by (rotation, translation); parallel axes."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
-    link = replace(link, collisions=(*link.collisions, *shapes))
+    seen = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
+    link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *seen))
     others = [part for part in others if part[0].mass or part[0].inertia.any()]
     if not others:
         return link

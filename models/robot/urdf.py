@@ -1,7 +1,8 @@
 """Robot descriptions in URDF, the XML format of ROS, read into links and joints, and written.
 
-Kinematics, inertias, limits, mimicry and collision shapes are read; <visual>, <transmission>, <gazebo>,
-<safety_controller>, <dynamics> and unknown elements are passed over. Meshes are named, with the folder of the file that
+Kinematics, inertias, limits, mimicry, collision and visual shapes are read; <transmission>, <gazebo>,
+<safety_controller>, <dynamics> and unknown elements are passed over, and so is a <visual> that says nothing that can be
+shown: how a robot looks never keeps it from moving. Meshes are named, with the folder of the file that
 names them, and no file of theirs is looked for here (`models.shapes.bodies` does). The standard library's parser is
 enough: the libraries that read URDF bring mesh and XML packages along, which a core without meshes spares.
 """
@@ -10,11 +11,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from math import cos, isfinite, sin
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 from warnings import warn
 from xml.etree import ElementTree
 
@@ -22,10 +24,11 @@ import numpy as np
 
 from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
-from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic
+from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
+_Shape = TypeVar("_Shape", bound=CollisionShape)
 
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
@@ -137,16 +140,13 @@ def written_urdf(
             ElementTree.SubElement(body, "mass", value=_text(link.mass))
             moments = map(_text, link.inertia[np.triu_indices(3)])
             ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
+        for seen in link.visuals:
+            visual = _write_shape(element, "visual", seen)
+            if seen.color is not None:
+                material = ElementTree.SubElement(visual, "material", name="")
+                ElementTree.SubElement(material, "color", rgba=_text(seen.color))
         for shape in link.collisions:
-            collision = ElementTree.SubElement(element, "collision")
-            _write_origin(collision, shape.translation, shape.rotation)
-            if shape.kind == "mesh":
-                sizes = {"filename": shape.file, "scale": _text(shape.size)}
-            elif shape.kind == "box":
-                sizes = {"size": _text(shape.size)}
-            else:
-                sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
-            ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), shape.kind, sizes)
+            _write_shape(element, "collision", shape)
     for joint in joints:
         element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
         _write_origin(element, joint.translation, joint.rotation)
@@ -166,6 +166,19 @@ def written_urdf(
         ElementTree.SubElement(robot, "tip", link=tip)
     ElementTree.indent(robot)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:
+    element = ElementTree.SubElement(link, tag)
+    _write_origin(element, shape.translation, shape.rotation)
+    if shape.kind == "mesh":
+        sizes = {"filename": shape.file, "scale": _text(shape.size)}
+    elif shape.kind == "box":
+        sizes = {"size": _text(shape.size)}
+    else:
+        sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
+    ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), shape.kind, sizes)
+    return element
 
 
 def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
@@ -242,7 +255,8 @@ def _contents(source: Source) -> str:
 
 def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[Link, ...]:
     links, refused = [], []
-    for said in (_said_of_link(each, folder) for each in tree.findall("link")):
+    colors = {each.get("name"): color for each in tree.findall("material") if (color := _color(each)) is not None}
+    for said in (_said_of_link(each, folder, colors) for each in tree.findall("link")):
         try:
             links.append(Link(**said))
             continue
@@ -261,23 +275,41 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[L
     return tuple(links)
 
 
-def _said_of_link(element: ElementTree.Element, folder: str) -> dict[str, Any]:
-    """Attributes of Link, by name."""
+def _said_of_link(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
+    """Attributes of Link, by name; `colors` are those of the robot's materials."""
     name = name_of(element)
     owner = f"link {name!r}"
-    shapes = tuple(_shape(each, owner, folder) for each in element.findall("collision"))
+    shapes = tuple(_shape(each, owner, folder, CollisionShape) for each in element.findall("collision"))
+    visuals = []
+    for each in element.findall("visual"):
+        material = each.find("material")
+        color = None if material is None else _color(material)
+        if color is None and material is not None:
+            color = colors.get(material.get("name"))
+        with suppress(ModelError):
+            visuals.append(_shape(each, owner, folder, VisualShape, color=color))
     body = _only(element, "inertial", owner)
     if body is None:
-        return {"name": name, "collisions": shapes}
+        return {"name": name, "collisions": shapes, "visuals": tuple(visuals)}
     center, turn = origin_of(body, owner)
     mass = number_of(child_of(body, "mass", owner), "value", owner)
     given = child_of(body, "inertia", owner)
     xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in MOMENTS)
     inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia, "collisions": shapes}
+    told = {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia}
+    return {**told, "collisions": shapes, "visuals": tuple(visuals)}
 
 
-def _shape(element: ElementTree.Element, owner: str, folder: str) -> CollisionShape:
+def _color(material: ElementTree.Element) -> Array | None:
+    """Red, green, blue and opacity, each 0 to 1; None where the element does not say them."""
+    try:
+        color = np.array((material.find("color").get("rgba") or "").split(), dtype=float)  # type: ignore[union-attr]
+    except (AttributeError, ValueError):
+        return None
+    return np.clip(color, 0.0, 1.0) if color.shape == (4,) and np.isfinite(color).all() else None
+
+
+def _shape(element: ElementTree.Element, owner: str, folder: str, kind_of: type[_Shape], **more: Any) -> _Shape:
     found: list[Any] = list(child_of(element, "geometry", owner))
     if len(found) != 1:
         message = f"{owner}: <geometry> has {len(found)} shapes, not one"
@@ -291,7 +323,7 @@ def _shape(element: ElementTree.Element, owner: str, folder: str) -> CollisionSh
     else:
         size = np.array([number_of(shape, key, owner) for key in ("radius", "length")[: SHAPES[kind]]])
     try:
-        return CollisionShape(kind, size, file, *origin_of(element, owner), folder if file else "")
+        return kind_of(kind, size, file, *origin_of(element, owner), folder if file else "", **more)
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
 

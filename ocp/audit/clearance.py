@@ -11,7 +11,7 @@ bound does not settle it, the time between is halved. The plan's own polynomials
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import comb
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of
 
-__all__ = ["Clearance", "Nearest", "Track", "clearance", "clearance_along", "nearest_at"]
+__all__ = ["Clearance", "Nearest", "Track", "clearance", "clearance_along", "nearest_along", "nearest_at"]
 
 SETTLED = 0.02
 """Of what the least distance is more or less than is asked: it is known to so much."""
@@ -144,13 +144,29 @@ def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | N
     Raises:
         ProblemError: The plan does not belong to the problem.
     """
+    found = nearest_along(problem, solution, [time])
+    return found[0] if found else None
+
+
+def nearest_along(problem: Problem, solution: Solution, times: Iterable[float], suffix: str = "") -> list[Nearest]:
+    """As `nearest_at` at several times; nothing where none have to stay apart.
+
+    Args:
+        suffix: That the names of the states have which move the bodies: of a plan whose parts stand side by side, one.
+
+    Raises:
+        ProblemError: The plan does not belong to the problem.
+    """
     form = Formulation.of(problem)
     check_belongs(form, solution)
     solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
-    found = []
-    for apart in problem.declared.apart.values():
-        found += _Search(apart, _track_of(form, apart, solution, p)).at(time)
-    return min(found, key=lambda near: near.distance, default=None)
+    moved = [one for one in problem.declared.apart.values() if all(name.endswith(suffix) for name in one.movers)]
+    searches = [_Search(apart, _track_of(form, apart, solution, p)) for apart in moved if len(apart)]
+    if not searches:
+        return []
+    return [
+        min((near for search in searches for near in search.at(time)), key=lambda near: near.distance) for time in times
+    ]
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:
@@ -212,6 +228,7 @@ class _Search:
 
     def at(self, time: float) -> list[Nearest]:
         """Each pair at one time, s."""
+        self.best[:] = np.inf
         self._look(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
         return self._found(self.best)
 

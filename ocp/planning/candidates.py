@@ -439,4 +439,4 @@ class Maker:
         parts = parts_of(self.motion.stretches)
         if self.asked.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
-        return Plan(self.asked.machine, best.solution, parts, tuple(ended))
+        return Plan(self.asked.machine, best.solution, parts, tuple(ended)).with_targets(self.asked.tasks)

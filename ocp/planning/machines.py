@@ -20,13 +20,14 @@ from models import (
     Robot,
     Standing,
     Support,
+    VisualShape,
 )
 from ocp.errors import NOT_NUMBERS, ProblemError
 
 __all__ = ["machine_of", "written_machine"]
 
 MACHINES = (FixedBase, FreeFloating, Standing)
-KINDS = {kind.__name__: kind for kind in (*MACHINES, Robot, Link, Joint, Mimic, CollisionShape, Support)}
+KINDS = {kind.__name__: kind for kind in (*MACHINES, Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)}
 
 
 def written_machine(machine: Machine) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -23,6 +23,8 @@ from ocp.planning.machines import machine_of, written_machine
 from ocp.schedule.trajectory import JointTrajectory
 from ocp.solution import Solution
 from ocp.storage import read_arrays, write_arrays, write_text
+from ocp.tasks.targets import Target, targets_along
+from ocp.tasks.tip_task import TipTask
 
 __all__ = ["Candidate", "Part", "Plan", "PlanSample", "failed", "parts_of"]
 
@@ -30,6 +32,8 @@ RATES = ("rates", SLOPES, "velocities")
 MOST_LINES = 15
 """Of a plan that is printed."""
 HALVINGS = 52
+ASKED = 401
+"""Times at which it is kept what tasks ask for."""
 SLACK = 1e-9
 """Of the horizon: times beyond it by less are its ends."""
 
@@ -95,6 +99,7 @@ class Plan:
         parts: Stretches of time in which the same tasks are done; in the solution they stand side by side.
         candidates: Every motion found, the plan among them, the cheapest first.
         bound: A lower bound of the cost of any motion that does the tasks; None where none was looked for.
+        targets: The poses that the tasks ask for, along the plan, in the world.
     """
 
     machine: Machine
@@ -102,6 +107,7 @@ class Plan:
     parts: tuple[Part, ...]
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
+    targets: tuple[Target, ...] = ()
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
     # ---- what it says ------------------------------------------------------------------------------------------
@@ -240,6 +246,15 @@ class Plan:
         from ocp.app.plots import html_of_plan
 
         return html_of_plan(self)
+    def with_targets(self, tasks: Sequence[TipTask]) -> Plan:
+        """The same plan, which tells what the tasks that it does ask for at ASKED times."""
+        times = np.linspace(0.0, self.horizon, ASKED)
+        clock = times
+        if CLOCK in self.solution.states:
+            clock = self._fractions(self.parts[0], times) * self.solution.horizon
+        at = self.at(times)
+        base = at["base"] if "base" in at else np.zeros((ASKED, 0))
+        return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
 
     # ---- files -------------------------------------------------------------------------------------------------
 
@@ -256,7 +271,12 @@ class Plan:
             "candidates": [[c.start.tolist(), c.cost, c.why] for c in self.candidates],
         }
         text = json.dumps(told).encode()
-        write_arrays(path, {**self.solution.arrays(path), "plan": np.frombuffer(text, dtype=np.uint8)})
+        targets = {
+            f"target.{k}": np.column_stack([one.t, one.position, one.rotation.reshape(-1, 9)])
+            for k, one in enumerate(self.targets)
+        }
+        arrays = {**self.solution.arrays(path), **targets, "plan": np.frombuffer(text, dtype=np.uint8)}
+        write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -278,10 +298,12 @@ class Plan:
                 for start, cost, why in told["candidates"]
             )
             bound = None if told["bound"] is None else float(told["bound"])
-            made = cls(machine_of(told["machine"]), solution, parts, candidates, bound)
+            stored = [arrays[name] for name in arrays if name.startswith("target.")]
+            targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in stored)
+            made = cls(machine_of(told["machine"]), solution, parts, candidates, bound, targets)
             made._check_parts()
             return made
-        except (*NOT_NUMBERS, KeyError, AttributeError) as error:
+        except (*NOT_NUMBERS, KeyError, AttributeError, IndexError) as error:
             raise ProblemError(f"{path}: the plan in it is damaged: {error}", name="plan", value=str(path)) from error
 
     def trajectory(self, period: float) -> JointTrajectory:

@@ -95,7 +95,7 @@ def plan_to_stand(
         one if one is best or one.why else Candidate(one.start, one.cost, "dearer", one.solution) for one in ranked
     ]
     assert best.solution is not None
-    return Plan(machine, best.solution, (Part(0.0, duration, ""),), tuple(ranked))
+    return Plan(machine, best.solution, (Part(0.0, duration, ""),), tuple(ranked)).with_targets(given)
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:

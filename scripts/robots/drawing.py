@@ -16,8 +16,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 
 from models import Robot
 from models.arrays import Array
+from ocp.app.frames import TIP, Frames, chain
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
-from scripts.robots.frames import TIP, Frames, chain, inertia_box
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]
 DPI = 100
@@ -85,6 +85,25 @@ class Scene:
         """The tool's axis at sample k, ending at the tip. Shape (2, 3)."""
         tip = self.frames.tip[k]
         return np.stack([tip - self.tool * self.frames.rotations[TIP][k][:, 2], tip])
+
+
+def inertia_box(robot: Robot, name: str) -> tuple[Array, Array, Array] | None:
+    """The box of even density that has a link's mass and inertia.
+
+    Returns:
+        Edge lengths (3,), m; its axes (3, 3), as columns, and its centre (3,), in the link's frame. None for a link
+        without mass or whose inertia no body can have.
+    """
+    link = robot.link(name)
+    if link.mass <= 0:
+        return None
+    moments, axes = np.linalg.eigh(np.asarray(link.inertia, dtype=float))
+    squares = 6 / link.mass * (moments.sum() - 2 * moments)
+    if not (np.isfinite(squares).all() and (squares >= -1e-9 * max(float(np.abs(squares).max()), 1e-12)).all()):
+        return None
+    if np.linalg.det(axes) < 0:
+        axes = axes * [1, 1, -1]
+    return np.sqrt(np.maximum(squares, 0)), axes, np.asarray(link.center_of_mass, dtype=float)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from ocp.audit.clearance import Nearest
 from ocp.tasks.equations import task_errors
 from scripts.robots import standing
 from scripts.robots.drawing import Scene, animate
-from scripts.robots.frames import frames_along
+from ocp.app.frames import frames_along
 from scripts.robots.results import joint_return
 from scripts.viewer.plan import save_plan
 
@@ -125,7 +125,7 @@ def animated(
     )
     robot, machine, scenes = found.robot, found.machine, []
     for title, motion, color in (("instant by instant", found.local, "orange"), ("planned", found.motion, "blue")):
-        frames = frames_along(robot, motion.joints, None, machine.translation, machine.rotation)
+        frames = frames_along(machine, motion.joints)
         zmp = np.column_stack([motion.zero_moment_point, np.zeros(len(motion.t))])
         scenes.append(Scene(title, robot, frames, motion.t, color, outline=outline, mark=zmp, view=view))
         if motion is found.motion:

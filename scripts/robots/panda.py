@@ -13,7 +13,7 @@ from models.arrays import Array
 from ocp import Collocation, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from scripts.robots.frames import frames_along
+from ocp.app.frames import frames_along
 from scripts.robots.results import Example
 from scripts.robots.robots import PANDA
 

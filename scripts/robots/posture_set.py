@@ -26,7 +26,7 @@ from ocp.planning.search import Search
 from ocp.planning.steps import Squares
 from ocp.tasks.equations import bind
 from scripts.drawing import COLORS, VIRIDIS, sheet
-from scripts.robots.frames import frames_along
+from ocp.app.frames import frames_along
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
 from scripts.robots.ur5 import roll

@@ -21,7 +21,7 @@ from models.machines.standing import External
 from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
 from ocp.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
-from scripts.robots.frames import frames_along
+from ocp.app.frames import frames_along
 from scripts.robots.mobile_manipulator import StandingExample, animated
 from scripts.robots.robots import RobotFile
 from scripts.viewer.plan import save_plan
@@ -148,7 +148,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
 
 def _legs(machine: Standing, robot: Robot) -> Array:
     """One line from foot to foot round the footprint, on the way up every leg and down again. Shape (k, 3), m."""
-    places = frames_along(robot, START[None], None, machine.translation, machine.rotation).positions
+    places = frames_along(machine, START[None]).positions
     points: list[Array] = []
     for leg in ("LF", "RF", "RH", "LH", "LF"):
         x, y, _ = places[f"{leg}_FOOT"][0]

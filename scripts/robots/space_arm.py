@@ -13,7 +13,7 @@ from ocp import Collocation, TipTask, plan_minimum_velocity, resolve
 from ocp.tasks.tracks import pose_line
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from scripts.robots.frames import frames_along
+from ocp.app.frames import frames_along
 from scripts.robots.results import FINE, Example, turning_angle
 from scripts.robots.robots import SPACE_ARM
 

@@ -16,7 +16,7 @@ from ocp.local.inverse_kinematics import Posture
 from ocp.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from scripts.robots.frames import TIP, Frames, frames_along
+from ocp.app.frames import TIP, Frames, frames_along
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
 
@@ -83,7 +83,7 @@ def plan(coarse: bool = False) -> Example:
         ("pseudo-inverse", local.t, local.joints, local.cost),
         *(_motion(name, found) for name, found in (("optimal, same start", same), ("optimal", solution)) if found),
     ]
-    rolls = [roll(frames_along(machine.robot, joints)) for _, _, joints, _ in motions]
+    rolls = [roll(frames_along(machine, joints)) for _, _, joints, _ in motions]
     rolls = [angles - 2 * np.pi * np.round((angles[0] - rolls[0][0]) / (2 * np.pi)) for angles in rolls]
     facts = {
         "starts": rows,
@@ -96,7 +96,7 @@ def plan(coarse: bool = False) -> Example:
 def starts(machine: Machine, task: TipTask) -> list[Posture]:
     """Postures at the start of the task with elbow and wrist above the panel, the best conditioned first."""
     found = inverse_kinematics(machine, task)
-    frames = frames_along(machine.robot, [posture.joints for posture in found])
+    frames = frames_along(machine, [posture.joints for posture in found])
     height = np.min([frames.positions[link][:, 2] for link in OVERHEAD], axis=0)
     clear = [posture for posture, low in zip(found, height, strict=True) if low > CENTER[1] + CLEARANCE]
     return clear or found

@@ -1,0 +1,79 @@
+"""What readers of mesh files have in common: triangles with colours, numbers in texts, and what is too much."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from models.errors import ModelError
+
+Faces: TypeAlias = NDArray[np.intp]
+
+MOST_BYTES = {"binary": 2**28, "text": 2**26}
+"""Of a file: numbers in a text take several times their bytes while they are read."""
+MOST_FACES = 2**22
+"""Of a mesh, after all its instances in a scene are placed."""
+
+
+class Triangles(NamedTuple):
+    """A mesh.
+
+    Attributes:
+        vertices: Shape (n, 3), m.
+        faces: Corners of each triangle as indices. Shape (m, 3).
+        colors: Red, green, blue and opacity of each triangle, 0 to 1; nan where the file says none. Shape (m, 4).
+    """
+
+    vertices: Array
+    faces: Faces
+    colors: Array
+
+
+def bare(vertices: Array, faces: Faces) -> Triangles:
+    """Triangles without colours."""
+    return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
+
+
+def together(parts: Sequence[Triangles]) -> Triangles:
+    """All parts as one mesh."""
+    if not parts:
+        return bare(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp))
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
+    colors = [part.colors for part in parts]
+    return Triangles(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), np.concatenate(colors))
+
+
+def wrong(file: Path, what: str, value: object = None, limit: object = None) -> ModelError:
+    """What is wrong with a mesh file."""
+    bound = f", limit {limit}" if isinstance(limit, int) else ""
+    return ModelError(f"mesh {str(file)!r}: {what}{bound}", name=str(file), value=value, limit=limit)
+
+
+def text_of(file: Path, data: bytes) -> str:
+    """The contents of a text, of at most MOST_BYTES."""
+    if len(data) > MOST_BYTES["text"]:
+        raise wrong(file, f"it has {len(data)} bytes of text", len(data), MOST_BYTES["text"])
+    return data.decode("utf-8", errors="replace")
+
+
+def numbers(file: Path, words: Sequence[str], where: Callable[[], str]) -> Array:
+    """Words as numbers; ModelError, with the place, for one that is none."""
+    try:
+        return np.array(words, dtype=float)
+    except ValueError:
+        strange = next((word for word in words if not _is_number(word)), "")
+        raise wrong(file, f"{where()}: {strange!r} is no number", strange) from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

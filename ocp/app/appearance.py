@@ -1,0 +1,241 @@
+"""What a robot looks like: the visual shapes of its links, where there are none the shapes that it touches with.
+
+Meshes that are not found are told, and what the link touches with is shown instead. Links that have neither are rods
+from joint to joint. Nothing is ever made up from masses and inertias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models import CollisionShape, ModelError, Robot
+from models.arrays import Array
+from models.shapes.mesh_files import find_mesh, read_painted_mesh
+from models.shapes.triangles import Triangles, bare, together
+
+__all__ = ["Appearance", "Part", "appearance_of", "part_of", "rod"]
+
+GREY = (0.72, 0.74, 0.78, 1.0)
+ROD = (0.35, 0.38, 0.42, 1.0)
+MOST_FACES = 200_000
+"""Of a robot, beyond which corners that are near to each other become one."""
+FINEST = 2.5e-4
+"""m, the first size of the cells in which corners become one; doubled until the faces are few enough."""
+CREASE = np.cos(np.deg2rad(38.0))
+"""Faces that meet in a sharper edge are not shaded as one surface."""
+MOST_AROUND = 48
+"""Faces at a corner, beyond which each is shaded by itself."""
+ROUND = 32
+"""Sides of what is round."""
+THIN = 0.012
+"""Radius of rods, of the greatest reach of the robot's joints."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A piece of surface of one colour.
+
+    Attributes:
+        link: Name of the link that carries it.
+        vertices, normals: In the frame of the link. Shape (n, 3) each, m.
+        faces: Corners of its triangles. Shape (m, 3).
+        color: Red, green, blue and opacity, 0 to 1.
+    """
+
+    link: str
+    vertices: Array
+    normals: Array
+    faces: NDArray[np.intp]
+    color: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """What is shown of a robot.
+
+    Attributes:
+        parts: Surfaces.
+        missing: Meshes that are not shown, as the description names them, and why.
+    """
+
+    parts: tuple[Part, ...]
+    missing: dict[str, str]
+
+
+def appearance_of(robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True) -> Appearance:
+    """The surfaces of a robot's links.
+
+    Args:
+        robot: The robot, however it was changed: shapes move with the links that they were merged into.
+        folders: Where meshes are looked for first, see `models.shapes.mesh_files.find_mesh`.
+        meshes: Whether files are read at all.
+    """
+    missing: dict[str, str] = {}
+    found: list[tuple[str, Triangles]] = []
+    for link in robot.links:
+        shown = _shown(link.visuals, folders, meshes, missing) or _shown(link.collisions, folders, meshes, missing)
+        found += [(link.name, triangles) for triangles in shown]
+    seen = {name for name, _ in found}
+    found += [(name, rod) for name, rod in _rods(robot, seen)]
+    return Appearance(tuple(_parts(_few(found))), missing)
+
+
+def _shown(
+    shapes: Sequence[CollisionShape], folders: Sequence[Any], meshes: bool, missing: dict[str, str]
+) -> list[Triangles]:
+    """The shapes of a link as triangles, in its frame."""
+    found = []
+    for shape in shapes:
+        if shape.kind == "mesh" and not meshes:
+            continue
+        try:
+            vertices, faces, colors = _triangles(shape, folders)
+        except (ModelError, OSError) as error:
+            missing[shape.file] = str(error)
+            continue
+        own = getattr(shape, "color", None)
+        colors = np.where(np.isnan(colors), GREY if own is None else own, colors)
+        place: Array = vertices @ np.asarray(shape.rotation).T + np.asarray(shape.translation)
+        found.append(Triangles(place, faces, colors))
+    return found
+
+
+def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
+    """In the axes of the shape; raises ModelError where its mesh is not found or not read."""
+    size = np.asarray(shape.size, dtype=float)
+    if shape.kind == "mesh":
+        path = find_mesh(shape.file, shape.folder or None, folders)
+        if path is None:
+            words = f"the mesh {shape.file!r} is not found; say in which folder its package lies"
+            raise ModelError(words, name=shape.file, value=shape.folder)
+        vertices, faces, colors = read_painted_mesh(path)
+        mirrored = np.prod(size) < 0
+        return Triangles(vertices * size, faces[:, ::-1] if mirrored else faces, colors)
+    if shape.kind == "box":
+        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+        return bare(signs * size, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
+    if shape.kind == "cylinder":
+        half = size[1] / 2
+        return _turned(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
+    half = size[1] / 2 if shape.kind == "capsule" else 0.0
+    angles = np.linspace(-np.pi / 2, 0, ROUND // 4 + 1)
+    cap = np.column_stack([np.cos(angles), np.sin(angles)]) * size[0]
+    upper = cap[::-1] * [1, -1] + [0, half]
+    return _turned(np.concatenate([cap - [0, half], upper if half else upper[1:]]))
+
+
+def _turned(profile: Array) -> Triangles:
+    """What a line of (radius, z), (k, 2), from the axis to the axis, sweeps as it turns about z."""
+    angle = np.arange(ROUND) * (2 * np.pi / ROUND)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    radii, heights = profile[:, 0], profile[:, 1]
+    points = np.concatenate([radii[:, None, None] * ring, np.tile(heights[:, None, None], (1, ROUND, 1))], axis=2)
+    k, i = (part.ravel() for part in np.meshgrid(np.arange(len(profile) - 1), np.arange(ROUND), indexing="ij"))
+    a, b = k * ROUND + i, k * ROUND + (i + 1) % ROUND
+    quads = np.stack([a, b, b + ROUND, a + ROUND], axis=1)
+    return bare(points.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
+
+
+def rod(start: Array, end: Array, radius: float) -> Triangles:
+    """A round bar from a point to another."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    axis = along / length
+    other = np.eye(3)[int(np.abs(axis).argmin())]
+    first = np.cross(axis, other)
+    first /= np.linalg.norm(first)
+    turn = np.column_stack([first, np.cross(axis, first), axis])
+    half = length / 2
+    profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
+    vertices, faces, _ = _turned(profile)
+    return Triangles(vertices @ turn.T + (start + end) / 2, faces, np.tile(ROD, (len(faces), 1)))
+
+
+def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
+    """Of links that move and have nothing to show, from where they are joined to where others are; to the tip."""
+    ends = [(joint.parent, np.asarray(joint.translation, dtype=float)) for joint in robot.joints]
+    if robot.tip is not None:
+        ends.append((robot.tip, np.asarray(robot.tip_translation, dtype=float)))
+    radius = THIN * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0)
+    tool = robot.tip if robot.tip is not None and np.any(robot.tip_translation) else None
+    moved = {joint.child for joint in robot.joints if joint.moves}
+    bare_links = {link.name for link in robot.links if link.name not in seen and (link.name in moved or not seen)}
+    found = []
+    for k, (link, end) in enumerate(ends):
+        to_tip = link == tool and k == len(ends) - 1
+        if (link in bare_links or to_tip) and np.linalg.norm(end) > radius:
+            found.append((link, rod(np.zeros(3), end, radius)))
+    return found
+
+
+def _few(found: list[tuple[str, Triangles]]) -> list[tuple[str, Triangles]]:
+    """The same, of at most MOST_FACES faces in all."""
+    size = FINEST
+    coarse = found
+    while sum(len(one.faces) for _, one in coarse) > MOST_FACES and size < 1.0:
+        coarse = [(link, _coarser(one, size)) for link, one in found]
+        size *= 2
+    return coarse
+
+
+def _coarser(mesh: Triangles, size: float) -> Triangles:
+    """The same with all corners in a cell of a grid made one, in their middle, without faces of no area."""
+    cells = np.floor(mesh.vertices / size).astype(np.int64)
+    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.ravel()
+    middles = np.stack([np.bincount(cell, column) for column in mesh.vertices.T], axis=1) / counts[:, None]
+    faces = cell[mesh.faces]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
+    _, first = np.unique(np.sort(faces[whole], axis=1), axis=0, return_index=True)
+    kept = np.flatnonzero(whole)[np.sort(first)]
+    return Triangles(middles, faces[kept], mesh.colors[kept])
+
+
+def _parts(found: list[tuple[str, Triangles]]) -> list[Part]:
+    """By link and colour."""
+    parts = []
+    for link in dict.fromkeys(name for name, _ in found):
+        mesh = together([one for name, one in found if name == link])
+        colors, which = np.unique(np.round(mesh.colors, 3), axis=0, return_inverse=True)
+        for k, color in enumerate(colors):
+            own = mesh.faces[which.ravel() == k]
+            if len(own):
+                parts.append(part_of(link, mesh.vertices, own, color))
+    return parts
+
+
+def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
+    """A part with normals: those of the faces around a corner that are no sharp edge away, by their area."""
+    places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
+    faces = where.ravel()[faces]
+    one, two, three = (places[faces[:, k]] for k in range(3))
+    areas = np.cross(two - one, three - one)
+    length = np.linalg.norm(areas, axis=1)
+    faces, areas, length = faces[length > 0], areas[length > 0], length[length > 0]
+    units = areas / length[:, None]
+    corners = faces.ravel()
+    order = np.argsort(corners, kind="stable")
+    counts = np.bincount(corners, minlength=len(places))
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    around = counts[corners]
+    few = np.flatnonzero(around <= MOST_AROUND)
+    mine = np.repeat(few, around[few])  # corners, and beside each those at the same place
+    step = np.arange(len(mine)) - np.repeat(np.cumsum(around[few]) - around[few], around[few])
+    theirs = order[starts[corners[mine]] + step] // 3
+    smooth = (units[mine // 3] * units[theirs]).sum(axis=1) > CREASE
+    mine, theirs = mine[smooth], theirs[smooth]
+    sums = np.stack([np.bincount(mine, areas[theirs, k], len(corners)) for k in range(3)], axis=1)
+    alone = around > MOST_AROUND
+    sums[alone] = units[np.flatnonzero(alone) // 3]
+    normals = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
+    fine = np.round(normals * 100).astype(np.int64)
+    _, first, which = np.unique(np.column_stack([corners, fine]), axis=0, return_index=True, return_inverse=True)
+    color = tuple(float(value) for value in color)
+    assert len(color) == 4
+    return Part(link, places[corners[first]], normals[first], which.reshape(-1, 3).astype(np.intp), color)

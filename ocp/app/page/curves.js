@@ -1,0 +1,149 @@
+// Curves over time with limits and a cursor, and the way of the zero moment point in its footprint, as inline SVG.
+
+const SPACE = "http://www.w3.org/2000/svg";
+const WIDE = 240, TALL = 96, LEFT = 34, RIGHT = 6, TOP = 6, BOTTOM = 14;
+const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
+
+function shape(kind, given, inside) {
+  const made = document.createElementNS(SPACE, kind);
+  for (const [name, value] of Object.entries(given)) made.setAttribute(name, value);
+  if (inside) inside.append(made);
+  return made;
+}
+
+function written(value) {
+  if (!Number.isFinite(value)) return "";
+  const size = Math.abs(value);
+  if (size && (size < 1e-3 || size >= 1e5)) return value.toExponential(1).replace("e+", "e");
+  return String(+value.toPrecision(3));
+}
+
+function valueAt(times, values, time) {
+  if (time <= times[0]) return values[0];
+  const last = times.length - 1;
+  if (time >= times[last]) return values[last];
+  let low = 0, high = last;
+  while (high - low > 1) { const middle = (low + high) >> 1; if (times[middle] <= time) low = middle; else high = middle; }
+  const share = (time - times[low]) / (times[high] - times[low] || 1);
+  return values[low] + share * (values[high] - values[low]);
+}
+
+class Chart {
+  constructor(name, curves, horizon, seek) {  // curves: {motion, unit, lower, upper, times, values, kind}
+    this.curves = curves;
+    this.horizon = horizon;
+    this.figure = document.createElement("figure");
+    this.figure.className = "chart";
+    const caption = document.createElement("figcaption"), title = document.createElement("b");
+    title.textContent = name;
+    title.title = name;
+    this.told = document.createElement("span");
+    caption.append(title, this.told);
+    this.svg = shape("svg", {viewBox: `0 0 ${WIDE} ${TALL}`, role: "img", "aria-label": `${name} over time`});
+    this.figure.append(caption, this.svg);
+    this.draw();
+    const move = (event) => {
+      if (event.type === "pointermove" && !event.buttons) return;
+      const box = this.svg.getBoundingClientRect();
+      const share = ((event.clientX - box.left) / box.width * WIDE - LEFT) / (WIDE - LEFT - RIGHT);
+      seek(this.horizon * Math.max(0, Math.min(1, share)));
+    };
+    this.svg.addEventListener("pointerdown", move);
+    this.svg.addEventListener("pointermove", move);
+  }
+
+  draw() {
+    let low = Infinity, high = -Infinity;
+    for (const {values} of this.curves) for (const value of values)
+      if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+    if (!(low <= high)) { low = 0; high = 1; }
+    const limits = new Set(this.curves.flatMap(({lower, upper}) => [lower, upper]).filter((one) => one !== null));
+    const reach = Math.max(high - low, 1e-9 + 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
+    for (const limit of [...limits])  // limits far away would flatten the curve
+      if (limit < low - 3 * reach || limit > high + 3 * reach) limits.delete(limit);
+    for (const limit of limits) { low = Math.min(low, limit); high = Math.max(high, limit); }
+    if (high - low < 1e-6 * Math.max(Math.abs(low), Math.abs(high), 1e-3)) {
+      const more = 0.05 * Math.max(Math.abs(low), 1e-3);
+      low -= more;
+      high += more;
+    }
+    const room = 0.05 * (high - low);
+    low -= room;
+    high += room;
+    this.x = (time) => LEFT + (WIDE - LEFT - RIGHT) * time / this.horizon;
+    const y = (value) => TOP + (TALL - TOP - BOTTOM) * (high - value) / (high - low);
+    shape("path", {class: "axis", d: `M${LEFT} ${TOP}V${TALL - BOTTOM}H${WIDE - RIGHT}`}, this.svg);
+    for (const value of [low + room, high - room]) {
+      const label = shape("text", {x: LEFT - 3, y: y(value) + 3, "text-anchor": "end"}, this.svg);
+      label.textContent = written(value);
+    }
+    for (const [time, anchor] of [[0, "start"], [this.horizon, "end"]]) {
+      const label = shape("text", {x: this.x(time), y: TALL - 3, "text-anchor": anchor}, this.svg);
+      label.textContent = time ? `${written(time)} s` : "0";
+    }
+    for (const limit of limits)
+      shape("line", {class: "limit", x1: LEFT, x2: WIDE - RIGHT, y1: y(limit), y2: y(limit)}, this.svg);
+    for (const curve of [...this.curves].reverse()) {
+      let path = "", pen = "M";
+      const step = Math.max(1, Math.floor(curve.values.length / 300));
+      for (let k = 0; k < curve.values.length; k += step) {
+        const value = curve.values[k];
+        if (!Number.isFinite(value)) { pen = "M"; continue; }
+        path += `${pen}${this.x(curve.times[k]).toFixed(1)} ${y(value).toFixed(1)}`;
+        pen = "L";
+      }
+      const last = curve.values.length - 1;
+      if (pen === "L") path += `L${this.x(curve.times[last]).toFixed(1)} ${y(curve.values[last]).toFixed(1)}`;
+      shape("path", {class: `curve ${curve.kind}`, d: path}, this.svg);
+    }
+    this.cursor = shape("line", {class: "cursor", x1: 0, x2: 0, y1: TOP, y2: TALL - BOTTOM}, this.svg);
+    this.show(0);
+  }
+
+  show(time) {
+    this.cursor.setAttribute("transform", `translate(${this.x(Math.min(time, this.horizon)).toFixed(2)} 0)`);
+    this.told.replaceChildren(...this.curves.map((curve, k) => {
+      const made = document.createElement("span");
+      made.className = `ink-${curve.kind}`;
+      made.textContent = `${k ? " | " : ""}${written(valueAt(curve.times, curve.values, time))}`;
+      return made;
+    }), ` ${this.curves[0].unit}`);
+  }
+}
+
+class FootChart {
+  constructor(feet) {  // feet: {corners, times, points, kind}
+    this.feet = feet;
+    this.figure = document.createElement("figure");
+    this.figure.className = "chart";
+    const caption = document.createElement("figcaption"), title = document.createElement("b");
+    title.textContent = "zero moment point in the footprint, seen from above";
+    caption.append(title);
+    const all = feet.flatMap(({corners, points}) => [...corners.map(([x, y]) => [x, y]),
+      ...Array.from({length: points.length / 2}, (_, k) => [points[2 * k], points[2 * k + 1]])]).filter(
+      (one) => one.every(Number.isFinite));
+    const [xs, ys] = [all.map(([x]) => x), all.map(([, y]) => y)];
+    const low = [Math.min(...xs), Math.min(...ys)], high = [Math.max(...xs), Math.max(...ys)];
+    const scale = Math.min((WIDE - 20) / (high[0] - low[0] || 1), (150 - 20) / (high[1] - low[1] || 1));
+    this.x = (x) => WIDE / 2 + scale * (x - (low[0] + high[0]) / 2);
+    this.y = (y) => 75 - scale * (y - (low[1] + high[1]) / 2);
+    const svg = shape("svg", {viewBox: `0 0 ${WIDE} 150`, role: "img", "aria-label": title.textContent});
+    shape("polygon", {class: "axis", points: feet[0].corners.map(([x, y]) => `${this.x(x)},${this.y(y)}`).join(" ")}, svg);
+    this.dots = [...feet].reverse().map((foot) => {
+      let path = "";
+      for (let k = 0; k < foot.points.length / 2; k++)
+        path += `${k ? "L" : "M"}${this.x(foot.points[2 * k]).toFixed(1)} ${this.y(foot.points[2 * k + 1]).toFixed(1)}`;
+      shape("path", {class: `curve ${foot.kind}`, d: path}, svg);
+      return [foot, shape("circle", {class: `dot ${foot.kind}`, r: 4}, svg)];
+    });
+    this.figure.append(caption, svg);
+    this.show(0);
+  }
+
+  show(time) {
+    for (const [foot, dot] of this.dots) {
+      const [x, y] = [0, 1].map((k) => valueAt(foot.times, foot.points.filter((_, i) => i % 2 === k), time));
+      dot.setAttribute("transform", `translate(${this.x(x)} ${this.y(y)})`);
+    }
+  }
+}

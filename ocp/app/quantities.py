@@ -1,0 +1,134 @@
+"""What is drawn over the time of a motion, with its limits: joints, torques, costs, what a base does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from models import FreeFloating, Machine, Standing, inverse_dynamics, simplified
+from models.arrays import Array
+from models.machines.standing import center_of_pressure
+from ocp.app.joint_limits import floating_torques
+from ocp.problem.formulation import Sampler
+from ocp.tasks.limits import JointBounds
+
+__all__ = ["EARTH", "Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]
+
+EARTH = (0.0, 0.0, -9.81)
+"""m/s^2, of machines on a fixed base."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A number over the time of a motion.
+
+    Attributes:
+        group: What it is drawn with. name: Of it. unit: "" of a pure number.
+        values: At the motion's M times. Shape (M,).
+        lower, upper: Its limits, infinite where there is none.
+    """
+
+    group: str
+    name: str
+    unit: str
+    values: Array
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """Where the ground pushes on a machine that stands.
+
+    Attributes:
+        corners: Of the region under its foot. Shape (k, 2), m.
+        points: Zero moment points, at the motion's M times. Shape (M, 2), m.
+    """
+
+    corners: Array
+    points: Array
+
+
+def joint_curves(
+    machine: Machine, bounds: JointBounds, joints: Array, rates: Array, accelerations: Array | None
+) -> list[Curve]:
+    """Positions, rates and torques of all joints, shape (M, n) each, with what bounds them."""
+    robot, found = machine.robot, []
+    torques = None if accelerations is None else _torques(machine, joints, rates, accelerations)
+    for k, joint in enumerate(robot.moving_joints):
+        found.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
+    for k, joint in enumerate(robot.moving_joints):
+        most = float(bounds.velocity[k])
+        found.append(Curve("Joint rates", joint.name, f"{joint.unit}/s", rates[:, k], -most, most))
+    for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
+        assert torques is not None
+        most = float(bounds.torque[k])
+        found.append(Curve("Torques", joint.name, joint.effort_unit, torques[:, k], -most, most))
+    return found
+
+
+def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array) -> Array | None:
+    """By inverse dynamics, shape (M, n); None of a robot without masses."""
+    robot = machine.robot
+    if robot.total_mass == 0:
+        return None
+    q, v, a = (ca.SX.sym(name, robot.dof) for name in ("q", "v", "a"))
+    if isinstance(machine, FreeFloating):
+        torque = floating_torques(machine, q, v, a)
+    else:
+        gravity = getattr(machine, "gravity_in_world", EARTH)
+        frame = machine.world_from_base(())
+        torque = inverse_dynamics(simplified(robot), q, v, a, (), gravity, frame)
+    found: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
+    return found
+
+
+def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array) -> list[Curve]:
+    """Manipulability and speed of the tip; of a floating machine its momentum, of which the base's own rates tell."""
+    robot, found = machine.robot, []
+    b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
+    if robot.tip is not None:
+        rows = range(6) if robot.dof >= 6 else range(3, 6) if robot.dof >= 3 else (3, 4)
+        what = "of the pose" if robot.dof >= 6 else "of the position" if robot.dof >= 3 else "in the plane"
+        twist = machine.tip_twist(b, q, v)
+        sampler = Sampler([b, q, v], [machine.manipulability(b, q, rows), ca.norm_2(twist[3:6])])
+        index, speed = sampler(base, joints, rates)
+        found.append(Curve("The motion", f"manipulability {what}", "", index[:, 0]))
+        found.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
+    if isinstance(machine, FreeFloating) and robot.total_mass > 0:
+        r = ca.SX.sym("r", machine.base_size)
+        whole = machine.momentum(b, q, machine.twist_of_rate(b, r), v)
+        own = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
+        turns = 3 if machine.base_size == 7 else 1
+        parts = [whole[:turns], whole[turns:], own[:turns], own[turns:]]
+        spin, push, own_spin, own_push = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])(
+            base, joints, rates, base_rates
+        )
+        for name, value, share, unit in (
+            ("moment of momentum", spin, own_spin, "N m s"),
+            ("momentum", push, own_push, "N s"),
+        ):
+            found.append(Curve("Momentum", f"{name}, of the whole", unit, value[:, 0]))
+            found.append(Curve("Momentum", f"{name}, of the joints alone", unit, share[:, 0]))
+    return found
+
+
+def footing_of(machine: Standing, joints: Array, rates: Array, accelerations: Array) -> tuple[Footing, list[Curve]]:
+    """Where the ground pushes, how far from the edge of the foot, and how hard, without forces from outside."""
+    q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
+    reaction = machine.ground_reaction(q, v, a)
+    point = center_of_pressure(reaction)
+    outputs = [point, machine.support.margin(point), reaction[5]]
+    points, margin, push = Sampler([q, v, a], outputs)(joints, rates, accelerations)
+    curves = [
+        Curve("Standing", "zero moment point from the edge of the foot", "m", margin[:, 0], 0.0),
+        Curve("Standing", "push of the ground", "N", push[:, 0], 0.0),
+    ]
+    return Footing(np.asarray(machine.support.vertices), points), curves
+
+
+def so_far(t: Array, values: Array) -> Array:
+    """The integral of samples (M,) up to each time, by trapezia. Shape (M,)."""
+    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])

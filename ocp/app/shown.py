@@ -1,0 +1,300 @@
+"""A motion as it is shown: a plan, a solution of a problem of one's own, a local motion or anybody's trajectory.
+
+Whatever it was made by, it is sampled once, with what is known of it: what was asked, limits, costs, the bodies that
+come nearest, the audit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from models import FreeFloating, Machine, Standing
+from models.arrays import Array
+from ocp.app.bases import floating_base
+from ocp.app.joint_limits import Row
+from ocp.app.oddities import readable
+from ocp.app.pictures import Solid, solid_of
+from ocp.app.quantities import Curve, Footing, footing_of, joint_curves, machine_curves, so_far
+from ocp.app.verdict import bounds_of
+from ocp.audit.clearance import nearest_along
+from ocp.builders.tool_motion import CLOCK
+from ocp.errors import ProblemError, unknown_name
+from ocp.files import RawTrajectory
+from ocp.local.rates import LocalSolution
+from ocp.planning import Plan
+from ocp.problem.formulation import Formulation
+from ocp.solution import Solution
+from ocp.tasks.targets import Target
+
+__all__ = ["Near", "Shown", "shown_local", "shown_plan", "shown_solution", "shown_trajectory"]
+
+PER_SECOND, LEAST, MOST = 50, 200, 600
+"""Times at which a motion is sampled."""
+LOOKS = 161
+"""Times at which the nearest bodies are looked for."""
+
+
+class Near(NamedTuple):
+    """The two bodies that are nearest to each other, at K times.
+
+    Attributes:
+        t: s. Shape (K,).
+        points: On their cores, in world. Shape (K, 2, 3), m.
+        distances: m. Shape (K,). asked: The least allowed. Shape (K,), m.
+        bodies: Their names.
+    """
+
+    t: Array
+    points: Array
+    distances: Array
+    asked: Array
+    bodies: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A motion, sampled.
+
+    Attributes:
+        name: What it is called.
+        machine: What moves.
+        t: s. Shape (M,).
+        joints: Shape (M, n). base: Shape (M, base_size).
+        curves: What is drawn over time.
+        targets: What tips were asked to do.
+        footing: Where the ground pushes; None of a machine that does not stand.
+        near: The nearest bodies; None where nothing is known of them.
+        around: Obstacles that stand still, in world.
+        verdict: Of the audit, a sentence, or "". passed: Whether it is good; None where nothing was looked at.
+        rows: Of the audit.
+        cost: Of it; None where it is not known.
+    """
+
+    name: str
+    machine: Machine
+    t: Array
+    joints: Array
+    base: Array
+    curves: tuple[Curve, ...]
+    targets: tuple[Target, ...] = ()
+    footing: Footing | None = None
+    near: Near | None = None
+    around: tuple[Solid, ...] = ()
+    verdict: str = ""
+    passed: bool | None = None
+    rows: tuple[Row, ...] = ()
+    cost: float | None = None
+
+
+def shown_plan(plan: Plan, name: str = "plan") -> Shown:
+    """A plan, with its audit."""
+    times = _times(plan.horizon)
+    sample = plan.sampled(times)
+    base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
+    near = _near(plan)
+    single = len(plan.parts) == 1
+    costs = []
+    if single:
+        fractions = plan._fractions(plan.parts[0], times)
+        own = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
+        costs = _cost(plan.solution, fractions, own)
+    audit = plan.audit()
+    rates = _base_rates(times, base)
+    given = sample.joints, sample.rates, sample.accelerations
+    about = {
+        "near": near,
+        "around": tuple(_around(plan.solution)),
+        "verdict": f"The plan {audit.sentence}.",
+        "passed": audit.passed,
+        "rows": tuple(rows_of(audit)),
+        "cost": plan.cost,
+        "targets": plan.targets,
+    }
+    return _shown(name, plan.machine, times, base, *given, rates, costs, **about)
+
+
+def shown_solution(
+    solution: Solution, machine: Machine, name: str = "solution", *, joints: str = "joints", base: str = "base"
+) -> Shown:
+    """A solution of a problem of one's own.
+
+    Args:
+        machine: Whose joints, and base, are states of the problem.
+        joints, base: What these states are called.
+
+    Raises:
+        ProblemError: No such state, or another size.
+    """
+    wanted = {joints: machine.joint_size} | ({base: machine.base_size} if machine.base_size else {})
+    for state, size in wanted.items():
+        if state not in solution.states:
+            raise unknown_name("state", state, list(solution.states))
+        found = solution.states[state].shape[1]
+        if found != size:
+            words = f"state {state!r} has {found} entries, the machine {size}: {list(machine.robot.joint_names)}"
+            raise ProblemError(words, name=state, value=found, limit=size)
+    times = _times(solution.horizon)
+    fractions = times / solution.horizon
+    columns, at = {}, 0
+    for state, values in solution.states.items():
+        columns[state] = slice(at, at + values.shape[1])
+        at += values.shape[1]
+    curve = solution.state_interpolant
+    states = curve(fractions)
+    slopes = curve.derivative()(fractions) / solution.horizon
+    bends = curve.derivative().derivative()(fractions) / solution.horizon**2
+    q, v, a = (one[:, columns[joints]] for one in (states, slopes, bends))
+    place = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    moves = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    about: dict[str, Any] = {"cost": solution.cost, "around": tuple(_around(solution))}
+    if solution.problem is not None:
+        audit = solution.audit()
+        looks = np.linspace(0.0, solution.horizon, LOOKS)
+        about |= {"verdict": f"The plan {audit.sentence}.", "passed": audit.passed, "rows": tuple(rows_of(audit))}
+        about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
+    smooth = _torque_like(solution, joints)
+    costs = _cost(solution, fractions, times)
+    return _shown(name, machine, times, place, q, v, a if smooth else None, moves, costs, **about)
+
+
+def shown_local(local: LocalSolution, machine: Machine, name: str = "pseudo-inverse") -> Shown:
+    """A motion by instantaneous resolution."""
+    times = _times(float(local.t[-1]))
+    at = [local.at(time) for time in times]
+    base, joints, rates = (np.array([one[what] for one in at]) for what in ("base", "joints", "joint_rates"))
+    return _shown(name, machine, times, base, joints, rates, None, _base_rates(times, base), [])
+
+
+def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Shown:
+    """Anybody's trajectory, between its samples as a controller makes it.
+
+    Raises:
+        ProblemError: It lacks joints of the machine, or has no sample that can be read.
+    """
+    robot = machine.robot
+    bounds = bounds_of(robot)
+    found = readable(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
+    if len(found.joints) < robot.dof:
+        lacking = [one for k, one in enumerate(robot.joint_names) if k not in found.joints]
+        words = f"{raw.file} does not move {lacking}; hold them: --lock {lacking[0]}=VALUE"
+        raise ProblemError(words, name=lacking[0], value=raw.file)
+    motion = found.motion
+    begin, end = float(motion.t[0]), float(motion.t[-1])
+    times = _times(end - begin)
+    joints, rates = motion.position.at(begin + times), motion.velocity.at(begin + times)
+    accelerations = None if motion.acceleration is None else motion.acceleration.at(begin + times)
+    base = np.zeros((len(times), 0))
+    if machine.base_size:
+        told = found.base
+        if told is None:
+            assert isinstance(machine, FreeFloating)
+            told = floating_base(machine, motion)[0]
+        base = np.column_stack([np.interp(begin + times, motion.t, column) for column in told.T])
+    rates_of_base = _base_rates(times, base)
+    return _shown(name or raw.file, machine, times, base, joints, rates, accelerations, rates_of_base, [])
+
+
+def rows_of(audit: Any) -> list[Row]:
+    """The findings of an audit as rows of a table."""
+    words = {True: "ok", False: "FAILED"}
+    return [
+        Row(f.name, f.value, f.limit, f.unit, f.time, "told" if f.limit is None else words[bool(f.passed)], f.note)
+        for f in audit.findings
+    ]
+
+
+def _shown(
+    name: str,
+    machine: Machine,
+    t: Array,
+    base: Array,
+    joints: Array,
+    rates: Array,
+    accelerations: Array | None,
+    base_rates: Array,
+    costs: Sequence[Curve],
+    **about: Any,
+) -> Shown:
+    """With what every motion tells."""
+    curves = [Curve("Cost", "half the squared joint rates, so far", "", so_far(t, (rates**2).sum(axis=1) / 2)), *costs]
+    curves += machine_curves(machine, base, joints, rates, base_rates)
+    near = about.get("near")
+    if near is not None:
+        distances = np.interp(t, near.t, near.distances)
+        curves.append(Curve("The motion", "nearest two bodies", "m", distances, float(near.asked.min())))
+    footing = None
+    if isinstance(machine, Standing) and accelerations is not None:
+        footing, more = footing_of(machine, joints, rates, accelerations)
+        curves += more
+    curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
+    return Shown(name, machine, t, joints, base, tuple(curves), footing=footing, **about)
+
+
+def _times(horizon: float) -> Array:
+    count = int(np.clip(np.ceil(PER_SECOND * horizon), LEAST, MOST))
+    return np.linspace(0.0, horizon, count + 1)
+
+
+def _base_rates(t: Array, base: Array) -> Array:
+    return np.asarray(np.gradient(base, t, axis=0, edge_order=2)) if base.shape[1] else base
+
+
+def _torque_like(solution: Solution, joints: str) -> bool:
+    """Whether the joints' accelerations are of the plan: the states' own curves bend smoothly."""
+    return len(solution.state_interpolant.nodes) > 2 and any(
+        name != joints and values.shape[1] == solution.states[joints].shape[1]
+        for name, values in solution.states.items()
+    )
+
+
+def _cost(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
+    """The running cost of the problem so far."""
+    if solution.problem is None:
+        return []
+    form = Formulation.of(solution.problem)
+    x, u = solution.state_interpolant(fractions), solution.control_interpolant(fractions)
+    p = form.parameter_vector(solution.parameters)
+    order = list(form.states) == list(solution.states) and list(form.controls) == list(solution.controls)
+    if not order:
+        return []
+    running = form.sampled([form.running], x, u, times, solution.horizon, p)[0][:, 0]
+    own = so_far(fractions * solution.horizon, running)
+    return [Curve("Cost", "the problem's own, so far", "", own)]
+
+
+def _near(plan: Plan) -> Near | None:
+    problem = plan.solution.problem
+    if problem is None:
+        return None
+    looks = np.linspace(0.0, plan.horizon, LOOKS)
+    which = np.clip(np.searchsorted([part.begin for part in plan.parts], looks, "right") - 1, 0, len(plan.parts) - 1)
+    found = []
+    for k, part in enumerate(plan.parts):
+        fractions = plan._fractions(part, looks[which == k])
+        found += nearest_along(problem, plan.solution, fractions * plan.solution.horizon, part.suffix)
+    return _joined(looks, found)
+
+
+def _joined(t: Array, found: Sequence[Any]) -> Near | None:
+    if len(found) < len(t):
+        return None
+    points, distances, asked = (
+        np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "asked")
+    )
+    return Near(t, points, distances, asked, tuple(one.bodies for one in found))
+
+
+def _around(solution: Solution) -> list[Solid]:
+    """Obstacles that stand still, as the problem knows them; no half-spaces."""
+    if solution.problem is None:
+        return []
+    found = {}
+    for apart in solution.problem.declared.apart.values():
+        for name, hull in apart.hulls.items():
+            if hull.frame < 0 and not hull.normal.size:
+                found[name] = solid_of(hull.core, hull.radius)
+    return list(found.values())
