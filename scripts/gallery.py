@@ -1,6 +1,6 @@
 """Real robots, planned, audited and drawn: `python scripts/gallery.py [--out results] [--only NAME ...]`.
 
-Writes OUT/gallery/: for each example a figure, an animation, the plan for scripts/view.py and its audit, and
+Writes OUT/gallery/: for each example a figure, an animation, the plan for `selfmotion view` and its audit, and
 summary.json of all. The robots are URDF files of optional packages: pip install "selfmotion[gallery]".
 The exit status is 0 when every plan passes its audit.
 """
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n" + text_table([{"example": name, **row} for name, row in shown.items()], digits=5))
     for name, reason in failed.items():
         print(f"{name}: {reason}", file=sys.stderr)
-    print(f"written to {folder}; to look at a plan: python scripts/view.py {folder / (names[0] + '.npz')}")
+    print(f"written to {folder}; to look at a plan: selfmotion view {folder / (names[0] + '.npz')}")
     return 1 if failed else 0
 
 

@@ -1,7 +1,7 @@
 """What a robot looks like: the visual shapes of its links, where there are none the shapes that it touches with.
 
-Meshes that are not found are told, and what the link touches with is shown instead. Links that have neither are rods
-from joint to joint. Nothing is ever made up from masses and inertias.
+Meshes that are not found are told, and what the link touches with is shown instead; faintly where the description gives
+other links a look and this one none. Links that have neither are rods from joint to joint. Nothing is ever made up from masses and inertias.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from models.shapes.triangles import Triangles, bare, together
 __all__ = ["Appearance", "Part", "appearance_of", "part_of", "rod"]
 
 GREY = (0.72, 0.74, 0.78, 1.0)
+ZONE = (0.55, 0.58, 0.62, 0.22)
 ROD = (0.35, 0.38, 0.42, 1.0)
 MOST_FACES = 200_000
 """Of a robot, beyond which corners that are near to each other become one."""
@@ -76,9 +77,13 @@ def appearance_of(robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = T
         meshes: Whether files are read at all.
     """
     missing: dict[str, str] = {}
+    dressed = any(link.visuals for link in robot.links)
     found: list[tuple[str, Triangles]] = []
     for link in robot.links:
-        shown = _shown(link.visuals, folders, meshes, missing) or _shown(link.collisions, folders, meshes, missing)
+        shown = _shown(link.visuals, folders, meshes, missing)
+        if not shown:  # what a description that shows others leaves out is a zone rather than a body
+            zone = dressed and not link.visuals
+            shown = _shown(link.collisions, folders, meshes, missing, ZONE if zone else GREY)
         found += [(link.name, triangles) for triangles in shown]
     seen = {name for name, _ in found}
     found += [(name, rod) for name, rod in _rods(robot, seen)]
@@ -86,7 +91,11 @@ def appearance_of(robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = T
 
 
 def _shown(
-    shapes: Sequence[CollisionShape], folders: Sequence[Any], meshes: bool, missing: dict[str, str]
+    shapes: Sequence[CollisionShape],
+    folders: Sequence[Any],
+    meshes: bool,
+    missing: dict[str, str],
+    plain: tuple[float, ...] = GREY,
 ) -> list[Triangles]:
     """The shapes of a link as triangles, in its frame."""
     found = []
@@ -99,7 +108,7 @@ def _shown(
             missing[shape.file] = str(error)
             continue
         own = getattr(shape, "color", None)
-        colors = np.where(np.isnan(colors), GREY if own is None else own, colors)
+        colors = np.where(np.isnan(colors), plain if own is None else own, colors)
         place: Array = vertices @ np.asarray(shape.rotation).T + np.asarray(shape.translation)
         found.append(Triangles(place, faces, colors))
     return found

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -75,6 +77,17 @@ REPORT = """One HTML file about a plan: the verdict in a sentence, pictures, cur
 It asks nothing from another host."""
 REPORT_EXAMPLES = """examples:
   selfmotion report seam.npz seam.html --title "Seam 4, cell 2\""""
+VIEW = """Show motions: the robot with its meshes, the path asked for and the one done, frames, ghosts, curves of joints
+and torques with their limits, cost, manipulability, momentum or zero moment point, the nearest bodies, and the audit.
+
+The first file is a plan of `selfmotion plan`; others are held against it: plans, or trajectories of the same robot as
+`selfmotion check` reads them. A solution of a problem of your own (Solution.save) is shown with --robot. Without --page
+the page is served on this machine until Ctrl-C; with it it is one file that plays anywhere, without a server."""
+VIEW_EXAMPLES = """examples:
+  selfmotion view seam.npz
+  selfmotion view seam.npz --page seam.html
+  selfmotion view optimum.npz pseudo_inverse.csv --page both.html
+  selfmotion view circle.npz --robot panda.urdf --tip panda_hand_tcp --lock panda_finger_joint1=0.02"""
 CACHE = """What is dear to compute and depends on nothing but its input (covers of meshes, pairs that never touch, the
 functions of problems as the C compiler made them) is kept in $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion.
 Cleared, it is computed again. Compiled functions take 256 MB at most: those not used for longest make room."""
@@ -120,6 +133,28 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(report, "file", "HTML file to write")
     report.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
     report.add_argument("--title", help="of the report; the plan's file if not told")
+    view = _command(commands, "view", "play motions in a browser", VIEW, VIEW_EXAMPLES, run_view)
+    _file(view, "plan", "file of a plan, or of a solution with --robot (.npz)")
+    _file(view, "beside", "plans, or trajectories of the same robot, to hold against it", nargs="*", default=[])
+    _file(view, "--page", "write one HTML file, and serve nothing")
+    view.add_argument("--title", help="of the page; the plan's file if not told")
+    view.add_argument("--name", action="append", default=[], help="of a motion; repeatable, in the order of the files")
+    view.add_argument("--port", type=int, default=8080, help="to serve on, or the next that is free (default: 8080)")
+    view.add_argument("--open", action="store_true", help="open it in this machine's browser")
+    view.add_argument(
+        "--tolerance",
+        type=_tolerance,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="of the audit; repeatable",
+    )
+    _file(view, "--robot", "URDF file of the robot that a solution moves")
+    robot_options(view)
+    view.add_argument("--floating", action="store_true", help="its base floats: the state 'base' of the solution")
+    view.add_argument("--joints", default="joints", metavar="STATE", help="of the solution (default: joints)")
+    view.add_argument("--base", default="base", metavar="STATE", help="of the solution (default: base)")
+    view.set_defaults(called={"folders=[FOLDER]": "--folder FOLDER"})
     kept = _command(commands, "cache", "show or clear what is kept between runs", CACHE, CACHE_EXAMPLES, run_cache)
     kept.add_argument("action", nargs="?", choices=("show", "clear"), default="show", help="(default: show)")
     shell = _command(commands, "completion", "print a script of shell completion", COMPLETION, "", run_completion)
@@ -286,6 +321,64 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
     return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", told
 
 
+def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """The command `view`."""
+    from ocp.app.player import page
+    from ocp.app.serving import Served
+
+    progress("reading the motions")
+    shown = motions_of(options)
+    progress("drawing")
+    text, missing = page(
+        shown, title=options.title or options.plan.name, folders=options.folder, meshes=not options.no_meshes
+    )
+    for name, reason in missing.items():
+        progress.say(f"not shown: {name}: {reason}")
+    first = shown[0]
+    told = {"passed": first.passed, "verdict": first.verdict, "duration": float(first.t[-1]), "missing": missing}
+    status = 1 if first.passed is False else 0
+    if options.page is not None:
+        write_text(options.page, text)
+        told |= {"written": str(options.page), "bytes": len(text.encode())}
+        return status, f"{first.verdict}\nwritten: {options.page}".strip(), told
+    with Served(text, options.port) as served:
+        print(f"{options.plan.name} on {served.address}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        if options.open:
+            webbrowser.open(served.address)
+        served.wait()
+    return status, first.verdict, {**told, "address": served.address}
+
+
+def motions_of(options: argparse.Namespace) -> list[Any]:
+    """What the files of `view` hold, the plan first."""
+    from ocp.app.shown import shown_plan, shown_solution, shown_trajectory
+    from ocp.solution import Solution
+
+    files = [options.plan, *options.beside]
+    names = [file.name if [one.name for one in files].count(file.name) == 1 else str(file) for file in files]
+    names[: len(options.name)] = options.name[: len(files)]
+
+    machine: Any = None
+    allowed: dict[str, Any] = {"tolerances": dict(options.tolerance)} if options.tolerance else {}
+    if options.robot is not None:
+        robot = read_robot(options)
+        machine = FreeFloating(robot) if options.floating else FixedBase(robot, *mount_of(options))
+        states = {"joints": options.joints, "base": options.base}
+        found = [shown_solution(Solution.load(options.plan), machine, names[0], **states, **allowed)]
+    else:
+        made = Plan.load(options.plan)
+        machine, found = made.machine, [shown_plan(made, names[0], **allowed)]
+    for file, name in zip(options.beside, names[1:], strict=True):
+        if file.suffix.lower() != ".npz":
+            moving = [joint.name for joint in machine.robot.joints if joint.moves]
+            found.append(shown_trajectory(read_trajectory(file, joints=moving), machine, name))
+        elif options.robot is not None:
+            found.append(shown_solution(Solution.load(file), machine, name, **states, **allowed))
+        else:
+            found.append(shown_plan(Plan.load(file), name, **allowed))
+    return found
+
+
 def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `cache`."""
     files = cache.files()
@@ -344,6 +437,13 @@ def _named_number(text: str) -> tuple[str, float]:
     name, value = _limit(text)
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r} is not JOINT=VALUE")
+    return name, value
+
+
+def _tolerance(text: str) -> tuple[str, float]:
+    name, value = _limit(text)
+    if not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, NAME of a state, control or constraint")
     return name, value
 
 

@@ -15,7 +15,7 @@ import json
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from ocp.app.frames import TIP, Frames, frames_along
 from ocp.app.shown import Shown
 from ocp.errors import ProblemError
 
-__all__ = ["MOST_BYTES", "Buffers", "page", "unpacked"]
+__all__ = ["MOST_BYTES", "Buffers", "Page", "page", "unpacked"]
 
 MOST_BYTES = 8_000_000
 """Of a page."""
@@ -55,7 +55,19 @@ class Buffers:
         return told
 
 
-def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True) -> str:
+class Page(NamedTuple):
+    """A page.
+
+    Attributes:
+        text: HTML.
+        missing: Meshes that it does not show, as the descriptions name them, and why.
+    """
+
+    text: str
+    missing: dict[str, str]
+
+
+def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True) -> Page:
     """The page of one motion, or of several, the first held against the others.
 
     Args:
@@ -92,7 +104,7 @@ def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = ()
         size = len(text.encode())
         words = f"the page has {size / 1e6:.3g} MB, at most {MOST_BYTES / 1e6:g} are written; show fewer motions"
         raise ProblemError(words, name="page", value=size, limit=MOST_BYTES)
-    return text
+    return Page(text, missing)
 
 
 def unpacked(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
@@ -250,8 +262,11 @@ def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
         ],
     }
     if one.footing is not None:
-        foot = {"corners": one.footing.corners.tolist(), "points": buffers.put(one.footing.points, "f4")}
-        told["footing"] = foot
+        told["footing"] = {
+            "corners": one.footing.corners.tolist(),
+            "points": buffers.put(one.footing.points, "f4"),
+            "forces": one.footing.forces,
+        }
     if one.near is not None:
         bodies = list(dict.fromkeys(one.near.bodies))
         told["near"] = {

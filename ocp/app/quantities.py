@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -16,6 +17,8 @@ from ocp.tasks.limits import JointBounds
 
 __all__ = ["EARTH", "Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]
 
+CONSISTENT = 1e-8
+"""m, by which distances to the edges of a foot may not fit one point."""
 EARTH = (0.0, 0.0, -9.81)
 """m/s^2, of machines on a fixed base."""
 
@@ -45,10 +48,12 @@ class Footing:
     Attributes:
         corners: Of the region under its foot. Shape (k, 2), m.
         points: Zero moment points, at the motion's M times. Shape (M, 2), m.
+        forces: Whether forces from outside are known, and in them.
     """
 
     corners: Array
     points: Array
+    forces: bool
 
 
 def joint_curves(
@@ -57,6 +62,7 @@ def joint_curves(
     """Positions, rates and torques of all joints, shape (M, n) each, with what bounds them."""
     robot, found = machine.robot, []
     torques = None if accelerations is None else _torques(machine, joints, rates, accelerations)
+    torque_group = "Torques, without forces from outside" if isinstance(machine, Standing) else "Torques"
     for k, joint in enumerate(robot.moving_joints):
         found.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
     for k, joint in enumerate(robot.moving_joints):
@@ -65,7 +71,7 @@ def joint_curves(
     for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
         assert torques is not None
         most = float(bounds.torque[k])
-        found.append(Curve("Torques", joint.name, joint.effort_unit, torques[:, k], -most, most))
+        found.append(Curve(torque_group, joint.name, joint.effort_unit, torques[:, k], -most, most))
     return found
 
 
@@ -85,8 +91,8 @@ def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array
     return found
 
 
-def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array) -> list[Curve]:
-    """Manipulability and speed of the tip; of a floating machine its momentum, of which the base's own rates tell."""
+def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array | None) -> list[Curve]:
+    """Manipulability and speed of the tip; of a floating machine its momentum, where rates of its base are known."""
     robot, found = machine.robot, []
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     if robot.tip is not None:
@@ -97,7 +103,7 @@ def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, b
         index, speed = sampler(base, joints, rates)
         found.append(Curve("The motion", f"manipulability {what}", "", index[:, 0]))
         found.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
-    if isinstance(machine, FreeFloating) and robot.total_mass > 0:
+    if isinstance(machine, FreeFloating) and base_rates is not None:
         r = ca.SX.sym("r", machine.base_size)
         whole = machine.momentum(b, q, machine.twist_of_rate(b, r), v)
         own = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
@@ -115,18 +121,33 @@ def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, b
     return found
 
 
-def footing_of(machine: Standing, joints: Array, rates: Array, accelerations: Array) -> tuple[Footing, list[Curve]]:
-    """Where the ground pushes, how far from the edge of the foot, and how hard, without forces from outside."""
+def footing_of(
+    machine: Standing, joints: Array, rates: Array, accelerations: Array, inside: Sequence[Curve] = ()
+) -> tuple[Footing, list[Curve]]:
+    """Where the ground pushes, and how far from the edge of the foot.
+
+    Args:
+        joints, rates, accelerations: Shape (M, n) each.
+        inside: How far it is inside each edge, as a problem says that knows of forces from outside; less a margin that
+            is the same everywhere. Without, no such forces are known.
+    """
+    normals, corners = machine.support.normals, np.asarray(machine.support.vertices)
+    if len(inside) == len(normals):
+        point = ca.SX.sym("point", 2)
+        edges = np.array(ca.Function("edges", [point], [machine.support.distances(point)])(np.zeros(2))).ravel()
+        rows = np.column_stack([normals, -np.ones(len(normals))])
+        told = np.column_stack([one.values for one in inside]) - edges
+        found, *_ = np.linalg.lstsq(rows, told.T, rcond=None)
+        if np.abs(rows @ found - told.T).max() < CONSISTENT:
+            points = np.ascontiguousarray(found[:2].T)
+            distances = edges + points @ normals.T
+            margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)
+            return Footing(corners, points, True), [margin]
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
-    reaction = machine.ground_reaction(q, v, a)
-    point = center_of_pressure(reaction)
-    outputs = [point, machine.support.margin(point), reaction[5]]
-    points, margin, push = Sampler([q, v, a], outputs)(joints, rates, accelerations)
-    curves = [
-        Curve("Standing", "zero moment point from the edge of the foot", "m", margin[:, 0], 0.0),
-        Curve("Standing", "push of the ground", "N", push[:, 0], 0.0),
-    ]
-    return Footing(np.asarray(machine.support.vertices), points), curves
+    point = center_of_pressure(machine.ground_reaction(q, v, a))
+    points, inner = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
+    words = "zero moment point from the edge of the foot, no forces from outside"
+    return Footing(corners, points, False), [Curve("Standing", words, "m", inner[:, 0], 0.0)]
 
 
 def so_far(t: Array, values: Array) -> Array:

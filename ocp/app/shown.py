@@ -6,7 +6,7 @@ come nearest, the audit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,13 +27,17 @@ from ocp.files import RawTrajectory
 from ocp.local.rates import LocalSolution
 from ocp.planning import Plan
 from ocp.problem.formulation import Formulation
-from ocp.solution import Solution
+from ocp.solution import Solution, in_order_of
 from ocp.tasks.targets import Target
 
 __all__ = ["Near", "Shown", "shown_local", "shown_plan", "shown_solution", "shown_trajectory"]
 
 PER_SECOND, LEAST, MOST = 50, 200, 600
 """Times at which a motion is sampled."""
+SAME = 1e-3
+"""Relative: costs that end nearer to each other are told once."""
+FOOT = "zero moment point"
+"""What problems of standing machines call the constraint that keeps it in the foot."""
 LOOKS = 161
 """Times at which the nearest bodies are looked for."""
 
@@ -90,41 +94,44 @@ class Shown:
     cost: float | None = None
 
 
-def shown_plan(plan: Plan, name: str = "plan") -> Shown:
-    """A plan, with its audit."""
+def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
+    """A plan, with its audit, of which `settings` are."""
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
     near = _near(plan)
     single = len(plan.parts) == 1
-    costs = []
+    told: list[Curve] = []
     if single:
         fractions = plan._fractions(plan.parts[0], times)
         own = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
-        costs = _cost(plan.solution, fractions, own)
-    audit = plan.audit()
-    rates = _base_rates(times, base)
+        told = _told(plan.solution, fractions, own)
     given = sample.joints, sample.rates, sample.accelerations
-    about = {
+    about: dict[str, Any] = {
         "near": near,
         "around": tuple(_around(plan.solution)),
-        "verdict": f"The plan {audit.sentence}.",
-        "passed": audit.passed,
-        "rows": tuple(rows_of(audit)),
         "cost": plan.cost,
         "targets": plan.targets,
     }
-    return _shown(name, plan.machine, times, base, *given, rates, costs, **about)
+    about |= _audited(plan.solution, lambda: plan.audit(**settings))
+    return _shown(name, plan.machine, times, base, *given, _base_rates(times, base), told, **about)
 
 
 def shown_solution(
-    solution: Solution, machine: Machine, name: str = "solution", *, joints: str = "joints", base: str = "base"
+    solution: Solution,
+    machine: Machine,
+    name: str = "solution",
+    *,
+    joints: str = "joints",
+    base: str = "base",
+    **settings: Any,
 ) -> Shown:
     """A solution of a problem of one's own.
 
     Args:
         machine: Whose joints, and base, are states of the problem.
         joints, base: What these states are called.
+        settings: Of the audit.
 
     Raises:
         ProblemError: No such state, or another size.
@@ -151,14 +158,13 @@ def shown_solution(
     place = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     moves = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     about: dict[str, Any] = {"cost": solution.cost, "around": tuple(_around(solution))}
+    about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
-        audit = solution.audit()
         looks = np.linspace(0.0, solution.horizon, LOOKS)
-        about |= {"verdict": f"The plan {audit.sentence}.", "passed": audit.passed, "rows": tuple(rows_of(audit))}
         about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
     smooth = _torque_like(solution, joints)
-    costs = _cost(solution, fractions, times)
-    return _shown(name, machine, times, place, q, v, a if smooth else None, moves, costs, **about)
+    told = _told(solution, fractions, times)
+    return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
 
 
 def shown_local(local: LocalSolution, machine: Machine, name: str = "pseudo-inverse") -> Shown:
@@ -166,7 +172,8 @@ def shown_local(local: LocalSolution, machine: Machine, name: str = "pseudo-inve
     times = _times(float(local.t[-1]))
     at = [local.at(time) for time in times]
     base, joints, rates = (np.array([one[what] for one in at]) for what in ("base", "joints", "joint_rates"))
-    return _shown(name, machine, times, base, joints, rates, None, _base_rates(times, base), [])
+    moves = _between(times, local.t, local.base_rates) if machine.base_size else base
+    return _shown(name, machine, times, base, joints, rates, None, moves, [])
 
 
 def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Shown:
@@ -187,15 +194,21 @@ def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Sh
     times = _times(end - begin)
     joints, rates = motion.position.at(begin + times), motion.velocity.at(begin + times)
     accelerations = None if motion.acceleration is None else motion.acceleration.at(begin + times)
-    base = np.zeros((len(times), 0))
+    base, moves = np.zeros((len(times), 0)), None
     if machine.base_size:
         told = found.base
         if told is None:
             assert isinstance(machine, FreeFloating)
-            told = floating_base(machine, motion)[0]
-        base = np.column_stack([np.interp(begin + times, motion.t, column) for column in told.T])
-    rates_of_base = _base_rates(times, base)
-    return _shown(name or raw.file, machine, times, base, joints, rates, accelerations, rates_of_base, [])
+            told = floating_base(machine, motion)[0]  # moves as its momentum has it
+        else:
+            moves = _between(begin + times, motion.t, np.gradient(told, motion.t, axis=0))
+        base = _between(begin + times, motion.t, told)
+    return _shown(name or raw.file, machine, times, base, joints, rates, accelerations, moves, [])
+
+
+def _between(times: Array, t: Array, values: Array) -> Array:
+    """Columns of samples, straight between them."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def rows_of(audit: Any) -> list[Row]:
@@ -215,12 +228,15 @@ def _shown(
     joints: Array,
     rates: Array,
     accelerations: Array | None,
-    base_rates: Array,
-    costs: Sequence[Curve],
+    base_rates: Array | None,
+    told: Sequence[Curve],
     **about: Any,
 ) -> Shown:
     """With what every motion tells."""
-    curves = [Curve("Cost", "half the squared joint rates, so far", "", so_far(t, (rates**2).sum(axis=1) / 2)), *costs]
+    effort = so_far(t, (rates**2).sum(axis=1) / 2)
+    curves = [Curve("Cost", "half the squared joint rates, so far", "", effort)]
+    own = [one for one in told if one.group == "Cost"]
+    curves += [one for one in own if abs(one.values[-1] - effort[-1]) > SAME * max(abs(effort[-1]), 1e-12)]
     curves += machine_curves(machine, base, joints, rates, base_rates)
     near = about.get("near")
     if near is not None:
@@ -228,9 +244,10 @@ def _shown(
         curves.append(Curve("The motion", "nearest two bodies", "m", distances, float(near.asked.min())))
     footing = None
     if isinstance(machine, Standing) and accelerations is not None:
-        footing, more = footing_of(machine, joints, rates, accelerations)
+        footing, more = footing_of(machine, joints, rates, accelerations, [one for one in told if one.group == FOOT])
         curves += more
     curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
+    curves += _rooms([one for one in told if one.group != "Cost"])
     return Shown(name, machine, t, joints, base, tuple(curves), footing=footing, **about)
 
 
@@ -251,19 +268,47 @@ def _torque_like(solution: Solution, joints: str) -> bool:
     )
 
 
-def _cost(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """The running cost of the problem so far."""
+def _audited(solution: Solution, audit: Callable[[], Any]) -> dict[str, Any]:
+    """What the audit says; of a solution without its problem that there can be none."""
+    if solution.problem is None:
+        return {"verdict": f"Its problem is not in the file, so that nothing is audited: {solution.problem_lost}."}
+    found = audit()
+    return {"verdict": f"The plan {found.sentence}.", "passed": found.passed, "rows": tuple(rows_of(found))}
+
+
+def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
+    """What the problem itself says along the motion: its running cost so far, and every row of its path constraints.
+
+    The rows of a constraint have its name for their group.
+    """
     if solution.problem is None:
         return []
     form = Formulation.of(solution.problem)
-    x, u = solution.state_interpolant(fractions), solution.control_interpolant(fractions)
-    p = form.parameter_vector(solution.parameters)
-    order = list(form.states) == list(solution.states) and list(form.controls) == list(solution.controls)
-    if not order:
-        return []
-    running = form.sampled([form.running], x, u, times, solution.horizon, p)[0][:, 0]
-    own = so_far(fractions * solution.horizon, running)
-    return [Curve("Cost", "the problem's own, so far", "", own)]
+    ordered = in_order_of(form, solution)
+    x, u = ordered.state_interpolant(fractions), ordered.control_interpolant(fractions)
+    p = form.parameter_vector(ordered.parameters)
+    running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
+    lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
+    own = so_far(fractions * ordered.horizon, running[:, 0])
+    return [Curve("Cost", "the problem's own, so far", "", own)] + [
+        Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
+        for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
+    ]
+
+
+def _rooms(rows: Sequence[Curve]) -> list[Curve]:
+    """Of each constraint, how far its tightest row is from its limit, or of equations how far the worst is off."""
+    found = []
+    for name in dict.fromkeys(one.group for one in rows):
+        own = [one for one in rows if one.group == name]
+        unit = own[0].unit if "," not in own[0].unit else ""
+        if equal := [one for one in own if one.lower == one.upper]:
+            off = np.max([np.abs(one.values - one.lower) for one in equal], axis=0)
+            found.append(Curve("Constraints", f"{name}: off by", unit, off))
+        if open_ := [one for one in own if one.lower < one.upper]:
+            rooms = [np.minimum(one.values - one.lower, one.upper - one.values) for one in open_]
+            found.append(Curve("Constraints", f"{name}: room to its limit", unit, np.min(rooms, axis=0), 0.0))
+    return [one for one in found if np.isfinite(one.values).any()]
 
 
 def _near(plan: Plan) -> Near | None:

@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from models import Robot
 from models.arrays import Array
 from ocp import Audit, TipTask
+from ocp.app.frames import frames_along
 from ocp.audit.clearance import Nearest
 from ocp.tasks.equations import task_errors
 from scripts.robots import standing
 from scripts.robots.drawing import Scene, animate
-from ocp.app.frames import frames_along
-from scripts.robots.results import joint_return
-from scripts.viewer.plan import save_plan
+from scripts.robots.results import joint_return, save_motion, save_plan
 
 __all__ = ["StandingExample", "animated", "draw", "plan"]
 
@@ -82,20 +80,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
     """mobile_manipulator.png, .gif and .npz."""
     found = example.results
     standing.draw(folder, found)
-    robot, machine = found.robot, found.machine
-    save_plan(
-        folder / "mobile_manipulator.npz",
-        found.solution,
-        robot,
-        {
-            "tip": standing.HAND,
-            "inertia": "as_given",
-            "lock": {joint.name: 0.0 for joint in _whole().moving_joints if joint.name not in standing.JOINTS},
-        },
-        package=(standing.PACKAGE, standing.FILE),
-        translation=machine.translation,
-        rotation=machine.rotation,
-    )
+    save(folder / "mobile_manipulator.npz", example)
     if not animation:
         return
     corners = np.asarray(found.footprint.support.vertices)
@@ -105,6 +90,14 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
         f"forward with {standing.PULL:g} N."
     )
     animated(folder / "mobile_manipulator.gif", found, ground, note=note, nearest=example.nearest)
+
+
+def save(path: Path, example: StandingExample) -> None:
+    """Both motions: the plan, and beside it the one instant by instant as NAME.local.csv."""
+    found, local = example.results, example.results.local
+    save_plan(path, found.machine, found.solution, [example.task])
+    names = found.machine.robot.joint_names
+    save_motion(path.with_suffix(".local.csv"), names, local.t, local.joints, local.joint_velocities)
 
 
 def animated(
@@ -131,7 +124,3 @@ def animated(
         if motion is found.motion:
             scenes[-1] = replace(scenes[-1], nearest_points=nearest.points)
     animate(path, scenes, frames=50, seconds=0.1, note=note)
-
-
-def _whole() -> Robot:
-    return Robot.from_urdf(standing.robot_file(), tip=standing.HAND, inertia="as_given")

@@ -11,9 +11,9 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp import Collocation, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
+from ocp.app.frames import frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from ocp.app.frames import frames_along
 from scripts.robots.results import Example
 from scripts.robots.robots import PANDA
 
@@ -90,8 +90,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     machine, local, laps = example.machine, example.local, example.more["laps"]
     robot, again = machine.robot, repeated(example)
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(robot, local.joints), local.t, "orange", view=VIEW),
-        Scene("optimal cyclic plan", robot, frames_along(robot, again), local.t, "blue", view=VIEW),
+        Scene("pseudo-inverse", robot, frames_along(machine, local.joints), local.t, "orange", view=VIEW),
+        Scene("optimal cyclic plan", robot, frames_along(machine, again), local.t, "blue", view=VIEW),
     ]
     note = (
         f"{example.file.name} on a fixed base, fingers locked: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool "

@@ -21,12 +21,12 @@ from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned
+from ocp.app.frames import frames_along
 from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions
 from ocp.planning.search import Search
 from ocp.planning.steps import Squares
 from ocp.tasks.equations import bind
 from scripts.drawing import COLORS, VIRIDIS, sheet
-from ocp.app.frames import frames_along
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
 from scripts.robots.ur5 import roll
@@ -187,7 +187,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
 
 def rolls_of(robot: Robot, joints: Array) -> Array:
     """Roll of the tool in degrees, within half a turn. Shape (M,)."""
-    return np.asarray(np.degrees(np.angle(np.exp(1j * roll(frames_along(robot, joints))))))
+    return np.asarray(np.degrees(np.angle(np.exp(1j * roll(frames_along(FixedBase(robot), joints))))))
 
 
 def _nearest(space: JointSpace, charts: Charts, joints: Array, layers: Any) -> Array:

@@ -19,12 +19,11 @@ from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, 
 from models.arrays import Array
 from models.machines.standing import External
 from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
+from ocp.app.frames import frames_along
 from ocp.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
-from ocp.app.frames import frames_along
-from scripts.robots.mobile_manipulator import StandingExample, animated
+from scripts.robots.mobile_manipulator import StandingExample, animated, save
 from scripts.robots.robots import RobotFile
-from scripts.viewer.plan import save_plan
 
 __all__ = ["anymal", "draw", "plan", "problem", "reach", "reaction", "task"]
 
@@ -128,15 +127,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
         prefix="j2s6s200_",
         inset=(0.36, 0.1, 0.5, 0.5),
     )
-    save_plan(
-        folder / "pushing.npz",
-        found.solution,
-        robot,
-        ANYMAL.options,
-        package=(ANYMAL.package, ANYMAL.ending),
-        translation=machine.translation,
-        rotation=machine.rotation,
-    )
+    save(folder / "pushing.npz", example)
     if animation:
         note = (
             f"Grey: legs, and the footprint of the feet; diamond: zero moment point. The hand pushes to the right (-y) "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,18 @@ import numpy as np
 
 from models import FreeFloating, Machine
 from models.arrays import Array
-from ocp import Audit, Solution, TipTask
+from ocp import Audit, Plan, Solution, TipTask
 from ocp.curves import differentiation_matrix
 from ocp.local.rates import LocalSolution
+from ocp.planning.motion import Part
+from ocp.storage import write_text
 from ocp.tasks.equations import task_errors
 from scripts.robots.robots import RobotFile
-from scripts.viewer.plan import save_plan
 
 FINE = 1001
 """Times at which a plan is looked at, between its nodes too."""
+KEPT = 250
+"""Steps of a motion that a plan is compared with, in its file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +50,10 @@ class Example:
     more: dict[str, Any] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
-        """The plan for scripts/view.py."""
-        file = self.file
-        base = "base" if self.machine.base_size else None
-        save_plan(path, self.plan, self.machine.robot, file.options, package=(file.package, file.ending), base=base)
+        """Both motions: the plan, and beside it the one by the pseudo-inverse as NAME.local.csv."""
+        save_plan(path, self.machine, self.plan, [self.task])
+        names, local = self.machine.robot.joint_names, self.local
+        save_motion(path.with_suffix(".local.csv"), names, local.t, local.joints, local.joint_rates)
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
@@ -68,6 +72,20 @@ class Example:
             "audit_passed": self.audit.passed,
             **self.facts,
         }
+
+
+def save_plan(path: Path, machine: Machine, solution: Solution, tasks: Sequence[TipTask]) -> None:
+    """A solution as a plan, with its machine and what its tips are asked to do."""
+    Plan(machine, solution, (Part(0.0, solution.horizon, ""),)).with_targets(tasks).save(path)
+
+
+def save_motion(path: Path, names: Sequence[str], t: Array, joints: Array, rates: Array) -> None:
+    """A motion as CSV, about KEPT samples of it: times (M,), s, joints and rates (M, n)."""
+    step = max(1, (len(t) - 1) // KEPT)
+    rows = np.append(np.arange(0, len(t) - 1, step), len(t) - 1)
+    head = ",".join(["time", *names, *(f"{name}.velocity" for name in names)])
+    lines = (",".join(f"{value:.9g}" for value in row) for row in np.column_stack([t, joints, rates])[rows])
+    write_text(path, "\n".join([head, *lines]) + "\n")
 
 
 def tip_error(machine: Machine, task: TipTask, plan: Solution) -> float:

@@ -11,7 +11,22 @@ from typing import Any
 import numpy as np
 
 from models import Robot
-from scripts.viewer.plan import packaged
+
+
+def packaged(package: str, ending: str) -> Path:
+    """A file of an installed distribution.
+
+    Raises:
+        FileNotFoundError: The distribution is not installed, or has no such file; says what to install.
+    """
+    try:
+        owner = distribution(package)
+    except PackageNotFoundError:
+        raise FileNotFoundError(f"{ending} comes with the package {package!r}: pip install {package}") from None
+    found = [file for file in owner.files or [] if f"/{file.as_posix()}".endswith(f"/{ending}")]
+    if not found:
+        raise FileNotFoundError(f"the installed package {package!r} has no file {ending}: pip install -U {package}")
+    return Path(str(owner.locate_file(found[0])))
 
 
 @dataclass(frozen=True)

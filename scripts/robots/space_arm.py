@@ -10,10 +10,10 @@ import numpy as np
 from models import FreeFloating
 from models.spatial import rotation_from_rpy
 from ocp import Collocation, TipTask, plan_minimum_velocity, resolve
+from ocp.app.frames import frames_along
 from ocp.tasks.tracks import pose_line
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from ocp.app.frames import frames_along
 from scripts.robots.results import FINE, Example, turning_angle
 from scripts.robots.robots import SPACE_ARM
 
@@ -47,12 +47,13 @@ def plan(coarse: bool = False) -> Example:
 
 def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     """space_arm.png, space_arm.gif and space_arm.npz."""
-    robot, local, solution = example.machine.robot, example.local, example.plan
+    machine, local, solution = example.machine, example.local, example.plan
+    robot = machine.robot
     at = solution.at(local.t)
     boxes = (robot.root,)
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(robot, local.joints, local.base), local.t, "orange", boxes),
-        Scene("optimal", robot, frames_along(robot, at["joints"], at["base"]), local.t, "blue", boxes),
+        Scene("pseudo-inverse", robot, frames_along(machine, local.joints, local.base), local.t, "orange", boxes),
+        Scene("optimal", robot, frames_along(machine, at["joints"], at["base"]), local.t, "blue", boxes),
     ]
     base = robot.link(robot.root).mass
     note = (

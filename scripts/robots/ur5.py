@@ -12,11 +12,11 @@ from models import FixedBase, Machine
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
+from ocp.app.frames import TIP, Frames, frames_along
 from ocp.local.inverse_kinematics import Posture
 from ocp.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
-from ocp.app.frames import TIP, Frames, frames_along
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
 
@@ -133,7 +133,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     at = solution.at(local.t)
     look: dict[str, Any] = {"surface": panel(), "view": (24.0, -40.0), "tool": 0.1}
     scenes = [
-        Scene(title, robot, frames_along(robot, joints), local.t, color, **look)
+        Scene(title, robot, frames_along(example.machine, joints), local.t, color, **look)
         for title, joints, color in (
             ("pseudo-inverse, best conditioned start", local.joints, "orange"),
             ("optimal over roll and start", at["joints"], "blue"),

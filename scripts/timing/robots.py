@@ -28,9 +28,9 @@ from models import (
 from models.arrays import Array
 from scripts import drawing
 from scripts.papers.run import text_table
+from scripts.robots.robots import packaged
 from scripts.timing.measure import FLAGS as FAST
 from scripts.timing.measure import compiled, has_compiler, least
-from scripts.viewer.plan import packaged
 
 DATA = "example-robot-data"
 ROBOTS: dict[str, tuple[str, str, dict[str, Any]]] = {

@@ -117,7 +117,9 @@ class FootChart {
     this.figure = document.createElement("figure");
     this.figure.className = "chart";
     const caption = document.createElement("figcaption"), title = document.createElement("b");
-    title.textContent = "zero moment point in the footprint, seen from above";
+    const lacking = feet.length > 1 && feet[0].forces !== feet[1].forces ? `, ${feet[0].forces ? "what it is held against" :
+      "the plan"} without forces from outside` : feet[0].forces ? "" : ", without forces from outside";
+    title.textContent = `zero moment point in the footprint, seen from above${lacking}`;
     caption.append(title);
     const all = feet.flatMap(({corners, points}) => [...corners.map(([x, y]) => [x, y]),
       ...Array.from({length: points.length / 2}, (_, k) => [points[2 * k], points[2 * k + 1]])]).filter(

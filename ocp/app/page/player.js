@@ -40,7 +40,7 @@ class Motion {
     if (told.near) this.near = {t: arrays(told.near.t), points: arrays(told.near.points),
       distances: arrays(told.near.distances), bodies: told.near.bodies, which: told.near.which,
       line: scene.line(new Float32Array(6), true)};
-    if (told.footing) this.footing = {corners: told.footing.corners, points: arrays(told.footing.points),
+    if (told.footing) this.footing = {corners: told.footing.corners, forces: told.footing.forces, points: arrays(told.footing.points),
       times: this.time, line: scene.line(this.outline(told.footing.corners))};
     this.pose = new Float32Array(7 * this.width);
   }
@@ -199,7 +199,8 @@ class Player {
     if (this.grid && shown.floor) scene.drawLine(this.grid, COLORS.grid, 1);
     for (const {motion, kind} of visible) {
       const time = Math.min(this.time, motion.horizon), pose = motion.at(time), faint = told && kind === "other";
-      this.drawRobot(motion, pose, (color) => told ? this.tinted(color, COLORS[kind]) : color);
+      if (!(faint && visible.length > 1))
+        this.drawRobot(motion, pose, (color) => told ? this.tinted(color, COLORS[kind]) : color);
       if (shown.paths) {
         const upto = this.motions.length ? motion.before(motion.t, time) : 0;
         scene.drawLine(motion.done, [...COLORS[kind], 0.35], 1.6);
@@ -211,6 +212,11 @@ class Player {
       if (motion.footing) this.drawPush(motion, time, COLORS[kind]);
       if (shown.near && motion.near && !faint) this.drawNear(motion.near, time);
     }
+    for (const {motion} of visible.slice(1)) {  // over the plan as a veil, through which it is seen
+      const pose = motion.at(Math.min(this.time, motion.horizon));
+      scene.drawFaint(() => this.drawRobot(motion, pose, (color) => [...this.tinted(color, COLORS.other).slice(0, 3), 0.45]));
+    }
+    for (const {motion} of visible.slice(0, 1)) this.drawGlass(motion, motion.at(Math.min(this.time, motion.horizon)));
     if (shown.around) scene.drawFaint(() => {
       for (const {motion} of visible.slice(0, 1))
         for (const one of motion.around) scene.drawSurface(one, IDENTITY, COLORS.solid);
@@ -222,8 +228,16 @@ class Player {
   }
 
   drawRobot(motion, pose, paint) {
-    for (const {mover, surface, color} of this.robots[motion.told.robot].parts)
+    const {parts} = this.robots[motion.told.robot];
+    for (const {mover, surface, color} of parts.filter((one) => one.color[3] > 0.99))
       this.scene.drawSurface(surface, matrixOf(pose, 7 * mover), paint(color));
+  }
+
+  drawGlass(motion, pose) {
+    const glass = this.robots[motion.told.robot].parts.filter((one) => one.color[3] <= 0.99);
+    if (glass.length) this.scene.drawFaint(() => {
+      for (const {mover, surface, color} of glass) this.scene.drawSurface(surface, matrixOf(pose, 7 * mover), color);
+    });
   }
 
   tinted([red, green, blue, opacity], tint) {

@@ -191,12 +191,15 @@ class Scene {
     gl.drawElements(gl.TRIANGLES, surface.count, surface.kind, 0);
   }
 
-  drawFaint(draw) {  // what draw draws, as one veil: the nearest surface of it alone
+  drawFaint(draw) {  // what draw draws, as one veil: the nearest surface of it alone, behind what is at the same place
     const gl = this.gl;
+    gl.enable(gl.POLYGON_OFFSET_FILL);
+    gl.polygonOffset(2, 8);
     gl.colorMask(false, false, false, false);
     draw();
     gl.colorMask(true, true, true, true);
     draw();
+    gl.disable(gl.POLYGON_OFFSET_FILL);
   }
 
   drawLine(line, color, width, model = IDENTITY, count = line.count) {
