@@ -1,7 +1,8 @@
 """What a robot looks like: the visual shapes of its links, where there are none the shapes that it touches with.
 
 Meshes that are not found are told, and what the link touches with is shown instead; faintly where the description gives
-other links a look and this one none. Links that have neither are rods from joint to joint. Nothing is ever made up from masses and inertias.
+other links a look and this one none. Links that have neither are rods from joint to joint. Nothing is ever made up from
+masses and inertias.
 """
 
 from __future__ import annotations

@@ -246,6 +246,9 @@ class Plan:
         from ocp.app.plots import html_of_plan
 
         return html_of_plan(self)
+
+    # ---- what was asked -----------------------------------------------------------------------------------------
+
     def with_targets(self, tasks: Sequence[TipTask]) -> Plan:
         """The same plan, which tells what the tasks that it does ask for at ASKED times."""
         times = np.linspace(0.0, self.horizon, ASKED)

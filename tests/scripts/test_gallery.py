@@ -15,16 +15,16 @@ import pinocchio
 import pytest
 from PIL import Image
 
-from models import FixedBase
+from models import FixedBase, FreeFloating
 from models.arrays import Array
-from ocp import Solution, SolveError, resolve_accelerations
+from ocp import Plan, Solution, SolveError, resolve_accelerations
+from ocp.app.frames import TIP, Frames, frames_along
+from ocp.files import read_trajectory
 from scripts import gallery
 from scripts.robots import panda, posture_set, pushing, robots, ur5
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
-from scripts.robots.frames import TIP, Frames, frames_along
 from scripts.robots.results import turning_angle
-from scripts.viewer.plan import play
 
 pytestmark = pytest.mark.xdist_group("gallery")
 
@@ -174,10 +174,16 @@ def test_the_tool_of_the_ur5_stands_on_the_panel_by_another_librarys_kinematics(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_plan_can_be_played_from_its_file_alone(coarse: Gallery, name: str) -> None:
-    played = play(coarse.folder / f"{name}.npz")
-    frames = played.frames(np.linspace(0.0, played.horizon, 5))
+    made = Plan.load(coarse.folder / f"{name}.npz")
+    at = made.at(np.linspace(0.0, made.horizon, 5))
+    frames = frames_along(made.machine, at["joints"], at.get("base"))
     assert np.isfinite(frames.tip).all()
-    assert len(frames.positions) == len(played.robot.links) + 1
+    assert len(frames.positions) == len(made.machine.robot.links) + 1
+    for target in made.targets:
+        done = made.sampled(target.t).tip[:, :3]
+        np.testing.assert_allclose(done, np.where(np.isnan(target.position), done, target.position), atol=2e-3)
+    local = read_trajectory(coarse.folder / f"{name}.local.csv", joints=made.names)
+    assert local.names == made.names
     assert (coarse.folder / f"{name}.npz").stat().st_size < 400_000
     with Image.open(coarse.folder / f"{name}.png") as picture:
         assert min(picture.size) > 500
@@ -192,7 +198,7 @@ def test_the_summary_holds_every_example(coarse: Gallery) -> None:
 
 def test_roll_is_the_angle_about_the_tools_own_axis() -> None:
     robot = robots.UR5.read()
-    pose = frames_along(robot, np.tile([0.3, -1.4, 1.6, -1.5, -1.2, 0.4], (2, 1)))
+    pose = frames_along(FixedBase(robot), np.tile([0.3, -1.4, 1.6, -1.5, -1.2, 0.4], (2, 1)))
     angle = 0.7
     cosine, sine = np.cos(angle), np.sin(angle)
     about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -213,7 +219,9 @@ def test_an_animation_moves_from_its_first_picture_to_its_last(tmp_path: Path) -
     robot = robots.SPACE_ARM.read()
     joints = np.linspace(0.0, 1.0, 11)[:, None] * np.ones(7)
     base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (11, 1))
-    scene = Scene("turn", robot, frames_along(robot, joints, base), np.linspace(0, 1, 11), "blue", (robot.root,))
+    scene = Scene(
+        "turn", robot, frames_along(FreeFloating(robot), joints, base), np.linspace(0, 1, 11), "blue", (robot.root,)
+    )
     assert scene.edges(0).shape == (12, 2, 3)
     animate(tmp_path / "turn.gif", [scene], frames=4, seconds=0.1, note="note")
     with Image.open(tmp_path / "turn.gif") as film:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import models
-from models import CollisionShape, Joint, Link, Mimic, Robot, Wrench, planar_chain
+from models import CollisionShape, Joint, Link, Mimic, Robot, VisualShape, Wrench, planar_chain
 from tests.bad_values import (
     CHOICE,
     FINITE,
@@ -86,6 +86,7 @@ PARTS = [
             | {"skewed": np.triu(np.ones((3, 3))), "negative": -np.eye(3), "no triangle": np.diag([1.0, 0.0, 0.0])},
             "any_inertia": FLAG,
             "collisions": SEQUENCE | {"alone": crate()},
+            "visuals": SEQUENCE | {"alone": crate(), "collisions": [crate()]},
         },
     ),
     Case(
@@ -98,6 +99,19 @@ PARTS = [
             "file": TEXT,
             "translation": SPATIAL,
             "rotation": rotation(),
+        },
+    ),
+    Case(
+        "VisualShape",
+        VisualShape,
+        {"kind": "box", "size": (1, 1, 1)},
+        {
+            "kind": CHOICE,
+            "size": SPATIAL | {"negative": (1, -1, 1), "zero": (0, 1, 1)},
+            "file": TEXT,
+            "translation": SPATIAL,
+            "rotation": rotation(),
+            "color": array(4) | {"above 1": (1, 1, 1, 2), "negative": (-0.1, 0, 0, 1)},
         },
     ),
     method(

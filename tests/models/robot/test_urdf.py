@@ -176,6 +176,29 @@ def test_names_of_any_kind_are_written_and_the_tip_link_takes_a_name_that_is_fre
     assert again.tip == f"{odd}_tip2"
 
 
+def test_what_links_look_like_is_read_and_written_and_never_refuses_a_robot() -> None:
+    seen = [
+        '<visual><origin xyz="1 2 3" rpy="0 0 1"/><geometry><mesh filename="a.dae" scale="2 2 -2"/></geometry>'
+        '<material name="red"/></visual>',
+        '<visual><geometry><box size="300 300 0.1"/></geometry><material name=""><color rgba="0 1 0 0.5"/></material>'
+        "</visual>",
+        "<visual><geometry/></visual><visual/><visual><geometry><teapot/></geometry></visual>",
+        '<visual><geometry><sphere radius="0.1"/></geometry><material name="none"><color rgba="no"/></material>'
+        "</visual>",
+    ]
+    materials = '<material name="red"><color rgba="2 0 0 1"/></material><material name="none"/>'
+    robot = Robot.from_urdf(f'<robot name="r">{materials}<link name="a">{"".join(seen)}</link></robot>')
+    for each in (robot, Robot.from_urdf(robot.to_urdf())):
+        mesh, box, ball = each.link("a").visuals
+        assert (mesh.kind, mesh.file, box.kind, ball.kind) == ("mesh", "a.dae", "box", "sphere")
+        np.testing.assert_allclose(mesh.size, [2, 2, -2])
+        np.testing.assert_allclose(mesh.translation, [1, 2, 3])
+        np.testing.assert_allclose(mesh.rotation[:, 0], [np.cos(1), np.sin(1), 0], atol=1e-15)
+        np.testing.assert_allclose(np.array([mesh.color, box.color], dtype=float), [[1, 0, 0, 1], [0, 1, 0, 0.5]])
+        assert ball.color is None
+        assert not each.link("a").collisions
+
+
 def test_collision_shapes_are_read_with_their_places() -> None:
     shapes = {
         '<box size="1 2 3"/>': ("box", [1, 2, 3], ""),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,8 @@ import trimesh
 
 from models import ModelError
 from models.arrays import Array
-from models.shapes import mesh_files
-from models.shapes.mesh_files import Faces, find_mesh, read_mesh
+from models.shapes import collada, mesh_files, triangles
+from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh
 from tests.models.robot.pinocchio_robots import collection
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.1, 0.1, 0.5]])
@@ -195,7 +197,8 @@ def test_a_broken_file_is_named_with_the_place(tmp_path: Path, name: str, conten
 
 
 def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_files, "MOST_BYTES", {"binary": 1000, "text": 100})
+    for kind, most in (("binary", 1000), ("text", 100)):
+        monkeypatch.setitem(triangles.MOST_BYTES, kind, most)
     for name, contents in [("a.stl", b"solid" + b" " * 200), ("a.obj", b" " * 101), ("a.dae", b" " * 101)]:
         with pytest.raises(ModelError, match="bytes of text, limit 100"):
             read_mesh(written(tmp_path, name, contents))
@@ -206,7 +209,8 @@ def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_too_many_triangles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_files, "MOST_FACES", 3)
+    for module in (mesh_files, collada):
+        monkeypatch.setattr(module, "MOST_FACES", 3)
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendfacet\n"
     broken: list[tuple[str, str | bytes]] = [
         ("a.stl", binary_stl(CORNERS, FACES)),
@@ -251,6 +255,44 @@ def test_names_are_found_where_ros_finds_them(tmp_path: Path, monkeypatch: pytes
     assert find_mesh("meshes", None) is None
     assert find_mesh("a\0b", tmp_path) is None
     assert find_mesh("x" * 5000, tmp_path) is None
+
+
+def test_packages_are_found_where_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ROS names them, and as pip installs those of example-robot-data; folders that are told come first."""
+    name, places = "package://some_arm/a.stl", ("site/cmeel.prefix/share", "ament/share", "ros", "told")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "site")])
+    monkeypatch.setenv("AMENT_PREFIX_PATH", os.pathsep.join([str(tmp_path / "none"), str(tmp_path / "ament")]))
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "ros"))
+    assert find_mesh(name, tmp_path, [tmp_path / "told"]) is None
+    for place in places:  # each goes before those before it
+        (tmp_path / place / "some_arm").mkdir(parents=True)
+        file = written(tmp_path / place / "some_arm", "a.stl", binary_stl(CORNERS, FACES))
+        assert find_mesh(name, tmp_path, [tmp_path / "told"]) == file
+
+
+def test_faces_have_the_colour_of_their_material(tmp_path: Path) -> None:
+    """Collada: by the instance's names of them; OBJ: from the library beside it. What has none is not a number."""
+    sets = "".join(
+        f"<triangles count='1' material='{m}'>{INPUT}<p>0 1 2</p></triangles>" for m in ("one", "two", "three")
+    )
+    effects = "".join(
+        f"<effect id='e{k}'><profile_COMMON><technique sid='t'><phong><diffuse><color>{color}</color></diffuse></phong>"
+        f"</technique></profile_COMMON></effect>"
+        for k, color in enumerate(("1 0 0 1", "0 0.5 1 0.3"))
+    )
+    materials = "".join(f"<material id='m{k}'><instance_effect url='#e{k}'/></material>" for k in range(2))
+    bound = "<bind_material><technique_common><instance_material symbol='one' target='#m1'/><instance_material "
+    bound += "symbol='two' target='#m0'/></technique_common></bind_material>"
+    scene = f"<node><instance_geometry url='#g'>{bound}</instance_geometry></node>"
+    text = dae(scene, faces=sets).replace("<asset>", f"<library_effects>{effects}</library_effects>{materials}<asset>")
+    colors = read_painted_mesh(written(tmp_path, "a.dae", text)).colors
+    np.testing.assert_allclose(colors, [[0, 0.5, 1, 1], [1, 0, 0, 1], [np.nan] * 4])
+    written(tmp_path, "b.mtl", "newmtl blue\nKd 0 0 1\nnewmtl wrong\nKd a b c\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nmtllib b.mtl\nmtllib none.mtl\nf 1 2 3\n"
+    corners += "usemtl blue\nf 1 2 3\nusemtl wrong\nf 1 2 3\n"
+    colors = read_painted_mesh(written(tmp_path, "b.obj", corners)).colors
+    np.testing.assert_allclose(colors, [[np.nan] * 4, [0, 0, 1, 1], [np.nan] * 4])
+    assert np.isnan(read_painted_mesh(written(tmp_path, "c.stl", binary_stl(CORNERS, FACES))).colors).all()
 
 
 def test_folders_that_are_none_are_refused() -> None:

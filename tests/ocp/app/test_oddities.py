@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Robot, Sphere, Standing, Surroundings, mass_matrix, rectangle
+from ocp import Plan
 from ocp.app import Check, check_trajectory
 from ocp.app.bases import floating_base
 from ocp.app.joint_limits import floating_torques
@@ -20,7 +21,6 @@ from ocp.app.surroundings import proof, within_limits
 from ocp.errors import ProblemError
 from ocp.files import read_trajectory
 from ocp.local.touching import distances_along
-from scripts.viewer.plan import play
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
@@ -271,22 +271,19 @@ def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -
 )
 @pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")
 def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, clearance: float | None) -> None:
-    played = play(GALLERY / f"{name}.npz")
-    robot, solution = played.robot, played.solution
-    t = np.linspace(0.0, played.horizon, round(played.horizon / 0.01) + 1)
-    at = solution.at(t)
-    q = at[played.joints][:, played.columns]
-    rates = at["rates"] if "rates" in at else at["velocities"]
-    more = [at["accelerations"]] if "accelerations" in at else []
-    for values in ([q], [q, rates], [q, rates, *more]):
-        file = write_table(tmp_path / "m.csv", t, *values, names=tuple(robot.joint_names))
+    made = Plan.load(GALLERY / f"{name}.npz")
+    machine, robot = made.machine, made.machine.robot
+    sample = made.sampled(np.linspace(0.0, made.horizon, round(made.horizon / 0.01) + 1))
+    more = [sample.accelerations] if made.rated == "velocities" else []
+    place = {} if machine.base_size else {"translation": machine.translation, "rotation": machine.rotation}  # type: ignore[attr-defined]
+    for values in ([sample.joints], [sample.joints, sample.rates], [sample.joints, sample.rates, *more]):
+        file = write_table(tmp_path / "m.csv", sample.t, *values, names=made.names)
         found = check_trajectory(
             robot,
             read_trajectory(file, joints=robot.joint_names),
-            base="fixed" if played.base is None else "floating",
-            translation=played.translation,
-            rotation=played.rotation,
+            base="floating" if machine.base_size else "fixed",
             clearance=clearance,
+            **place,
         )
         assert found.passed, found
 

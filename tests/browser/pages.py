@@ -1,0 +1,232 @@
+"""What is done with each page, and what has to hold: it loads, plays, scrubs, switches plans, and asks nobody."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+import numpy as np
+
+from ocp import Plan
+from ocp.app.frames import TIP, frames_along
+from ocp.app.player import page
+from ocp.app.serving import Served
+from ocp.app.shown import Shown, shown_plan, shown_trajectory
+from ocp.files import read_trajectory
+
+__all__ = ["Look", "failures"]
+
+SLOW = 60_000
+"""ms: the pictures are made without a graphics card."""
+GALLERY = {
+    "panda": "Panda: a circle, cyclic, beside the pseudo-inverse",
+    "space_arm": "A free-flying arm, beside the pseudo-inverse",
+    "mobile_manipulator": "TIAGo on its wheels, a rope in its hand",
+}
+LOOSE = {"mobile_manipulator": {"tolerances": {"tip": 0.06, "velocities": 1e-3, "zero moment point": 1e-3}}}
+"""As scripts/robots/standing.py has them."""
+
+
+@dataclass
+class Look:
+    """A browser, where its pictures go, and what was wrong.
+
+    Attributes:
+        browser: Of playwright. folder: Of the pictures. told: What did not hold.
+    """
+
+    browser: Any
+    folder: Path
+    told: list[str] = field(default_factory=list)
+
+    def check(self, holds: object, words: str) -> None:
+        """Tell what does not hold."""
+        if not holds:
+            self.told.append(words)
+
+    @contextmanager
+    def opened(self, address: str, name: str, **settings: Any) -> Iterator[Any]:
+        """A page; whatever it complains of, and whomever else it asks, is told."""
+        context = self.browser.new_context(**{"viewport": {"width": 1360, "height": 860}, **settings})
+        opened = context.new_page()
+        opened.set_default_timeout(SLOW)
+        opened.on("console", lambda said: self.check(said.type not in ("error", "warning"), f"{name}: {said.text}"))
+        opened.on("pageerror", lambda error: self.check(False, f"{name}: {error}"))
+        own = urlparse(address).netloc
+        opened.on("request", lambda asked: self.check(_own(asked.url, own), f"{name} asks {asked.url}"))
+        try:
+            opened.goto(address)
+            yield opened
+        except Exception as error:  # of the driver: what did not come in time
+            self.told.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0]}")
+        finally:
+            context.close()
+
+    def picture(self, opened: Any, name: str) -> bytes:
+        """Of the whole window, kept; without the name of a file of the scene alone, not kept."""
+        return bytes(opened.screenshot(path=self.folder / f"{name}.png"))
+
+
+def _own(address: str, own: str) -> bool:
+    parts = urlparse(address)
+    return parts.scheme in ("data", "blob", "file") or (parts.netloc == own and own != "")
+
+
+def failures(look: Look, root: Path) -> list[str]:
+    """Open all pages; what does not hold."""
+    for name, title in GALLERY.items():
+        print(f"browser: {title}", flush=True)
+        file = root / "results" / "gallery" / f"{name}.npz"
+        plan = Plan.load(file)
+        raw = read_trajectory(file.with_suffix(".local.csv"), joints=plan.names)
+        shown = [shown_plan(plan, "optimum", **LOOSE.get(name, {})), shown_trajectory(raw, plan.machine, "compared")]
+        text = page(shown, title=title).text
+        target = look.folder / f"{name}.html"
+        target.write_text(text, encoding="utf-8")
+        look.check(len(text.encode()) <= 8_000_000, f"{name}: the page has {len(text.encode())} bytes")
+        with look.opened(target.as_uri(), name) as opened:
+            player(look, opened, name, shown[0])
+        with look.opened(target.as_uri(), f"{name}, phone", viewport={"width": 390, "height": 844}) as opened:
+            ready(opened)
+            wide = opened.evaluate("document.documentElement.scrollWidth")
+            look.check(wide <= 390, f"{name}: on a phone the page is {wide} px wide")
+            look.picture(opened, f"{name}_phone")
+        if name == "panda":
+            with Served(text) as served, look.opened(served.address, "served") as opened:
+                player(look, opened, "served", shown[0])
+            with look.opened(target.as_uri(), "dark", color_scheme="dark") as opened:
+                ready(opened)
+                look.picture(opened, "panda_dark")
+    site(look, root / "build" / "site")
+    return look.told
+
+
+def ready(opened: Any) -> None:
+    """Wait until the page is drawn."""
+    until(opened, "document.documentElement.dataset.ready === 'yes'")
+    opened.wait_for_timeout(300)
+
+
+def until(opened: Any, holds: str) -> None:
+    """Wait until an expression holds; asked from outside, as the page's policy forbids to evaluate texts in it."""
+    end = monotonic() + SLOW / 1000
+    while not opened.evaluate(holds):
+        if monotonic() > end:
+            raise TimeoutError(f"{holds}: not within {SLOW / 1000:g} s")
+        opened.wait_for_timeout(20)
+
+
+def player(look: Look, opened: Any, name: str, first: Shown) -> None:
+    """Play, pause, scrub, change the speed, loop, switch plans; the drawn poses are those of the model."""
+    ready(opened)
+    scene = opened.locator("#scene")
+    begin = scene.screenshot()
+    opened.click("#play")
+    until(opened, "player.time > 0.4")
+    opened.click("#play")
+    time = opened.evaluate("player.time")
+    look.check(not opened.evaluate("player.playing"), f"{name}: pause does not stop it")
+    opened.wait_for_timeout(300)
+    look.check(opened.evaluate("player.time") == time, f"{name}: it goes on while paused")
+    look.check(scene.screenshot() != begin, f"{name}: playing moves nothing")
+    horizon = opened.evaluate("player.horizon")
+    opened.locator("#scrub").evaluate(
+        "(one, to) => { one.value = to; one.dispatchEvent(new Event('input')); }", 0.6 * horizon
+    )
+    opened.wait_for_timeout(300)
+    clock = opened.inner_text("#clock")
+    look.check(
+        clock.startswith(f"{0.6 * horizon:.2f}"), f"{name}: scrubbed to {0.6 * horizon:.2f} s the clock says {clock}"
+    )
+    shift = opened.locator(".chart .cursor").first.get_attribute("transform") or ""
+    look.check(not shift.startswith("translate(34.00 "), f"{name}: the cursor of the curves does not follow: {shift}")
+    look.picture(opened, f"{name}_over")
+    poses(look, opened, name, first)
+    chart = opened.locator(".chart svg").first.bounding_box()
+    opened.mouse.click(chart["x"] + 0.5 * chart["width"], chart["y"] + 0.5 * chart["height"])
+    share = opened.evaluate("player.time") / horizon
+    look.check(0.35 < share < 0.55, f"{name}: a click in the middle of a curve goes to {share:.2f} of the time")
+    opened.uncheck("#loop")
+    opened.select_option("#speed", "10")
+    opened.evaluate("player.seek(0.95 * player.horizon); player.play()")
+    until(opened, "!player.playing")
+    look.check(opened.evaluate("player.time === player.horizon"), f"{name}: without loop it does not end at the end")
+    opened.check("#loop")
+    opened.evaluate("player.play()")
+    until(opened, "player.time > 0.5 * player.horizon")
+    until(opened, "player.time < 0.5 * player.horizon")
+    opened.evaluate("player.stop(); player.seek(0.3 * player.horizon)")
+    opened.wait_for_timeout(300)
+    over = scene.screenshot()
+    opened.locator("#options select[aria-label=shown]").select_option("side")
+    opened.check("#show-ghosts")
+    opened.wait_for_timeout(500)
+    look.picture(opened, f"{name}_side")
+    look.check(scene.screenshot() != over, f"{name}: side by side is as over each other")
+    opened.locator("#options select[aria-label=shown]").select_option("alone")
+    opened.wait_for_timeout(300)
+    alone, verdict = scene.screenshot(), opened.inner_text("#verdict")
+    look.check(first.verdict in verdict, f"{name}: the verdict is not told: {verdict}")
+    look.check(opened.locator("#audit tr").count() > 5, f"{name}: the audit has no table")
+    look.picture(opened, f"{name}_alone")
+    opened.locator("#options select[aria-label=plan]").select_option("1")
+    opened.wait_for_timeout(300)
+    look.check(scene.screenshot() != alone, f"{name}: switching plans changes nothing")
+    look.check(opened.inner_text("#verdict") != verdict, f"{name}: switching plans keeps the verdict")
+    opened.evaluate("window.scrollTo(0, document.body.scrollHeight)")
+    opened.wait_for_timeout(200)
+    look.picture(opened, f"{name}_below")
+
+
+def poses(look: Look, opened: Any, name: str, first: Shown) -> None:
+    """What the page draws between its times, against the model."""
+    robot = first.machine.robot
+    links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP]
+    for time in np.random.default_rng(0).uniform(0.0, first.t[-1], 5):
+        drawn = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
+        joints, base = (
+            np.array([[np.interp(time, first.t, column) for column in values.T]])
+            for values in (first.joints, first.base)
+        )
+        frames = frames_along(first.machine, joints, base)
+        wanted = np.array([frames.positions[link][0] for link in links])
+        off = float(np.abs(drawn[:, :3] - wanted).max())
+        look.check(off < 2e-3, f"{name}: at {time:.3f} s a link is drawn {off:.2g} m from where it is")
+
+
+def site(look: Look, folder: Path) -> None:
+    """Every page of the site, where it has been built: no complaint, no other host, and every link within resolves."""
+    pages = sorted(folder.rglob("*.html")) if folder.is_dir() else []
+    print(f"browser: {len(pages)} pages of the site", flush=True)
+    anchors: dict[Path, set[str]] = {}
+
+    def known(file: Path) -> set[str]:
+        if file not in anchors:
+            anchors[file] = set(re.findall(r"\bid=[\"']?([^\"'\s>]+)", file.read_text(encoding="utf-8")))
+        return anchors[file]
+
+    for file in pages:
+        name = file.relative_to(folder).as_posix()
+        with look.opened(file.as_uri(), name) as opened:
+            opened.wait_for_load_state("load")
+            links = opened.eval_on_selector_all("a[href]", "(all) => all.map((one) => one.href)")
+            for link in dict.fromkeys(links):
+                _resolves(look, name, link, known)
+
+
+def _resolves(look: Look, name: str, link: str, known: Callable[[Path], set[str]]) -> None:
+    parts = urlparse(link)
+    if parts.scheme != "file":
+        return
+    target = Path(unquote(parts.path))
+    target = target / "index.html" if target.is_dir() else target
+    if not target.is_file():
+        look.check(False, f"{name}: the link {link} leads nowhere")
+    elif parts.fragment and target.suffix == ".html":
+        look.check(unquote(parts.fragment) in known(target), f"{name}: there is no #{parts.fragment} in {target.name}")

@@ -1,0 +1,459 @@
+"""Pages that play motions: every surface and every frame where the model has it, curves that obey their laws."""
+
+from __future__ import annotations
+
+import json
+import re
+import urllib.error
+import urllib.request
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import (
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    Joint,
+    Link,
+    Machine,
+    Robot,
+    Sphere,
+    Standing,
+    Surroundings,
+    VisualShape,
+    link_frames,
+    locked,
+    mass_matrix,
+    rectangle,
+    simplified,
+    with_load,
+)
+from models.arrays import Array
+from models.robot.kinematics import centers_of_mass
+from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
+from ocp.app import appearance, main, player, serving
+from ocp.app.appearance import appearance_of
+from ocp.app.frames import frames_along
+from ocp.app.player import page, unpacked
+from ocp.app.quantities import Curve, footing_of
+from ocp.app.serving import Served
+from ocp.app.shown import shown_local, shown_plan, shown_solution, shown_trajectory
+from ocp.files import read_trajectory
+from ocp.local.touching import distances_along
+from ocp.planning.motion import Part
+from ocp.tasks.targets import targets_along
+from tests.models.machines.armoured import armoured_arm
+
+MACHINE = """<robot name="arm">
+  <material name="red"><color rgba="1 0 0 1"/></material>
+  <link name="hull"><inertial><mass value="20"/><inertia ixx="2" iyy="3" izz="4" ixy="0.1" ixz="0" iyz="0"/></inertial>
+    <visual><origin xyz="0 0 0.1" rpy="0 0 1"/><geometry><box size="1 0.4 0.2"/></geometry></visual></link>
+  <link name="upper/arm"><inertial><origin xyz="0.3 0 0"/><mass value="2"/>
+    <inertia ixx="0.01" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://arm_description/upper.obj" scale="2 1 -1"/></geometry>
+      <material name="red"/></visual>
+    <collision><geometry><cylinder radius="0.04" length="0.5"/></geometry></collision></link>
+  <link name="fore"><inertial><origin xyz="0.25 0 0"/><mass value="1.5"/>
+    <inertia ixx="0.01" iyy="0.05" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><cylinder radius="0.05" length="0.5"/></geometry></visual></link>
+  <link name="hand"><inertial><mass value="0.5"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><sphere radius="0.05"/></geometry></collision></link>
+  <link name="finger"/>
+  <joint name="shoulder" type="revolute"><parent link="hull"/><child link="upper/arm"/><origin xyz="0.5 0 0.1"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="5" effort="9"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper/arm"/><child link="fore"/>
+    <origin xyz="0.6 0 0" rpy="0.3 0 0"/><axis xyz="0 1 0"/></joint>
+  <joint name="wrist" type="revolute"><parent link="fore"/><child link="hand"/><origin xyz="0.5 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="5" effort="9"/></joint>
+  <joint name="grip" type="prismatic"><parent link="hand"/><child link="finger"/><origin xyz="0.1 0 0"/>
+    <axis xyz="1 0 0"/><limit lower="0" upper="0.1" velocity="1" effort="9"/></joint>
+</robot>"""
+OBJ = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+OPTIONS: dict[str, Any] = {"tip": "finger", "lock": {"grip": 0.05}, "tip_translation": [0.2, 0.0, 0.01]}
+TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+START = np.array([0.4, 0.7, -0.6])
+GROUPS = {"Cost", "The motion", "Joints", "Joint rates"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """arm.urdf, and its mesh in a package."""
+    path = tmp_path_factory.mktemp("arm")
+    (path / "arm.urdf").write_text(MACHINE, encoding="utf-8")
+    (path / "share" / "arm_description").mkdir(parents=True)
+    (path / "share" / "arm_description" / "upper.obj").write_text(OBJ, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def robot(folder: Path) -> Robot:
+    return Robot.from_urdf(folder / "arm.urdf", **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def machines(robot: Robot) -> dict[str, Machine]:
+    return {"fixed": FixedBase(robot, (0.1, -0.2, 0.7), TURN), "floating": FreeFloating(robot)}
+
+
+@pytest.fixture(scope="module")
+def plans(machines: dict[str, Machine]) -> dict[str, Plan]:
+    return {kind: planned(machine) for kind, machine in machines.items()}
+
+
+def planned(machine: Machine, **more: Any) -> Plan:
+    problem = minimum_velocity_problem(machine, (0.1, -0.1), (3, 4), START, 1.5, **more)
+    solution = solve(problem, Collocation(intervals=6, degree=3))
+    return Plan(machine, solution, (Part(0.0, 1.5, ""),))
+
+
+def turned(quaternion: Array) -> Array:
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def surfaces(told: Any, arrays: Any, robot: int = 0) -> dict[tuple[str, tuple[float, ...]], Array]:
+    """Corners of what is shown, in the frame of the link that moves it, by the link's name and the colour."""
+    found = {}
+    for part in told["robots"][robot]["parts"]:
+        corners = np.array(part["low"]) + np.array(part["step"]) * arrays[part["vertices"]["at"]][:, :3]
+        found[part["link"], tuple(part["color"])] = corners
+    return found
+
+
+@pytest.mark.parametrize("kind", ["fixed", "floating"])
+def test_every_frame_and_the_tip_stand_where_the_model_has_them(
+    plans: dict[str, Plan], machines: dict[str, Machine], kind: str
+) -> None:
+    machine, plan = machines[kind], plans[kind]
+    told, arrays = unpacked(page([shown_plan(plan)]).text)
+    motion, movers = told["motions"][0], told["robots"][0]["movers"]
+    t, poses = arrays[motion["t"]["at"]], arrays[motion["poses"]["at"]]
+    assert movers == ["hull", "upper/arm", "fore", "hand"]
+    for k in (0, len(t) // 3, len(t) - 1):
+        at = plan.at(float(t[k]))
+        base = at["base"] if machine.base_size else ()
+        frames = link_frames(machine.robot, ca.DM(at["joints"]), machine.world_from_base(ca.DM(base)))
+        wanted = [
+            (np.array(ca.DM(f.position)).ravel(), np.array(ca.DM(f.rotation))) for f in map(frames.get, movers) if f
+        ]
+        tip = machine.tip_pose(base, at["joints"])  # 0.2 m off its link
+        wanted.append((np.array(ca.DM(tip.position)).ravel(), np.array(ca.DM(tip.rotation))))
+        for pose, (position, rotation) in zip(poses[k], wanted, strict=True):
+            np.testing.assert_allclose(pose[:3], position, atol=2e-6)
+            np.testing.assert_allclose(turned(pose[3:].astype(float)), rotation, atol=2e-6)
+    steps = (poses[1:, :, 3:] * poses[:-1, :, 3:]).sum(axis=2)
+    assert steps.min() > 0.9  # between two times the turn is the short way round
+
+
+def test_links_look_as_they_are_described_and_else_as_they_touch(folder: Path, robot: Robot) -> None:
+    looks = appearance_of(robot, [folder / "share"])
+    assert not looks.missing
+    by = {part.link: part for part in looks.parts}
+    assert set(by) == {"hull", "upper/arm", "fore", "hand", "finger"}  # of the finger the rod to the tip
+    cosine, sine = np.cos(1), np.sin(1)
+    signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.2, 0.2) for z in (-0.1, 0.1)])
+    corners = signs @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) + [0, 0, 0.1]
+    np.testing.assert_allclose(np.unique(by["hull"].vertices.round(4), axis=0), np.unique(corners.round(4), axis=0))
+    np.testing.assert_allclose(np.ptp(by["upper/arm"].vertices, axis=0), [0.2, 0.1, 0.1], atol=1e-9)
+    assert by["upper/arm"].vertices[:, 2].min() == pytest.approx(-0.1)  # mirrored
+    assert by["upper/arm"].color == (1.0, 0.0, 0.0, 1.0)
+    assert by["hand"].color[3] < 0.5  # without a look among others that have one: faint
+    np.testing.assert_allclose(np.linalg.norm(by["hand"].vertices, axis=1), 0.05, atol=1e-6)
+    bare = appearance_of(robot)
+    assert list(bare.missing) == ["package://arm_description/upper.obj"]
+    instead = {part.link: part for part in bare.parts}["upper/arm"]  # what it touches with
+    np.testing.assert_allclose(np.ptp(instead.vertices, axis=0), [0.08, 0.08, 0.5], atol=1e-6)
+    assert instead.color[3] == 1.0
+    assert not appearance_of(robot, meshes=False).missing
+    nothing = Robot((Link("a", 1.0), Link("b", 1.0), Link("c")), tuple(_chain(("a", "b", "c"))), tip="c")
+    assert {part.link for part in appearance_of(nothing).parts} == {"a", "b"}  # rods
+
+
+def _chain(names: tuple[str, ...]) -> Any:
+    for parent, child in pairwise(names):
+        yield Joint(f"to_{child}", "revolute", parent, child, (0.3, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("change", ["simplified", "locked", "with_load"])
+def test_a_robot_that_was_changed_looks_the_same(folder: Path, robot: Robot, change: str) -> None:
+    changed = {
+        "simplified": lambda: simplified(robot),
+        "locked": lambda: locked(robot, {"wrist": -0.6}),
+        "with_load": lambda: with_load(robot, "hand", 2.0),
+    }[change]()
+    clouds = []
+    for one in (robot, changed):
+        q = START[: one.dof]
+        frames = frames_along(FixedBase(one), q)
+        parts = [part for part in appearance_of(one, [folder / "share"]).parts if part.color != appearance.ROD]
+        points = [part.vertices @ frames.rotations[part.link][0].T + frames.positions[part.link][0] for part in parts]
+        clouds.append(np.unique(np.vstack(points).round(4), axis=0))
+    np.testing.assert_allclose(clouds[0], clouds[1], atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("shape", "extent", "normal"),
+    [
+        (VisualShape("sphere", (0.2,)), (0.4, 0.4, 0.4), lambda p: p / 0.2),
+        (VisualShape("capsule", (0.1, 0.6)), (0.2, 0.2, 0.8), lambda p: (p - [0, 0, 1] * p.clip(-0.3, 0.3)) / 0.1),
+        (VisualShape("box", (0.2, 0.4, 0.6)), (0.2, 0.4, 0.6), None),
+        (VisualShape("cylinder", (0.1, 0.6)), (0.2, 0.2, 0.6), None),
+    ],
+)
+def test_simple_shapes_are_closed_and_their_normals_point_out(shape: VisualShape, extent: Any, normal: Any) -> None:
+    (part,) = appearance_of(Robot((Link("a", visuals=(shape,)),))).parts
+    np.testing.assert_allclose(np.ptp(part.vertices, axis=0), extent, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(part.normals, axis=1), 1.0, atol=1e-9)
+    corners = part.vertices[part.faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    np.testing.assert_allclose(areas.sum(axis=0), 0, atol=1e-9)  # closed
+    volume = np.einsum("fi,fi->", corners[:, 0], areas) / 3
+    whole = {"sphere": 4 / 3 * np.pi * 0.008, "capsule": np.pi * 0.01 * (0.6 + 0.4 / 3), "box": 0.048}
+    assert volume == pytest.approx(whole.get(shape.kind, np.pi * 0.01 * 0.6), rel=0.03)
+    for k in range(3):
+        assert (np.einsum("fi,fi->f", part.normals[part.faces[:, k]], areas) > 0).all()
+    if normal is not None:
+        np.testing.assert_allclose(part.normals, normal(part.vertices), atol=0.05)
+    else:  # sharp edges: every normal along z, or across it
+        upright = np.abs(part.normals[:, 2])
+        assert (np.minimum(upright, 1 - upright) < 1e-9).all()
+
+
+def test_meshes_of_many_faces_become_coarse_and_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(appearance, "ROUND", 200)
+    robot = Robot((Link("a", visuals=(VisualShape("sphere", (0.2,)),)),))
+    (fine,) = appearance_of(robot).parts
+    monkeypatch.setattr(appearance, "MOST_FACES", 4000)
+    (coarse,) = appearance_of(robot).parts
+    assert 500 < len(coarse.faces) <= 4000 < len(fine.faces)
+    np.testing.assert_allclose(np.linalg.norm(coarse.vertices, axis=1), 0.2, atol=0.01)
+
+
+def test_what_is_asked_for_is_told_in_the_world(robot: Robot, tmp_path: Path) -> None:
+    """In the axes of a link that moves, of some coordinates alone, from the beginning of the task to its end."""
+    machine = FixedBase(robot, (0.1, -0.2, 0.7), TURN)
+    times, joints = np.linspace(0.0, 2.0, 21), START + np.linspace(0.0, 0.3, 21)[:, None]
+    tasks = [
+        TipTask(position=lambda t: ca.vertcat(t, 0.5, 0.0), direction=(0, 0, -2), begin=0.5, duration=1.0),
+        TipTask(position=(0.1, 0.2, 0.3), orientation=(1.0, 0, 0, 0), link="hand", relative_to="upper/arm"),
+        TipTask(rows=(3, 4), velocity=(0.1, 0.0)),
+    ]
+    first, second = targets_along(machine, tasks, times, np.zeros((21, 0)), joints)
+    inside = (times >= 0.5) & (times <= 1.5)
+    assert np.isnan(first.position[~inside]).all()
+    np.testing.assert_allclose(
+        first.position[inside], np.column_stack([times - 0.5, 0 * times + 0.5, 0 * times])[inside]
+    )
+    np.testing.assert_allclose(first.rotation[inside][:, :, 2], np.tile([0, 0, -1.0], (inside.sum(), 1)))
+    frames = frames_along(machine, joints)
+    turn, place = frames.rotations["upper/arm"], frames.positions["upper/arm"]
+    np.testing.assert_allclose(second.position, turn @ [0.1, 0.2, 0.3] + place, atol=1e-12)
+    np.testing.assert_allclose(second.rotation, turn, atol=1e-12)
+    made = planned(machine).with_targets(tasks[:2])
+    made.save(tmp_path / "plan.npz")
+    again = Plan.load(tmp_path / "plan.npz")
+    for one, other in zip(made.targets, again.targets, strict=True):
+        for part, stored in zip(one, other, strict=True):
+            np.testing.assert_array_equal(part, stored)
+    told, _ = unpacked(page([shown_plan(again)]).text)
+    assert len(told["motions"][0]["targets"]) == 2
+    looks = [[(s.kind, s.file) for link in m.robot.links for s in link.visuals] for m in (machine, again.machine)]
+    assert looks[0] == looks[1] != []
+
+
+def curves_of(shown: Any) -> dict[tuple[str, str], Curve]:
+    return {(curve.group, curve.name): curve for curve in shown.curves}
+
+
+def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows(plans: dict[str, Plan]) -> None:
+    plan = plans["fixed"]
+    shown = shown_plan(plan)
+    found = curves_of(shown)
+    assert {group for group, _ in found} >= GROUPS | {"Torques"}
+    assert found["Cost", "half the squared joint rates, so far"].values[-1] == pytest.approx(plan.cost, rel=1e-4)
+    assert ("Cost", "the problem's own, so far") not in found  # the same
+    assert found["Joints", "shoulder"].upper == 3.0
+    assert found["Joints", "elbow"].upper == np.inf
+    robot, q = plan.machine.robot, ca.SX.sym("q", 3)
+    v = ca.SX.sym("v", 3)
+    frame = plan.machine.world_from_base(())
+    heights = [
+        link.mass * 9.81 * c[2] for link, c in zip(robot.links, centers_of_mass(robot, q, frame).values(), strict=True)
+    ]
+    energy = ca.Function("energy", [q, v], [ca.mtimes([v.T, mass_matrix(robot, q), v]) / 2 + sum(heights)])
+    sample = plan.sampled(shown.t)
+    values = np.array([float(energy(*each)) for each in zip(sample.joints, sample.rates, strict=True)])
+    torques = np.column_stack([found["Torques", name].values for name in plan.names])
+    power = (torques * sample.rates).sum(axis=1)
+    work = np.sum(np.diff(shown.t) * (power[1:] + power[:-1]) / 2)
+    assert work == pytest.approx(values[-1] - values[0], rel=2e-3)
+
+
+def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, Plan]) -> None:
+    found = curves_of(shown_plan(plans["floating"]))
+    whole, own = (found["Momentum", f"momentum, of {which}"].values for which in ("the whole", "the joints alone"))
+    assert own.max() > 0.1
+    assert whole.max() < 1e-3 * own.max()
+
+
+def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) -> None:
+    machine = FixedBase(armoured_arm())
+    start = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
+    clear = Clear(Surroundings(machine, [Sphere(0.05, (0.9, 0.4, 0.2))]))
+    problem = minimum_velocity_problem(machine, (0.0, 0.1, 0.0), (3, 4, 5), start, 1.0, clear=clear)
+    plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
+    near = shown_plan(plan).near
+    assert near is not None
+    joints = plan.at(near.t)["joints"]
+    apart = distances_along(clear.surroundings, np.zeros((len(near.t), 0)), joints, near.t)
+    np.testing.assert_allclose(near.distances, apart.min(axis=1), atol=1e-9)
+    best = apart.argmin(axis=1)
+    labels = clear.surroundings.labels
+    assert [tuple(labels[k]) for k in best] == [tuple(pair) for pair in near.bodies]
+    told, arrays = unpacked(page([shown_plan(plan)]).text)
+    assert len(told["motions"][0]["around"]) == 1  # the ball
+    ball = told["motions"][0]["around"][0]
+    corners = np.array(ball["low"]) + np.array(ball["step"]) * arrays[ball["vertices"]["at"]][:, :3]
+    np.testing.assert_allclose(np.linalg.norm(corners - [0.9, 0.4, 0.2], axis=1), 0.05, atol=1e-4)
+
+
+def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Robot) -> None:
+    """Which know of forces from outside, up to a margin; without rows, and at rest, it is below the centre of mass."""
+    machine = Standing(robot, support=rectangle((-0.5, 0.9), (-0.4, 0.6)))
+    joints, still = np.tile(START, (5, 1)), np.zeros((5, 3))
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 2))
+    offsets = (machine.support.normals * machine.support.vertices).sum(axis=1)
+    rows = points @ machine.support.normals.T - offsets - 0.02
+    inside = [Curve("zero moment point", str(k), "m", row, 0.0) for k, row in enumerate(rows.T)]
+    found, (margin,) = footing_of(machine, joints, still, still, inside)
+    np.testing.assert_allclose(found.points, points, atol=1e-12)
+    np.testing.assert_allclose(margin.values, rows.min(axis=1) + 0.02, atol=1e-12)
+    assert found.forces
+    rest, _ = footing_of(machine, joints, still, still)
+    centers = centers_of_mass(robot, ca.DM(START))
+    middle = sum(robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()) / robot.total_mass
+    np.testing.assert_allclose(rest.points, np.tile(middle[:2], (5, 1)), atol=1e-9)
+    assert not rest.forces
+
+
+def test_solutions_local_motions_and_files_are_shown_as_plans_are(
+    plans: dict[str, Plan], machines: dict[str, Machine], tmp_path: Path
+) -> None:
+    for kind, plan in plans.items():
+        machine = machines[kind]
+        wanted = shown_plan(plan)
+        plan.solution.save(tmp_path / "solution.npz")
+        plan.write_csv(tmp_path / "motion.csv", 0.01)
+        local = resolve(machine, (0.1, -0.1), (3, 4), START, 1.5)
+        raw = read_trajectory(tmp_path / "motion.csv", joints=plan.names)
+        shown = [
+            shown_solution(Solution.load(tmp_path / "solution.npz"), machine),
+            shown_trajectory(raw, machine),
+            shown_local(local, machine),
+        ]
+        for one in shown[:2]:
+            np.testing.assert_allclose(one.t, wanted.t, atol=1e-12)
+            np.testing.assert_allclose(one.joints, wanted.joints, atol=1e-4)
+            np.testing.assert_allclose(one.base, wanted.base, atol=1e-4)
+        assert shown[0].verdict == wanted.verdict
+        assert shown[0].passed is wanted.passed is True
+        assert shown[1].passed is None
+        np.testing.assert_allclose(shown[2].joints[0], START)
+        told, _ = unpacked(page([wanted, *shown], title="four").text)
+        assert len(told["robots"]) == 1  # the same robot is held once
+        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0, 0]
+    with pytest.raises(ProblemError, match="elbows"):
+        shown_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
+    with pytest.raises(ProblemError, match="base"):
+        shown_solution(plans["fixed"].solution, machines["floating"])
+
+
+def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, Plan], folder: Path) -> None:
+    shown = [shown_plan(plans["fixed"], "<b>one</b> & 'two'"), shown_plan(plans["floating"])]
+    text = page(shown, folders=[folder / "share"]).text
+    assert text == page(shown, folders=[folder / "share"]).text
+    assert len(text.encode()) < 300_000
+    assert "default-src 'none'" in text
+    assert set(re.findall(r"https?://[^\s\"'<)]+", text)) == {"http://www.w3.org/2000/svg"}  # a name, not an address
+    assert not re.findall(r"\b(?:src|href)=(?!\"data:)", text)
+    assert "<title>&lt;b&gt;one" in text
+    assert "<b>one</b>" not in text
+    told, arrays = unpacked(text)
+    assert told["motions"][0]["name"] == "<b>one</b> & 'two'"
+    assert all(np.isfinite(values).all() for values in arrays.values() if values.dtype.kind == "f")
+    assert {name for name, _ in surfaces(told, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
+    rows = told["motions"][0]["rows"]
+    assert {row[5] for row in rows} <= {"ok", "told"}
+
+
+def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player, "MOST_BYTES", 10_000)
+    with pytest.raises(ProblemError, match="MB"):
+        page([shown_plan(plans["fixed"])])
+    with pytest.raises(ProblemError, match="at least one"):
+        page([])
+
+
+def test_a_page_is_served_on_this_machine_as_long_as_it_lasts() -> None:
+    with Served("<p>ä</p>") as served, Served("b", int(served.address.rpartition(":")[2])) as other:
+        assert served.address.startswith("http://127.0.0.1:")
+        assert served.address != other.address  # the next port that is free
+        with urllib.request.urlopen(served.address, timeout=20) as answer:
+            assert answer.read().decode() == "<p>ä</p>"
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{served.address}/favicon.ico", timeout=20)
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(served.address, timeout=20)
+    with pytest.raises(ProblemError, match="65535"):
+        Served("", 70000)
+
+
+def test_the_command_writes_a_page_or_serves_it(
+    plans: dict[str, Plan], folder: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans["fixed"].save(tmp_path / "plan.npz")
+    plans["fixed"].write_csv(tmp_path / "same.csv", 0.01)
+    plans["fixed"].solution.save(tmp_path / "bare.npz")
+    words = [str(tmp_path / name) for name in ("plan.npz", "same.csv")]
+    target = tmp_path / "out.html"
+    more = ["--page", str(target), "--name", "optimum", "--folder", str(folder / "share"), "--json"]
+    assert main(["view", *words, *more]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["passed"] is True
+    assert told["bytes"] == target.stat().st_size
+    assert [one["name"] for one in unpacked(target.read_text(encoding="utf-8"))[0]["motions"]] == [
+        "optimum",
+        "same.csv",
+    ]
+    again = ["view", str(tmp_path / "bare.npz"), "--robot", str(folder / "arm.urdf"), "--tip", "finger"]
+    assert main([*again, "--lock", "grip=0.05", "--page", str(target), "--quiet", "--no-meshes"]) == 0
+    assert "local minimum" in capsys.readouterr().out
+    assert main(["view", str(tmp_path / "bare.npz"), "--page", str(target)]) == 2
+    assert "no plan" in capsys.readouterr().err
+    assert main([*again, "--page", str(target), "--quiet"]) == 2  # the plan does not move the grip
+    assert "grip" in capsys.readouterr().err
+    loose = ["--tolerance", "rates=1e-30"]
+    assert main(["view", words[0], "--page", str(target), "--quiet", *loose]) in (0, 1)
+    monkeypatch.setattr(serving.Served, "wait", lambda self: urllib.request.urlopen(self.address, timeout=20).close())
+    assert main(["view", words[0], "--port", "0"]) == 0
+    shown = capsys.readouterr()
+    assert "http://127.0.0.1:" in shown.err
+    assert "not shown: package://arm_description/upper.obj" in shown.err
+
+
+def test_shapes_that_are_no_look_are_refused() -> None:
+    crate = CollisionShape("box", (1, 1, 1))
+    with pytest.raises(Exception, match="visuals"):
+        Link("a", visuals=(crate,))  # type: ignore[arg-type]
