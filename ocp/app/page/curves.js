@@ -1,7 +1,7 @@
 // Curves over time with limits and a cursor, and the way of the zero moment point in its footprint, as inline SVG.
 
 const SPACE = "http://www.w3.org/2000/svg";
-const WIDE = 240, TALL = 96, LEFT = 34, RIGHT = 6, TOP = 6, BOTTOM = 14;
+const WIDE = 240, TALL = 96, LEFT = 42, RIGHT = 6, TOP = 6, BOTTOM = 14;
 const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
 
 function shape(kind, given, inside) {
@@ -14,7 +14,8 @@ function shape(kind, given, inside) {
 function written(value) {
   if (!Number.isFinite(value)) return "";
   const size = Math.abs(value);
-  if (size && (size < 1e-3 || size >= 1e5)) return value.toExponential(1).replace("e+", "e");
+  if (size < 1e-9) return "0";
+  if ((size < 1e-3 || size >= 1e5)) return value.toExponential(1).replace("e+", "e");
   return String(+value.toPrecision(3));
 }
 

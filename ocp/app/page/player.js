@@ -128,9 +128,10 @@ class Player {
   }
 
   get visible() {  // motions that are seen, and in what colour
-    const first = {motion: this.motions[this.first], kind: "plan"};
-    if (this.mode === "alone" || this.motions.length < 2) return [first];
-    return [first, {motion: this.motions[this.second], kind: "other"}];
+    const alone = this.mode === "alone" || this.motions.length < 2;
+    const kinds = this.first && (alone || !this.second) ? ["other", "plan"] : ["plan", "other"];
+    const made = [this.first, this.second].map((number, k) => ({motion: this.motions[number], kind: kinds[k]}));
+    return alone ? made.slice(0, 1) : made;
   }
 
   ask() {
@@ -197,9 +198,9 @@ class Player {
   drawPart(visible, told) {
     const {scene, shown} = this;
     if (this.grid && shown.floor) scene.drawLine(this.grid, COLORS.grid, 1);
-    for (const {motion, kind} of visible) {
-      const time = Math.min(this.time, motion.horizon), pose = motion.at(time), faint = told && kind === "other";
-      if (!(faint && visible.length > 1))
+    for (const [number, {motion, kind}] of visible.entries()) {
+      const time = Math.min(this.time, motion.horizon), pose = motion.at(time), faint = number > 0;
+      if (!faint)
         this.drawRobot(motion, pose, (color) => told ? this.tinted(color, COLORS[kind]) : color);
       if (shown.paths) {
         const upto = this.motions.length ? motion.before(motion.t, time) : 0;
@@ -212,9 +213,9 @@ class Player {
       if (motion.footing) this.drawPush(motion, time, COLORS[kind]);
       if (shown.near && motion.near && !faint) this.drawNear(motion.near, time);
     }
-    for (const {motion} of visible.slice(1)) {  // over the plan as a veil, through which it is seen
+    for (const {motion, kind} of visible.slice(1)) {  // over the other as a veil, through which it is seen
       const pose = motion.at(Math.min(this.time, motion.horizon));
-      scene.drawFaint(() => this.drawRobot(motion, pose, (color) => [...this.tinted(color, COLORS.other).slice(0, 3), 0.45]));
+      scene.drawFaint(() => this.drawRobot(motion, pose, (color) => [...this.tinted(color, COLORS[kind]).slice(0, 3), 0.45]));
     }
     for (const {motion} of visible.slice(0, 1)) this.drawGlass(motion, motion.at(Math.min(this.time, motion.horizon)));
     if (shown.around) scene.drawFaint(() => {
@@ -370,9 +371,9 @@ class Player {
     said.className = passed === true ? "good" : passed === false ? "bad" : "";
     audit.replaceChildren();
     const keys = document.createElement("p");
+    const words = {plan: this.visible.length > 1 ? "the plan" : "the motion", other: "what it is held against"};
     const key = (kind, text, more = "") => `<span><i class="key ${more} ink-${kind}"></i>${text}</span>&emsp;`;
-    keys.innerHTML = key("plan", this.visible.length > 1 ? "the plan" : "the motion") +
-      (this.visible.length > 1 ? key("other", "what it is held against") : "") +
+    keys.innerHTML = this.visible.map(({kind}) => key(kind, words[kind])).join("") +
       (motion.targets.length ? key("asked", "the path asked for") : "") + key("limit", "limits, where near", "dashed");
     audit.append(keys);
     if (!rows.length) return;

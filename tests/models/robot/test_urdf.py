@@ -194,7 +194,8 @@ def test_what_links_look_like_is_read_and_written_and_never_refuses_a_robot() ->
         np.testing.assert_allclose(mesh.size, [2, 2, -2])
         np.testing.assert_allclose(mesh.translation, [1, 2, 3])
         np.testing.assert_allclose(mesh.rotation[:, 0], [np.cos(1), np.sin(1), 0], atol=1e-15)
-        np.testing.assert_allclose(np.array([mesh.color, box.color], dtype=float), [[1, 0, 0, 1], [0, 1, 0, 0.5]])
+        colors = np.array([mesh.color, box.color], dtype=float)
+        np.testing.assert_allclose(colors, np.array([[1, 0, 0, 1], [0, 1, 0, 0.5]]))
         assert ball.color is None
         assert not each.link("a").collisions
 

@@ -14,7 +14,8 @@ import trimesh
 from models import ModelError
 from models.arrays import Array
 from models.shapes import collada, mesh_files, triangles
-from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh
+from models.shapes.mesh_files import find_mesh, read_mesh, read_painted_mesh
+from models.shapes.triangles import Faces
 from tests.models.robot.pinocchio_robots import collection
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.1, 0.1, 0.5]])
@@ -286,12 +287,12 @@ def test_faces_have_the_colour_of_their_material(tmp_path: Path) -> None:
     scene = f"<node><instance_geometry url='#g'>{bound}</instance_geometry></node>"
     text = dae(scene, faces=sets).replace("<asset>", f"<library_effects>{effects}</library_effects>{materials}<asset>")
     colors = read_painted_mesh(written(tmp_path, "a.dae", text)).colors
-    np.testing.assert_allclose(colors, [[0, 0.5, 1, 1], [1, 0, 0, 1], [np.nan] * 4])
+    np.testing.assert_allclose(colors, np.array([[0, 0.5, 1, 1], [1, 0, 0, 1], [np.nan] * 4]))
     written(tmp_path, "b.mtl", "newmtl blue\nKd 0 0 1\nnewmtl wrong\nKd a b c\n")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nmtllib b.mtl\nmtllib none.mtl\nf 1 2 3\n"
     corners += "usemtl blue\nf 1 2 3\nusemtl wrong\nf 1 2 3\n"
     colors = read_painted_mesh(written(tmp_path, "b.obj", corners)).colors
-    np.testing.assert_allclose(colors, [[np.nan] * 4, [0, 0, 1, 1], [np.nan] * 4])
+    np.testing.assert_allclose(colors, np.array([[np.nan] * 4, [0, 0, 1, 1], [np.nan] * 4]))
     assert np.isnan(read_painted_mesh(written(tmp_path, "c.stl", binary_stl(CORNERS, FACES))).colors).all()
 
 

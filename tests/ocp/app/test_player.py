@@ -343,7 +343,8 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     assert found.forces
     rest, _ = footing_of(machine, joints, still, still)
     centers = centers_of_mass(robot, ca.DM(START))
-    middle = sum(robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()) / robot.total_mass
+    weighed = np.array([robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()])
+    middle = weighed.sum(axis=0) / robot.total_mass
     np.testing.assert_allclose(rest.points, np.tile(middle[:2], (5, 1)), atol=1e-9)
     assert not rest.forces
 
