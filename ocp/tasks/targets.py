@@ -10,7 +10,6 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
-from ocp.problem.formulation import Sampler
 from ocp.tasks.equations import bind
 from ocp.tasks.geometry import target_size
 from ocp.tasks.tip_task import TipTask
@@ -76,5 +75,6 @@ def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]
     """Rotations (M, 3, 3) and positions (M, 3) of a machine's tip."""
     b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose: Any = machine.tip_pose(b, q)
-    turns, places = Sampler([b, q], [pose.rotation, pose.position])(base, joints)
-    return turns.reshape(-1, 3, 3).transpose(0, 2, 1), places
+    function = ca.Function("frames", [b, q], [pose.rotation, pose.position])
+    turns, places = (np.array(part) for part in function.map(len(joints))(base.T, joints.T))
+    return turns.reshape(3, -1, 3).transpose(1, 0, 2), places.T
