@@ -18,6 +18,7 @@ from ocp.app.colors import COMPARED, FAULT, LIMIT, PLAN, SURROUNDINGS, TIP
 from ocp.app.pieces import Motion
 from ocp.problem.formulation import Sampler
 from ocp.problem.hulls import frames_of
+from ocp.solution import Solution
 from ocp.tasks.limits import JointBounds
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "curves",
     "draw_joints",
     "look",
+    "obstacles_of",
     "scene",
     "show_limits",
     "solids_of",
@@ -74,6 +76,18 @@ def solid_of(core: Array, radius: float) -> Solid:
         around = radius * np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1).reshape(-1, 3)
     hull = convex_hull((np.asarray(core)[:, None] + around).reshape(-1, 3))
     return np.asarray(hull.vertices), hull.faces
+
+
+def obstacles_of(solution: Solution) -> tuple[Solid, ...]:
+    """Obstacles that stand still, as the problem of a solution knows them; no half-spaces."""
+    if solution.problem is None:
+        return ()
+    found = {}
+    for apart in solution.problem.declared.apart.values():
+        for name, hull in apart.hulls.items():
+            if hull.frame < 0 and not hull.normal.size:
+                found[name] = solid_of(hull.core, hull.radius)
+    return tuple(found.values())
 
 
 def scene(

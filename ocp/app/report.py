@@ -16,7 +16,7 @@ import numpy as np
 from models import FreeFloating, Machine
 from models.arrays import Array
 from ocp.app.joint_limits import Row
-from ocp.app.pictures import Solid, curves, scene, solid_of
+from ocp.app.pictures import Solid, curves, obstacles_of, scene
 from ocp.app.pieces import Motion
 from ocp.app.verdict import Check, bounds_of, check_trajectory
 from ocp.files import RawTrajectory
@@ -189,7 +189,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
             f"{len(plan.candidates)} motions found",
         ),
         tuple(str(fault) for fault in check.faults),
-        scene(machine, motion, bases, _around(plan)),
+        scene(machine, motion, bases, list(obstacles_of(plan.solution))),
         curves(motion, plan.names, units, bounds, check.faults),
         (("The audit", rows), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
@@ -202,16 +202,3 @@ def _mount(machine: Machine) -> dict[str, Array]:
         "translation": np.array(frame.position, dtype=float).ravel(),
         "rotation": np.array(frame.rotation, dtype=float),
     }
-
-
-def _around(plan: Plan) -> list[Solid]:
-    """Obstacles that stand still, as the plan's problem knows them; no half-spaces."""
-    problem = plan.solution.problem
-    if problem is None:
-        return []
-    found = {}
-    for apart in problem.declared.apart.values():
-        for name, hull in apart.hulls.items():
-            if hull.frame < 0 and not hull.normal.size:
-                found[name] = solid_of(hull.core, hull.radius)
-    return list(found.values())

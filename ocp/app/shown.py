@@ -17,7 +17,7 @@ from models.arrays import Array
 from ocp.app.bases import floating_base
 from ocp.app.joint_limits import Row
 from ocp.app.oddities import readable
-from ocp.app.pictures import Solid, solid_of
+from ocp.app.pictures import Solid, obstacles_of
 from ocp.app.quantities import Curve, Footing, footing_of, joint_curves, machine_curves, so_far
 from ocp.app.verdict import bounds_of
 from ocp.audit.clearance import nearest_along
@@ -109,7 +109,7 @@ def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
     given = sample.joints, sample.rates, sample.accelerations
     about: dict[str, Any] = {
         "near": near,
-        "around": tuple(_around(plan.solution)),
+        "around": obstacles_of(plan.solution),
         "cost": plan.cost,
         "targets": plan.targets,
     }
@@ -157,7 +157,7 @@ def shown_solution(
     q, v, a = (one[:, columns[joints]] for one in (states, slopes, bends))
     place = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     moves = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    about: dict[str, Any] = {"cost": solution.cost, "around": tuple(_around(solution))}
+    about: dict[str, Any] = {"cost": solution.cost, "around": obstacles_of(solution)}
     about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
         looks = np.linspace(0.0, solution.horizon, LOOKS)
@@ -331,15 +331,3 @@ def _joined(t: Array, found: Sequence[Any]) -> Near | None:
         np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "asked")
     )
     return Near(t, points, distances, asked, tuple(one.bodies for one in found))
-
-
-def _around(solution: Solution) -> list[Solid]:
-    """Obstacles that stand still, as the problem knows them; no half-spaces."""
-    if solution.problem is None:
-        return []
-    found = {}
-    for apart in solution.problem.declared.apart.values():
-        for name, hull in apart.hulls.items():
-            if hull.frame < 0 and not hull.normal.size:
-                found[name] = solid_of(hull.core, hull.radius)
-    return list(found.values())
