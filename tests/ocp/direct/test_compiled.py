@@ -25,6 +25,8 @@ from ocp.direct import compiled
 from ocp.direct.assembly import Derivatives, derivatives
 from ocp.direct.compiled import Background, CompilerError, Library, built, code, kept, stop_compiling
 from ocp.problem.formulation import Formulation
+from tests.conformance import brachistochrone, bryson_denham
+from tests.conformance.case import Case
 from tests.ocp.problems import SWING, plant, swing, van_der_pol
 
 ROOT = Path(__file__).parents[3]
@@ -116,6 +118,16 @@ def test_compiled_and_interpreted_solves_are_one(shared: Path, case: str, solver
         np.testing.assert_array_equal(getattr(plans[0], field), getattr(plans[1], field))
     for name, slope in plans[0].cost_gradients.items():
         np.testing.assert_array_equal(slope, plans[1].cost_gradients[name])
+
+
+@pytest.mark.parametrize("case", [brachistochrone.CASE, bryson_denham.CASE_AS_PATH], ids=lambda case: case.name)
+def test_known_optima_are_met_compiled(shared: Path, case: Case) -> None:
+    """The whole suite of them passes compiled, too; here for two that take little time."""
+    run = case.runs[0]
+    prepared = prepare(case.build(), run.method, compiled=True)
+    assert is_compiled(prepared)
+    below, above = run.cost
+    assert -below <= prepared.solve().cost - case.cost <= above
 
 
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
