@@ -22,6 +22,7 @@ extensions = [
     "scripts.site.executed",
     "scripts.site.formulas",
     "scripts.site.numbers",
+    "scripts.site.players",
     "scripts.site.docstrings",
 ]
 root_doc = "index"

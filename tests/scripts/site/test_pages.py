@@ -12,10 +12,12 @@ from xml.etree import ElementTree
 import pytest
 from latex2mathml.converter import convert
 
+from ocp.app.command import parser
 from scripts.papers.reproduced import read
 from scripts.site.docstrings import prepared
 from scripts.site.executed import blocks, executed
 from scripts.site.numbers import MARK, listed
+from scripts.site.players import command
 
 SITE = Path(__file__).resolve().parents[3] / "scripts" / "site"
 PAGES = sorted(SITE.rglob("*.md"))
@@ -148,3 +150,17 @@ def test_of_what_is_long_the_beginning_is_shown() -> None:
     told = executed("```python\nfor k in range(60):\n    print('line', k)\n```\n", "page")
     assert "line 59" in told
     assert "lines more" not in told
+
+
+def test_every_plan_of_the_gallery_is_played_beside_what_it_is_compared_with() -> None:
+    told = (SITE / "gallery.md").read_text(encoding="utf-8")
+    plans = sorted((SITE.parents[1] / "results" / "gallery").glob("*.npz"))
+    assert sorted(re.findall(r"```\{player\} (\w+)", told)) == [plan.stem for plan in plans]
+    for plan in plans:
+        words = command(plan, SITE / "out.html")[3:]
+        options = parser().parse_args(words)
+        assert options.plan == plan
+        assert options.page == SITE / "out.html"
+        beside = [file for file in [plan.with_name(f"{plan.stem}.local.csv")] if file.exists()]
+        assert options.beside == beside
+        assert len(options.name) == 1 + len(beside)
