@@ -222,6 +222,7 @@ class _OnRows:
         self.inputs, self.outputs = slice(inputs[0], outputs[0]), slice(outputs[0], self.rows)
         self.constants: list[float] = []
         self.steps: list[tuple[Any, ...]] = []
+        self.tables: list[tuple[Array, list[tuple[Any, list[Array]]]]] = []
         seat: dict[int, int] = {}  # the row of what each place of the memory holds
         for k in range(function.n_instructions()):
             kind, of, into = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
@@ -241,18 +242,25 @@ class _OnRows:
         given = np.concatenate([value.T for value in inputs])
         count = given.shape[1]
         found = np.empty((sum(self.sizes), count))
-        width = max(min(AT_ONCE, count), 1)
-        table = np.zeros((self.rows + len(self.constants), width))
-        table[self.rows :] = np.array(self.constants).reshape(-1, 1)
-        rows = list(table)
-        steps = [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
-        for first in range(0, count, width):
-            here = min(width, count - first)
+        try:
+            table, steps = self.tables.pop()
+        except IndexError:  # the first call, or another thread has it
+            table, steps = self._table()
+        for first in range(0, count, AT_ONCE):
+            here = min(AT_ONCE, count - first)
             table[self.inputs, :here] = given[:, first : first + here]
             for operation, places in steps:
                 operation(*places)
             found[:, first : first + here] = table[self.outputs, :here]
+        self.tables.append((table, steps))
         return [part.T for part in np.split(found, np.cumsum(self.sizes)[:-1])]
+
+    def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
+        """Rows of numbers, and the instructions on them."""
+        table = np.zeros((self.rows + len(self.constants), AT_ONCE))
+        table[self.rows :] = np.array(self.constants).reshape(-1, 1)
+        rows = list(table)
+        return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
 
 
 def _spline(s: Array, joints: Array) -> _Pieces:

@@ -53,30 +53,38 @@ FIRST = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Limits at nodes.
+    """Nodes along a path, and the limits at them.
 
     Attributes:
+        path, limits, joints: Of the schedule.
         distance: Of the nodes, from 0 to the path's length. Shape (N + 1,), m.
         asked: Speed in each interval. Shape (N,), m/s.
-        rows: At the nodes, just after them where they jump. Shape (N + 1,).
         jumps: Nodes where the path's pieces meet. Shape (B,).
-        before: Rows just before these. Shape (B,).
+        before: Distances just before these. Shape (B,), m.
+        sharp: Whether jerks are limited anywhere.
     """
 
+    path: PathLike
+    limits: LineLimits
+    joints: JointPath | None
     distance: Array
     asked: Array
-    rows: Rows
     jumps: NDArray[np.intp]
-    before: Rows
+    before: Array
+    sharp: bool = True
 
-    def ends(self, first: int = 0, last: int | None = None) -> tuple[Rows, Rows]:
-        """Rows at the first and at the last place of the intervals between two nodes. Shape (N,) each."""
-        last = len(self.asked) if last is None else last
-        right = Rows(*(kind[first + 1 : last + 1].copy() for kind in self.rows))
+    def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
+        """Rows at the first and at the last place of the intervals between two nodes. Shape (N,) each.
+
+        They are made when they are asked for: all of a long path would fill the memory.
+        """
         at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
-        for kind, before in zip(right, self.before, strict=True):
-            kind[self.jumps[at] - first - 1] = before[at]
-        return self.rows.of(slice(first, last)), right
+        places = np.concatenate([self.distance[first : last + 1], self.before[at]])
+        rows = rows_at(self.path, self.limits, self.joints, places)
+        count = last - first
+        right = np.arange(1, count + 1)
+        right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
+        return rows.of(slice(count)), rows.of(right)
 
     def parts(self) -> list[tuple[int, int]]:
         """First and last nodes of parts of bounded length."""
@@ -102,7 +110,7 @@ class _Cells(NamedTuple):
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
-    """Nodes and rows of a path.
+    """Nodes of a path.
 
     Args:
         path, limits: Of the schedule.
@@ -127,8 +135,8 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     inner = nodes[1:-1]
     before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(nodes)[:-1] / 2)
     of_interval = np.asarray(asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
-    rows = rows_at(path, limits, joints, s)
-    return Grid(s, of_interval, rows, np.searchsorted(s, inner), rows_at(path, limits, joints, before))
+    sharp = bool(np.isfinite(cells.sharp).any())
+    return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
 def _halved(
@@ -163,13 +171,11 @@ def _halved(
 
 
 def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
-    """Rows at the first nodes of a path, none halved: enough to say where the line binds."""
+    """The first nodes of a path, no interval halved: enough to say where the line binds."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.dense(PER_CELL, 1), bounds]))
-    rows = rows_at(path, limits, None, s)
     asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
-    none = np.zeros(0, dtype=np.intp)
-    return Grid(s, asked, rows, none, rows.of(none))
+    return Grid(path, limits, None, s, asked, np.zeros(0, dtype=np.intp), np.zeros(0))
 
 
 def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:

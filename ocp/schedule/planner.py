@@ -144,7 +144,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
         grid = nodes_only(path, limits)
     else:
         grid = make_grid(path, limits, limited)
-        profile = _planned(path, limits, limited, grid, base)
+        profile = _planned(grid, base)
     dips = () if profile is base else _dips(grid, profile, causes(limits, limited))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
@@ -163,24 +163,22 @@ def _by_ramps(path: PathLike, limits: LineLimits) -> SpeedProfile:
     return plan(zones, {})
 
 
-def _planned(
-    path: PathLike, limits: LineLimits, joints: JointPath | None, grid: Grid, base: SpeedProfile | None
-) -> SpeedProfile:
+def _planned(grid: Grid, base: SpeedProfile | None) -> SpeedProfile:
     """The base motion where it keeps all limits, the fastest motion elsewhere."""
     count = len(grid.asked)
     if base is None:
-        return fastest_over(Stretch(path, limits, joints, grid, 0, count))
+        return fastest_over(Stretch(grid, 0, count))
     broken = _broken(grid, base)
     if not broken.any():
         return base
     s, reach = grid.distance, 1.0
     while True:
-        stretches = _stretches(grid, base, broken, limits, reach)
+        stretches = _stretches(grid, base, broken, reach)
         found = []
         for first, last in stretches:
             ends = [(0.0 if k in (0, count) else float(grid.asked[k]) ** 2, 0.0) for k in (first, last)]
             try:
-                motion = fastest_over(Stretch(path, limits, joints, grid, first, last, (ends[0], ends[1])))
+                motion = fastest_over(Stretch(grid, first, last, (ends[0], ends[1])))
             except ProblemError:
                 if (first, last) == (0, count):
                     raise
@@ -198,8 +196,8 @@ def _planned(
             parts.append(_cut(base, passed, float(s[first])))
         parts.append(motion)
         passed = float(s[last])
-    if passed < path.length:
-        parts.append(_cut(base, passed, path.length))
+    if passed < s[-1]:
+        parts.append(_cut(base, passed, float(s[-1])))
     return joined(parts)
 
 
@@ -220,14 +218,12 @@ def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
     return over
 
 
-def _stretches(
-    grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], limits: LineLimits, reach: float
-) -> list[tuple[int, int]]:
+def _stretches(grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], reach: float) -> list[tuple[int, int]]:
     """First and last nodes of the stretches to be planned anew: between them the base is steady, or the path ends.
 
     On either side of what is broken they are `reach` times as long as a ramp to rest.
     """
-    count, s = len(broken), grid.distance
+    count, s, limits = len(broken), grid.distance, grid.limits
     here = base.at_distance(s)
     steady = (np.abs(here.acceleration) <= KEPT * limits.acceleration) & (here.jerk == 0)
     asked = np.minimum(np.append(grid.asked, np.inf), np.insert(grid.asked, 0, np.inf))

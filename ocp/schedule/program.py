@@ -24,17 +24,18 @@ hardly grows with the nodes. Where such steps lead away from the bounds, all pla
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from ocp.errors import SolveError
 from ocp.schedule.profile import Array
 
-__all__ = ["End", "Spline", "SplineRows", "least_time"]
+__all__ = ["Program", "Spline", "SplineRows", "least_time"]
 
 STEPS = 200
 ACCEPTED, MORE_STEPS = 1e-3, 10
@@ -47,12 +48,14 @@ LOST = 0.7
 """Share of a coefficient that a step takes at most: a motion that all but stands still somewhere may be a trap."""
 ALIKE = 10
 """Intervals on either side over which the lengths of steps are made alike."""
+FIRM = 0.0, 1e-14, 1e-12, 1e-10
+"""Added to the diagonal of the equations of a step, relative, until rounding does not make them indefinite."""
 LONG_ENOUGH = 256
 """Rows that are worth an addition of their own."""
 ASTRAY, NO_MATTER = 2.0, 1e-2
 """Ratio by which the worst miss may grow in a step, and what it may grow to, relative to the bound, in any case."""
-INFEASIBLE, MORE_SO = 1e-6, 10.0
-"""What a row may miss its bound by, relative, when a solution is accepted; or so many times the accuracy."""
+INFEASIBLE, MORE_SO = 1e-6, 100.0
+"""What a row may miss its bound by, relative, when a solution is accepted; or so many times the accuracy's square."""
 UNEVEN = 1e-3
 """Sum of the slopes that prices leave, by the logarithm of the coefficients, over the time, when it is accepted."""
 
@@ -77,19 +80,6 @@ class SplineRows(NamedTuple):
     jerk: NDArray[np.bool_]
 
 
-class End(NamedTuple):
-    """How a stretch begins or ends: at rest outside it, or moving.
-
-    Attributes:
-        rest: Distance (m) from rest to the stretch, over which the jerk is constant and x ~ s^(4/3); 0 if moving.
-        x, slope: Squared speed and its derivative by the distance if moving.
-    """
-
-    rest: float = 0.0
-    x: float = 0.0
-    slope: float = 0.0
-
-
 class Spline:
     """Squared speed over nodes, shape (N + 1,), m: N + 2 coefficients."""
 
@@ -98,6 +88,15 @@ class Spline:
         before, after = np.append(0.0, self.h), np.append(self.h, 0.0)
         self.width = before + after
         self.share = before / self.width
+
+    def part(self, at: NDArray[np.intp]) -> Spline:
+        """That of some coefficients, as if they were neighbours."""
+        found, last = copy(self), len(self.h)
+        found.h = self.h[np.minimum(at[:-2], last - 1)]
+        found.nodes, found.width, found.share = (
+            kind[np.minimum(at[:-1], last)] for kind in (self.nodes, self.width, self.share)
+        )
+        return found
 
     def at_nodes(self, b: Array) -> tuple[Array, Array]:
         """x and x' at the nodes. Shape (N + 1,) each."""
@@ -122,78 +121,121 @@ class Spline:
         return np.array([here, slope, bend])
 
 
-class _Ends:
-    """What the ends of a stretch fix: at rest the outermost coefficient follows the next, moving both are known."""
+class Program(NamedTuple):
+    """What is run in the least time.
 
-    def __init__(self, spline: Spline, ends: tuple[End, End]) -> None:
-        n = len(spline.h) + 2
-        self.sides = ((0, 1, spline.h[0], 1.0, ends[0]), (n - 1, n - 2, spline.h[-1], -1.0, ends[1]))
-        self.ratio = [1 / (1 + 2 * h / (3 * end.rest)) if end.rest else 0.0 for _, _, h, _, end in self.sides]
-        fixed = [outer for outer, *_ in self.sides] + [inner for _, inner, *_, end in self.sides if not end.rest]
-        self.fixed = np.array(sorted(fixed))
+    Attributes:
+        spline: Squared speed.
+        rows: What it keeps.
+        most: Upper bounds of its coefficients; infinite for none. Shape (N + 2,).
+        rest: Distances (m) from rest to its beginning and from its end to rest, over which the jerk is constant and
+            x ~ s^(4/3); 0 where it moves there.
+        fixed: Coefficients that stay: the outer two where it begins or ends moving.
+    """
+
+    spline: Spline
+    rows: SplineRows
+    most: Array
+    rest: tuple[float, float]
+    fixed: NDArray[np.intp]
+
+    def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
+        """That of some intervals (B,), in order, between motions that stay, and its coefficients in this one.
+
+        Its stretches stand one behind the other, two intervals without rows between them.
+        """
+        count = len(self.spline.h)
+        cuts = np.flatnonzero(np.diff(free) > 1)
+        first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
+        sizes = last - first + 2
+        begin = np.cumsum(sizes) - sizes
+        at = np.arange(sizes.sum()) + np.repeat(first - begin, sizes)
+        stays = np.isin(at, self.fixed)
+        left, right = first > 0, last < count
+        inner = np.concatenate([begin[left], begin[left] + 1, (begin + sizes)[right] - 1, (begin + sizes)[right] - 2])
+        stays[inner] = True
+        seat = np.full(count, -1)
+        seat[free] = np.arange(len(free)) + 2 * np.repeat(np.arange(len(first)), last - first)
+        # what is known at the outer nodes is not asked for again
+        known = np.zeros((2, count), dtype=bool)
+        known[0, first[left]], known[1, last[right] - 1] = True, True
+        interval, inside, bent = self.rows.interval, self.rows.fraction, self.rows.of[:, 2] != 0
+        outer = (known[0, interval] & (inside == 0)) | (known[1, interval] & (inside == 1))
+        rows = SplineRows(*(kind[(seat[interval] >= 0) & (bent | ~outer)] for kind in self.rows))
+        most = self.most[at]
+        most[inner] = np.inf
+        rest = 0.0 if left[0] else self.rest[0], 0.0 if right[-1] else self.rest[1]
+        own = rows._replace(interval=seat[rows.interval])
+        return Program(self.spline.part(at), own, most, rest, np.flatnonzero(stays)), at
+
+
+class _Ends:
+    """What of the coefficients is no unknown: some stay, and where a program is at rest the outer one follows."""
+
+    def __init__(self, program: Program) -> None:
+        n, h, (first, last) = len(program.most), program.spline.h, program.rest
+        self.sides = [(0, 1, 1 / (1 + 2 * h[0] / (3 * first)))] if first else []
+        self.sides += [(n - 1, n - 2, 1 / (1 + 2 * h[-1] / (3 * last)))] if last else []
+        self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
     def start(self, b: Array) -> Array:
         """Coefficients that keep to the ends."""
         b = b.copy()
-        for (outer, inner, h, sign, end), ratio in zip(self.sides, self.ratio, strict=True):
-            if end.rest:
-                b[outer] = ratio * b[inner]
-            else:
-                b[outer], b[inner] = end.x, end.x + sign * h * end.slope / 2
+        for outer, inner, ratio in self.sides:
+            b[outer] = ratio * b[inner]
         return b
 
     def follow(self, change: Array) -> None:
         """Make a change of the coefficients one that keeps to the ends, in place."""
-        for (outer, inner, _, _, end), ratio in zip(self.sides, self.ratio, strict=True):
-            change[outer] = ratio * change[inner] if end.rest else 0.0
+        change[self.fixed] = 0.0
+        for outer, inner, ratio in self.sides:
+            change[outer] = ratio * change[inner]
 
     def reduce(self, slope: Array) -> None:
         """Make a slope by the coefficients one by the free ones, in place."""
-        for (outer, inner, *_), ratio in zip(self.sides, self.ratio, strict=True):
+        for outer, inner, ratio in self.sides:
             slope[inner] += ratio * slope[outer]
         slope[self.fixed] = 0.0
 
     def band(self, main: Array, beside: Array, apart: Array) -> Array:
-        """Nonzeros, by columns, of a curvature by the free coefficients; what is fixed stands alone.
+        """Diagonals of a curvature by the free coefficients, what is fixed alone, as `_Steps` takes them.
 
         Args:
             main, beside, apart: Its diagonals by all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
         """
         n = len(main)
-        for (outer, inner, *_), ratio in zip(self.sides, self.ratio, strict=True):
+        for outer, inner, ratio in self.sides:
             at, next_at = (0, 1) if outer == 0 else (n - 2, n - 3)
             main[inner] += ratio * (2 * beside[at] + ratio * main[outer])
             beside[next_at] += ratio * apart[min(at, n - 3)]
-        free = np.ones(n)
-        free[self.fixed] = 0.0
-        full = np.zeros((n, 5))
-        full[:, 2] = np.where(free > 0, main, 1.0)
-        full[1:, 1] = full[:-1, 3] = beside * free[:-1] * free[1:]
-        full[2:, 0] = full[:-2, 4] = apart * free[:-2] * free[2:]
-        return np.concatenate([full[0, 2:], full[1, 1:], full[2:-2].ravel(), full[-2, :-1], full[-1, :-2]])
+        main[self.fixed] = 1.0
+        for kind in (beside, apart):
+            reach = n - len(kind)
+            kind[self.fixed[self.fixed < n - reach]] = 0.0
+            kind[self.fixed[self.fixed >= reach] - reach] = 0.0
+        full = np.zeros((3, n), order="F")
+        full[0], full[1, :-1], full[2, :-2] = main, beside, apart
+        return full
 
 
 class _Steps:
-    """Equations of five diagonals, solved by casadi in place."""
+    """Solves equations of five diagonals, symmetric and positive, by those on the diagonal and below. Shape (3, n).
 
-    def __init__(self, n: int) -> None:
-        pattern = ca.Sparsity.banded(n, 2)
-        matrix, right = ca.MX.sym("matrix", pattern), ca.MX.sym("right", n)
-        self.function = ca.Function("steps", [matrix, right], [ca.solve(matrix, right, "ldl")])
-        self.memory = [np.zeros(size) for size in (pattern.nnz(), n, n)]
-        self.buffer, self.run = self.function.buffer()
-        for k in (0, 1):
-            self.buffer.set_arg(k, memoryview(self.memory[k]))  # type: ignore[arg-type]
-        self.buffer.set_res(0, memoryview(self.memory[2]))  # type: ignore[arg-type]
+    Raises:
+        LinAlgError: They are not positive, as where rounding is all that is left of a program.
+    """
 
-    def matrix(self, band: Array) -> None:
-        """Take a matrix by its nonzeros."""
-        self.memory[0][:] = band
+    def __init__(self, band: Array) -> None:
+        for firm in FIRM:
+            firmer = band.copy(order="F")
+            firmer[0] *= 1 + firm
+            self.factors, failed = dpbtrf(firmer, lower=1, overwrite_ab=1)
+            if not failed:
+                return
+        raise np.linalg.LinAlgError("the equations of a step are not positive")
 
     def solve(self, right: Array) -> Array:
-        self.memory[1][:] = right
-        self.run()
-        return self.memory[2].copy()
+        return np.asarray(dpbtrs(self.factors, right, lower=1)[0])
 
 
 class _ByInterval:
@@ -245,7 +287,8 @@ class _Rows:
         gradients: Of the others by the three coefficients of their interval. Shape (3, M - `alone`).
     """
 
-    def __init__(self, spline: Spline, rows: SplineRows, most: Array) -> None:
+    def __init__(self, program: Program) -> None:
+        spline, rows, most, *_ = program
         self.count = len(spline.h)
         self.bounded = np.flatnonzero(np.isfinite(most))
         self.alone = self.count + len(self.bounded)
@@ -348,22 +391,11 @@ def _smooth(steps: Array) -> Array:
     )  # its sums run along the path, and with them the rounding of the longest
 
 
-def least_time(
-    spline: Spline,
-    rows: SplineRows,
-    most: Array,
-    ends: tuple[End, End],
-    start: Array,
-    *,
-    accuracy: float,
-    center: float,
-) -> Array:
+def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
     """Coefficients of the fastest motion. Shape (N + 2,).
 
     Args:
-        spline, rows: The stretch.
-        most: Upper bounds of the coefficients; infinite for none. Shape (N + 2,).
-        ends: Of the stretch.
+        program: The stretch.
         start: Coefficients to start from, positive; they need not keep the rows. Shape (N + 2,).
         accuracy: Of the time, relative, and of all else where that is less accurate than what is accepted.
         center: How far from the bounds to begin: complementarity over the time.
@@ -371,11 +403,11 @@ def least_time(
     Raises:
         SolveError: No motion was found that keeps the rows, with the distance of the worst as its `time`.
     """
-    count, every = len(spline.h), _Rows(spline, rows, most)
-    fixing, equations = _Ends(spline, ends), _Steps(count + 2)
+    spline, rest = program.spline, program.rest
+    count, every, fixing = len(spline.h), _Rows(program), _Ends(program)
     cost_weights = spline.width / 2
-    cost_weights[0] += 3 * ends[0].rest
-    cost_weights[-1] += 3 * ends[1].rest
+    cost_weights[0] += 3 * rest[0]
+    cost_weights[-1] += 3 * rest[1]
     b = fixing.start(start)
     gap, size = every.look(b)
     slack = np.maximum(-gap, 0.1 * size)
@@ -391,22 +423,23 @@ def least_time(
 
     found: Array | None = None
     latest, worst, together = 0, np.inf, False
-    known: tuple[Array, ...] = ()
+    before: tuple[tuple[Array, float, Array], ...] = ()
     for number in range(STEPS):
-        lacking = _lacking(gap, slack, size, count)
-        if known and not together and not lacking.max() < max(ASTRAY * worst, NO_MATTER):
-            together = True
-            b, slack, price = known
-            gap, size = every.look(b)
         np.maximum(slack, -gap, out=slack)
         lacking = _lacking(gap, slack, size, count)
+        if before and not together and not lacking.max() < max(ASTRAY * worst, NO_MATTER):
+            together = True
+            b, slack, price = (value + step * change for value, step, change in before)
+            gap, size = every.look(b)
+            np.maximum(slack, -gap, out=slack)
+            lacking = _lacking(gap, slack, size, count)
         time, slope, *curvature = _time(spline.share, cost_weights, b)
         mean, worst = float(slack @ price) / len(gap), float(lacking.max())
         if not np.isfinite(mean + worst) or mean * len(gap) > DIVERGED * time:
             if found is not None:
                 return found
             break
-        if worst < max(INFEASIBLE, MORE_SO * accuracy) and mean * len(gap) < max(ACCEPTED, accuracy) * time:
+        if worst < max(INFEASIBLE, MORE_SO * accuracy**2) and mean * len(gap) < max(ACCEPTED, accuracy) * time:
             residual = slope + every.gathered(price)
             fixing.reduce(residual)
             if float(np.abs(residual * b).sum()) < max(UNEVEN, accuracy) * time:
@@ -418,7 +451,12 @@ def least_time(
 
         pull, missed = price / slack, gap + slack
         squares = every.squares(pull)
-        equations.matrix(fixing.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
+        try:
+            equations = _Steps(fixing.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
+        except np.linalg.LinAlgError:
+            if found is not None:
+                return found
+            break
         base = slope + every.gathered(pull * missed)
 
         # the prices' relative rates towards 0 are those of the slacks, mirrored about -1/2
@@ -442,7 +480,7 @@ def least_time(
         if together:
             taken = [np.full(count, each) for each in shortest]
         else:
-            known = b + shortest[0] * change, slack + shortest[0] * of_slack, price + shortest[1] * of_price
+            before = (b, shortest[0], change), (slack, shortest[0], of_slack), (price, shortest[1], of_price)
         b = b + np.concatenate([taken[0][:1], taken[0], taken[0][-1:]]) * change
         slack = slack + taken[0][every.interval] * of_slack
         price = price + taken[1][every.interval] * of_price

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, curvature_along, rates_along, tool_along, torques_along
 from ocp.schedule.profile import Array, LineMotion
 
-__all__ = ["Rows", "causes", "rows_at"]
+__all__ = ["Rows", "causes", "rows_at", "torque_rows"]
 
 AT_ONCE = 20_000
 """Places handled at once."""
@@ -96,35 +96,40 @@ def _kinds(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], lis
         speed += [f"joint {name!r} velocity" for name in names]
         acceleration += [f"joint {name!r} acceleration" for name in names]
         jerk += [f"joint {name!r} jerk" for name in names]
-        if _torques(limits, joints):
+        if torque_rows(limits, joints):
             acceleration += [f"joint {name!r} torque" for name in names]
     return speed, acceleration, jerk
 
 
-def _torques(limits: LineLimits, joints: JointPath) -> bool:
-    return bool(np.isfinite(limits.torques(len(joints.names))).any())
+def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
+    """Rows of acceleration that are torques: the last so many."""
+    if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
+        return 0
+    return len(joints.names)
 
 
-def rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array) -> Rows:
-    """Rows of all limits at distances (S,) of a path, those of `causes`.
+def rows_at(
+    path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
+) -> Rows:
+    """Rows of all limits at distances (S,) of a path, those of `causes`; zeros for torques that are not asked for.
 
     Raises:
         ProblemError: A curvature or joints that are not finite, as at a singular arm, or of a wrong shape.
     """
     if len(distance) <= AT_ONCE:
-        return _rows_at(path, limits, joints, distance)
+        return _rows_at(path, limits, joints, distance, torques)
     # into memory that is there: the parts of a long path and the whole would be twice as much
     speed, acceleration, jerk = (len(kind) for kind in _kinds(limits, joints))
     shapes = ((speed,), (acceleration, 3), (jerk, 3))
     all_of_them = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
     for first in range(0, len(distance), AT_ONCE):
-        part = _rows_at(path, limits, joints, distance[first : first + AT_ONCE])
+        part = _rows_at(path, limits, joints, distance[first : first + AT_ONCE], torques)
         for kind, own in zip(all_of_them, part, strict=True):
             kind[first : first + AT_ONCE] = own
     return all_of_them
 
 
-def _rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Rows:
+def _rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _kinds(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)
@@ -148,7 +153,7 @@ def _rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Ar
         speed[:, k:, 0] = np.abs(first) / velocities
         acceleration[:, m : m + n, 0], acceleration[:, m : m + n, 1] = first / most, second / most
         jerk[:, p:] = np.stack([first, 3 * second, third], axis=2) / jerks[:, None]
-        if _torques(limits, joints):
+        if torques and torque_rows(limits, joints):
             along = torques_along(joints, s)
             values = np.stack([along.inertia, along.drag, along.rest], axis=2)
             acceleration[:, m + n :] = values / limits.torques(n)[:, None]

@@ -1,26 +1,28 @@
 """The fastest motion over a stretch of a path: its limits as rows, solved, looked at between the nodes, and tightened.
 
-A rough motion under the rows at one place of every interval tells which of them matter: few do. These are held at both
-ends of the interval, and at that of its places where they use most. The motion under them is looked at; a row that
-is passed is held there too, and where it was already, the bounds of the interval are lowered by as much. This is done
-until none is passed. Long stretches are solved in windows: each comes to rest at its end, so that a motion beyond the
-next seam is known to exist.
+A rough motion over every second node, under the rows at one place of every interval, tells which of them matter: few
+do. These are held at both ends of the interval, and at that of its places where they use most. The motion under them
+is looked at; a row that is passed is held there too, and where it was already, the bounds of the interval are lowered
+by as much. This is done until none is passed, at last in the few intervals alone that still are, and those about them.
+Long stretches are solved in windows: each comes to rest at its end, so that a motion beyond the next seam is known to
+exist.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from ocp.errors import ProblemError, SolveError
-from ocp.schedule.grid import Grid, reach
+from ocp.schedule.grid import reach
 from ocp.schedule.passes import passes
 from ocp.schedule.profile import Array, SpeedProfile, joined
-from ocp.schedule.program import End, Spline, SplineRows, least_time
+from ocp.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.schedule.rows import Rows
 from ocp.schedule.window import HELD, INSIDE, ROOM, Ends, Motion, Stretch, Window, demanded, profile_of
 
@@ -30,12 +32,14 @@ KEPT = 1e-9
 """Limits count as kept up to this, relative."""
 ROUNDS = 20
 """Of tightening."""
+MANY = 200
+"""So many intervals, and two at a time are one in the first round, which is to find the rows that matter."""
 AROUND, FEW = 40, 1 / 6
 """Intervals on either side of one that passes a limit, which are planned again with it; they alone if they are few."""
 MOST = 1.5
 """Largest ratio by which a bound is lowered in a round."""
-ROUGH, SOON, ACCURACY = 0.05, 1e-5, 1e-8
-"""Of the time of a window, relative: in the first round, which is to find the rows that matter, two more, and later."""
+ACCURACIES = 0.05, 1e-3, 1e-5, 1e-8
+"""Of the time of a window, relative, round by round: no more than rows still change by; the last is for all later."""
 CENTER, CENTER_AGAIN = 1.0, 0.1
 """Where the interior point begins, the first time and from a solution."""
 LEAST_BESIDE = 0.01
@@ -50,7 +54,7 @@ SEAM = 1 - 1e-3
 """Share of the bounds that a window uses behind its seam, so that the next has room."""
 NEVER = 0.98
 """Rows that reach less than this share of their bound whatever the motion are left out at first..."""
-NEAR = 0.8
+NEAR = 0.9
 """...and, once a motion is known, those that came less near to it in an interval and beside it."""
 
 
@@ -88,12 +92,14 @@ class _Tight:
         times: How often they were.
         held: Rows at the `HELD` places of each interval, upwards and downwards. Shape (4, 2, N, K + L + P).
         speeds: At these places, over the speeds that the jerk there is proportional to. Shape (4, N).
+        inherited: Intervals of the window before, which are held to what they were in that one.
     """
 
     margins: _Margins
     times: _Margins
     held: NDArray[np.bool_]
     speeds: Array
+    inherited: int = 0
 
     @classmethod
     def of(cls, window: Window) -> _Tight:
@@ -109,7 +115,7 @@ class _Tight:
         return _Tight(self.margins.of(part), self.times.of(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Hold rows that come near their bounds, and some row of jerk in every interval.
+        """Hold rows that come near their bounds, there and in the intervals beside, and some row of jerk in each.
 
         Args:
             used, values: What was demanded.
@@ -120,8 +126,20 @@ class _Tight:
         near[:, :-1] |= near[:, 1:].copy()
         self.held[[0, -1]] |= near
         self.hold(near, values)
-        # else the second derivative could be anything there
-        first = used.shape[2] - jerks.shape[1]
+        self.bend(jerks)
+
+    def let_go(self, values: Array, jerks: Array, seam: int) -> None:
+        """Of the rows that are held, keep those that came near their bounds, and some row of jerk in every interval.
+
+        Where the window before or the next one is held to them too, all stay.
+        """
+        own = slice(self.inherited, seam)
+        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > NEAR
+        self.bend(jerks)
+
+    def bend(self, jerks: Array) -> None:
+        """Hold some row of jerk in every interval: else the second derivative could be anything there."""
+        first = self.held.shape[3] - jerks.shape[1]
         sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
@@ -162,7 +180,7 @@ def fastest_over(stretch: Stretch) -> SpeedProfile:
     Raises:
         ProblemError: Limits that no motion keeps, by place.
     """
-    if not np.any(stretch.grid.rows.jerk[:, :, 0]):
+    if not stretch.grid.sharp:
         return _settled(Window.of(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
@@ -196,13 +214,14 @@ def _settled(window: Window, seam: int, before: _Tight | None) -> tuple[SpeedPro
             margin[: len(own)] = own
         tight.held[:, :, : before.held.shape[2]] = before.held
         tight.speeds[:, : before.held.shape[2]] = before.speeds
+        tight.inherited = before.held.shape[2]
     kept, seen = seam - window.first, min(seam + OVERLAP // 2, window.last) - window.first
-    x, slope = _tightened(window, tight, seam, seen, None)
+    x, slope = _tightened(window, tight, seam, seen)
     state = float(x[kept]), 0.0 if slope is None else float(slope[kept])
     return profile_of(window, x[: kept + 1], slope), state, tight.part(kept, window.last - window.first)
 
 
-def _tightened(window: Window, tight: _Tight, seam: int, seen: int, start: Motion | None) -> tuple[Array, Array | None]:
+def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Array, Array | None]:
     """Squared speeds and, where jerks are limited, slopes at the nodes: those of a motion that keeps all limits.
 
     Where few intervals still pass them, these are planned again with their neighbours, between the motions beside.
@@ -211,40 +230,84 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int, start: Motio
         window, seam: As of `_settled`.
         tight: What it is held to, changed in place.
         seen: Intervals of the window that must keep the limits: the first so many.
-        start: Squared speeds and slopes to start from, if a motion is known.
     """
-    accuracies = [ROUGH, SOON, SOON] if start is None and np.any(window.grid.rows.jerk[:, :, 0]) else []
+    every = np.arange(window.last - window.first)
+    sharp = window.grid.sharp
+    start, free = None, every
     for number in range(ROUNDS):
-        accuracy = accuracies[number] if number < len(accuracies) else ACCURACY
-        x, slope = _solved(window, tight, seam, start, accuracy)
-        used, values = demanded(window, profile_of(window, x, slope), accuracy != ROUGH)
+        accuracy = ACCURACIES[min(number, len(ACCURACIES) - 1)] if sharp else ACCURACIES[-1]
+        try:
+            x, slope = _solved(window, tight, seam, start, accuracy, free)
+        except ProblemError:
+            if len(free) == len(every):
+                raise
+            free = every  # too short to change the motion in
+            continue
+        used, values = demanded(window, profile_of(window, x, slope), free, start is not None or not sharp)
         used /= _room(window, seam)[:, None]
-        if accuracy == ROUGH and slope is not None:
+        if start is None and slope is not None:
             tight.hold_near(used, values, window.rows[1].jerk[:, :, 0])
             start = x, slope
             continue
         passed = used > 1 + KEPT
-        over = passed[:, :seen].any(axis=(0, 2))
-        if not over.any() and accuracy == ACCURACY:
+        over = np.asarray(passed.any(axis=(0, 2)))
+        if not over[:seen].any() and accuracy == ACCURACIES[-1]:
             return x, slope
+        if slope is not None and number == 1:
+            tight.let_go(values, window.rows[1].jerk[:, :, 0], seam - window.first)
         tight.lower(used, passed if slope is None else tight.hold(passed, values), window.rows[0], seam - window.first)
         if slope is None:
             continue
         start = x, slope
-        parts = _about(np.flatnonzero(over), len(x) - 1)
-        if accuracy != ACCURACY or sum(last - first for first, last in parts) > FEW * len(x):
-            continue
-        try:
-            for first, last in parts:
-                part, own, nodes = window.part(first, last, x, slope), tight.part(first, last), slice(first, last + 1)
-                x[nodes], slope[nodes] = _tightened(part, own, seam, min(seen, last) - first, (x[nodes], slope[nodes]))
-        except ProblemError:
-            continue  # too short to change the motion in
-        return x, slope
+        near = np.flatnonzero(maximum_filter1d(over, 2 * AROUND + 1))
+        free = near if accuracy == ACCURACIES[-1] and len(near) < FEW * len(every) else every
     worst = used[:, :seen].max(axis=(0, 2))
     place, most = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are passed by {most - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=most, limit=1.0, time=place)
+
+
+def _coarse(window: Window) -> Window:
+    """A window with every second node of another one, whose rows there are those inside its intervals.
+
+    Near ends at which it moves it has all nodes: there the motion is bound to what is known.
+    """
+    count, grid = window.last - window.first, window.grid
+    begin, end = (AROUND if x > 0 else 0 for x, _ in window.ends)
+    parts = np.arange(begin), np.arange(begin, count - end, 2), np.arange(count - end, count + 1)
+    at = np.unique(np.concatenate(parts))
+    left, right = window.rows[0].of(at[:-1]), window.rows[-1].of(at[1:] - 1)
+    whole = np.diff(at) == 1
+    between = window.rows[0].of(at[:-1] + 1 - whole)
+
+    def inside(rows: Rows) -> Rows:
+        kinds = zip(rows.of(at[:-1]), between, strict=True)
+        return Rows(*(np.where(whole.reshape(-1, *(1,) * (own.ndim - 1)), own, other) for own, other in kinds))
+
+    asked = np.minimum.reduceat(grid.asked[window.first : window.last], at[:-1])
+    own = replace(grid, distance=window.nodes[at], asked=asked)
+    return Window(own, 0, len(asked), window.ends, (left, *map(inside, window.rows[1:-1]), right))
+
+
+def _roughly(window: Window, tight: _Tight, seam: int) -> Motion:
+    """Squared speeds and slopes at the nodes of a motion that is next to the fastest; limits are kept all but."""
+    every = np.arange(window.last - window.first)
+    if len(every) < MANY:
+        return _with_jerk(window, tight, seam, None, ACCURACIES[0], every)
+    few = _coarse(window)
+    try:
+        x, slope = _with_jerk(few, _Tight.of(few), few.last, None, ACCURACIES[0], every[: few.last])
+    except ProblemError:  # too coarse to leave a known motion
+        return _with_jerk(window, tight, seam, None, ACCURACIES[0], every)
+    at = np.minimum(np.searchsorted(few.nodes, window.nodes, side="right") - 1, len(x) - 2)
+    way, h = window.nodes - few.nodes[at], np.diff(few.nodes)[at]
+    bend = np.diff(slope)[at] / h
+    found = x[at] + way * (slope[at] + way * bend / 2), slope[at] + way * bend
+    for rest, next_to, near in ((0, 1, at == 0), (-1, -2, at == len(x) - 2)):
+        if x[rest] == 0:
+            share = np.abs(window.nodes - few.nodes[rest])[near] / h[near]
+            found[0][near], found[1][near] = x[next_to] * share ** (4 / 3), slope[next_to] * np.cbrt(share)
+    return np.maximum(found[0], 0.0), found[1]
 
 
 def _room(window: Window, seam: int) -> Array:
@@ -252,25 +315,14 @@ def _room(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SEAM)
 
 
-def _about(intervals: NDArray[np.intp], count: int) -> list[tuple[int, int]]:
-    """First and last nodes of stretches about some of so many intervals."""
-    found: list[tuple[int, int]] = []
-    for at in intervals.tolist():
-        first, last = at - AROUND, at + 1 + AROUND
-        first, last = (first if first > 1 else 0), (last if last < count - 1 else count)
-        if found and first <= found[-1][1]:
-            found[-1] = found[-1][0], last
-        else:
-            found.append((first, last))
-    return found
-
-
 def _solved(
-    window: Window, tight: _Tight, seam: int, start: Motion | None, accuracy: float
+    window: Window, tight: _Tight, seam: int, start: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> tuple[Array, Array | None]:
-    """Squared speeds at the nodes, and their slopes where jerks are limited."""
-    if np.any(window.grid.rows.jerk[:, :, 0]):
-        return _with_jerk(window, tight, seam, start, accuracy)
+    """Squared speeds at the nodes, and their slopes where jerks are limited; new in the free intervals alone."""
+    if window.grid.sharp:
+        return (
+            _roughly(window, tight, seam) if start is None else _with_jerk(window, tight, seam, start, accuracy, free)
+        )
     return _without_jerk(window, tight.margins), None
 
 
@@ -278,7 +330,7 @@ def _without_jerk(window: Window, margins: _Margins) -> Array:
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]
-    caps = np.minimum(_beside(grid.asked) ** 2, _by_rows(grid, 0, len(h)) * _beside(margins.speed) ** 2)
+    caps = np.minimum(_beside(grid.asked) ** 2, _by_rows(window) * _beside(margins.speed) ** 2)
     of = left.acceleration, right.acceleration
     p = np.concatenate([of[0][:, :, 0], of[1][:, :, 0] + 2 * h * of[1][:, :, 1]], axis=1)
     q, rest = (np.concatenate([side[:, :, seat] for side in of], axis=1) for seat in (1, 2))
@@ -287,14 +339,11 @@ def _without_jerk(window: Window, margins: _Margins) -> Array:
     return passes(window.nodes, caps, p, q, -bound - rest, bound - rest)
 
 
-def _by_rows(grid: Grid, begin: int, end: int) -> Array:
+def _by_rows(window: Window) -> Array:
     """Squared speed that the rows of speed leave at nodes, on both sides."""
-    most = grid.rows.speed[begin : end + 1].max(axis=1, initial=0.0)
-    at = np.flatnonzero((grid.jumps >= begin) & (grid.jumps <= end))
-    before = grid.before.speed[at].max(axis=1, initial=0.0)
-    most[grid.jumps[at] - begin] = np.maximum(most[grid.jumps[at] - begin], before)
+    left, right = (window.rows[k].speed.max(axis=1, initial=0.0) for k in (0, -1))
     with np.errstate(divide="ignore"):
-        return np.asarray(most**-2.0)
+        return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
 
 def _beside(of_intervals: Array) -> Array:
@@ -302,7 +351,9 @@ def _beside(of_intervals: Array) -> Array:
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
-def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None, accuracy: float) -> Motion:
+def _with_jerk(
+    window: Window, tight: _Tight, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
+) -> Motion:
     """Squared speeds and slopes at the nodes of a window."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
     left, middle, right = (window.rows[k] for k in (0, 2, 4))
@@ -310,15 +361,15 @@ def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None, a
     room = _room(window, seam)
     shares = tight.margins.times(room)
     asked = grid.asked[begin:end] ** 2 * room**2
-    caps = np.minimum(_beside(asked), _by_rows(grid, begin, end) * _beside(shares.speed) ** 2)
+    caps = np.minimum(_beside(asked), _by_rows(window) * _beside(shares.speed) ** 2)
     up, rates = reach(nodes, caps, left, right, at_rest)
     # from rest: the first interval, of constant jerk, is no part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
-    states = [End(x=x, slope=slope) for x, slope in ends]
-    for side, rest in enumerate(at_rest):
-        if rest:
+    rest = [0.0, 0.0]
+    for side, resting in enumerate(at_rest):
+        if resting:
             node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
-            states[side] = End(rest=float(width))
+            rest[side] = float(width)
             outer, inside = (left, right) if side == 0 else (right, left)
             sharp = _from_rest(outer, inside, float(width), side, shares.jerk)
             caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
@@ -337,19 +388,31 @@ def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None, a
     else:
         b = spline.through(known[0][inner], known[1][inner])
         b = np.maximum(b, 1e-9 * b.max())
-        tight.speeds[:, cells] = _speed_ratios(spline, b)
-        b *= AGAIN
-    for side, rest in enumerate(at_rest):
-        if not rest:
-            most[[0, 1] if side == 0 else [-1, -2]] = np.inf
+        # what is not planned anew, and what a motion is known to keep from before, is held to what it was
+        new = free[(free >= max(low, tight.inherited)) & (free < high - 1)]
+        tight.speeds[:, new] = _speed_ratios(spline, b)[:, new - low]
+    fixed: list[int] = []
+    sides = ((0, 1, spline.h[0]), (len(b) - 1, len(b) - 2, -spline.h[-1]))
+    for (x_end, slope_end), resting, (outermost, next_to, way) in zip(ends, at_rest, sides, strict=True):
+        if not resting:
+            b[outermost], b[next_to] = x_end, x_end + way * slope_end / 2
+            most[[outermost, next_to]] = np.inf
+            fixed += [outermost, next_to]
     own_shares = shares.of(cells)
     moving = (not at_rest[0], not at_rest[1])
     places = tuple(rows.of(cells) for rows in window.rows)
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * most[:-1] + spline.share * most[1:]
     rows = _rows(places, held[:, :, cells], caps[inner], implied, own_shares, tight.speeds[:, cells], moving)
+    program = Program(spline, rows, most, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
-        b = _coefficients(spline, rows, most, (states[0], states[1]), b, accuracy)
+        if known is None:
+            b = least_time(program, b, accuracy=accuracy, center=CENTER)
+        elif len(free) == end - begin:
+            b = _again(program, b, accuracy)
+        else:
+            part, at = program.part(free[(free >= low) & (free < high - 1)] - low)
+            b[at] = _again(part, b[at], accuracy)
     except SolveError as error:
         message = f"{error}; raise the limits, or keep the path away from singular arms"
         details = {"name": "limits", "value": error.value, "limit": error.limit, "time": error.time}
@@ -359,16 +422,14 @@ def _with_jerk(window: Window, tight: _Tight, seam: int, known: Motion | None, a
     return x, slope
 
 
-def _coefficients(
-    spline: Spline, rows: SplineRows, most: Array, ends: tuple[End, End], start: Array, accuracy: float
-) -> Array:
-    """Solve a program, after the first round from its last solution; where that leads nowhere, from further inside."""
-    if accuracy == ROUGH:
-        return least_time(spline, rows, most, ends, start, accuracy=accuracy, center=CENTER)
+def _again(program: Program, known: Array, accuracy: float) -> Array:
+    """Solve a program from a solution of one like it; where that leads nowhere, from further inside."""
+    free = np.ones(len(known), dtype=bool)
+    free[program.fixed] = False
     try:
-        return least_time(spline, rows, most, ends, start, accuracy=accuracy, center=CENTER_AGAIN)
+        return least_time(program, np.where(free, AGAIN, 1.0) * known, accuracy=accuracy, center=CENTER_AGAIN)
     except SolveError:
-        return least_time(spline, rows, most, ends, 0.3 * start, accuracy=accuracy, center=CENTER)
+        return least_time(program, np.where(free, 0.3 * AGAIN, 1.0) * known, accuracy=accuracy, center=CENTER)
 
 
 def _start(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:

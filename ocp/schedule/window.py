@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ocp.schedule.grid import Grid
-from ocp.schedule.limits import JointPath, LineLimits, PathLike
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, through
-from ocp.schedule.rows import Rows, rows_at
+from ocp.schedule.rows import Rows, rows_at, torque_rows
 
 __all__ = ["HELD", "INSIDE", "ROOM", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
 
@@ -39,15 +38,11 @@ class Stretch:
     """A part of a grid between two nodes.
 
     Attributes:
-        path, limits, joints: Of the schedule.
         grid: All of it.
         first, last: Nodes.
         ends: Squared speed and its slope at either; rest where the path ends. Shape (2, 2).
     """
 
-    path: PathLike
-    limits: LineLimits
-    joints: JointPath | None
     grid: Grid
     first: int
     last: int
@@ -62,44 +57,48 @@ class Window(Stretch):
         rows: Where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
         bends: What parabolas through the rows of acceleration and of jerk at three of these places miss at most.
             Shape (N, L, 3) and (N, P, 3).
-        close: Rows at places nearer to one another, of intervals of the grid that were looked at so. Shape (15,) each.
+        close: Rows at places nearer to one another, of intervals of the grid that were looked at so, with or without
+            those of torques.
     """
 
     rows: tuple[Rows, ...] = ()
     bends: tuple[Array, Array] = (np.zeros((0, 0, 3)), np.zeros((0, 0, 3)))
-    close: dict[int, Rows] = field(default_factory=dict)
+    close: dict[tuple[int, bool], Rows] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
         """Part of a stretch between two nodes."""
-        begin, h = stretch.grid.distance[first:last], np.diff(stretch.grid.distance[first : last + 1])
-        left, right = stretch.grid.ends(first, last)
+        grid = stretch.grid
+        begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
+        left, right = grid.ends(first, last)
         places = np.concatenate([begin + share * h for share in INSIDE])
-        rows = rows_at(stretch.path, stretch.limits, stretch.joints, places)
+        rows = rows_at(grid.path, grid.limits, grid.joints, places)
         inside = [rows.of(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
         all_of_them = (left, *inside, right)
         bends = _bends([each.acceleration for each in all_of_them]), _bends([each.jerk for each in all_of_them])
-        return cls(stretch.path, stretch.limits, stretch.joints, stretch.grid, first, last, ends, all_of_them, bends)
+        return cls(grid, first, last, ends, all_of_them, bends)
 
-    def part(self, first: int, last: int, x: Array, slope: Array) -> Window:
-        """Its intervals between two nodes, given squared speeds and slopes at all of them. Shape (N + 1,)."""
-        own = [(float(x[node]), float(slope[node])) for node in (first, last)]
-        ends = (self.ends[0] if first == 0 else own[0], self.ends[1] if last == len(x) - 1 else own[1])
-        rows = tuple(rows.of(slice(first, last)) for rows in self.rows)
-        bends = self.bends[0][first:last], self.bends[1][first:last]
-        return replace(self, first=self.first + first, last=self.first + last, ends=ends, rows=rows, bends=bends)
+    def closely(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
+        """Rows at the ends of the `FINE` parts of some intervals but for their own, place by place.
 
-    def closely(self, intervals: NDArray[np.intp]) -> Rows:
-        """Rows at the ends of the `FINE` parts of some intervals but for their own, place by place. Shape (15 B,)."""
-        new = [at for at in intervals.tolist() if self.first + at not in self.close]
+        Shape ((FINE - 1) B,); those of torques, which take longest, where they are asked for.
+        """
+        new = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
         if new:
-            begin, h = self.nodes[new], np.diff(self.nodes)[new]
+            grid, begin, h = self.grid, self.nodes[new], np.diff(self.nodes)[new]
             places = begin[:, None] + np.arange(1, FINE) / FINE * h[:, None]
-            rows = rows_at(self.path, self.limits, self.joints, places.ravel())
+            rows = rows_at(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
             for k, at in enumerate(new):
-                self.close[self.first + at] = rows.of(slice(k * (FINE - 1), (k + 1) * (FINE - 1)))
-        found = [self.close[self.first + at] for at in intervals.tolist()]
+                self.close[self.first + at, torques] = rows.of(slice(k * (FINE - 1), (k + 1) * (FINE - 1)))
+        found = [self.close[self.first + at, torques] for at in intervals.tolist()]
         return Rows(*(np.stack(kind, axis=1).reshape(-1, *kind[0].shape[1:]) for kind in zip(*found, strict=True)))
+
+    @property
+    def torques(self) -> slice:
+        """Rows of `causes` that are torques."""
+        speed, acceleration, _ = (kind.shape[1] for kind in self.rows[0])
+        count = torque_rows(self.grid.limits, self.grid.joints)
+        return slice(speed + acceleration - count, speed + acceleration)
 
     @property
     def nodes(self) -> Array:
@@ -117,21 +116,23 @@ def profile_of(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
     return SpeedProfile(t, s, v, np.append(np.diff(x) / (2 * np.diff(s)), 0.0), np.zeros(len(s) - 1))
 
 
-def demanded(window: Window, profile: SpeedProfile, closely: bool = True) -> tuple[Array, Array]:
-    """Demands over their limits in each interval: the largest, upwards and downwards, and those at `HELD` places.
+def demanded(
+    window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
+) -> tuple[Array, Array]:
+    """Demands over their limits in some intervals (B,): the largest, upwards and downwards, and those at `HELD` places.
 
-    Shape (2, N, K + L + P) and (4, N, K + L + P).
+    Shape (2, N, K + L + P) and (4, N, K + L + P), none in the others.
 
     In either half of an interval each demand is a parabola through three places; its vertex counts too. Where that may
     miss what matters, and they are looked at `closely`, more places count.
     """
-    begin, before, here, after, end = window.rows
-    nodes, h = window.nodes, np.diff(window.nodes)
-    count = len(h)
-    each = len(profile.jerk) // count
+    count, h = len(which), np.diff(window.nodes)[which]
+    every, left = count == window.last - window.first, window.nodes[which]
+    begin, before, here, after, end = window.rows if every else (rows.of(which) for rows in window.rows)
+    each = len(profile.jerk) // (window.last - window.first)
     # the halves meet where the jerk changes, near the middle: rows there are those of a parabola as well
-    at = profile.distance[1::2] if each == 2 else nodes[:-1] + h / 2
-    f = (at - nodes[:-1]) / h
+    at = profile.distance[1::2][which] if each == 2 else left + h / 2
+    f = (at - left) / h
     x = (f - INSIDE[1]) / (INSIDE[1] - INSIDE[0])
 
     def between(a: Array, b: Array, c: Array) -> Array:
@@ -140,16 +141,16 @@ def demanded(window: Window, profile: SpeedProfile, closely: bool = True) -> tup
 
     middle = Rows(*(between(*kinds) for kinds in zip(before, here, after, strict=True)))
 
-    def states(part: slice, jerk: Array) -> LineMotion:
-        t, s, v, a = (kind[part] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
+    def states(place: NDArray[np.intp], jerk: Array) -> LineMotion:
+        t, s, v, a = (kind[place] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
         return LineMotion(t, s, v, a, jerk)
 
-    first = states(slice(0, -1, each), profile.jerk[::each])
-    last = states(slice(each, None, each), profile.jerk[each - 1 :: each])
+    first = states(each * which, profile.jerk[each * which])
+    last = states(each * (which + 1), profile.jerk[each * (which + 1) - 1])
     if each == 1:  # the acceleration jumps at nodes: it is that before them
         last = last._replace(acceleration=first.acceleration)
     zero = np.zeros(count)
-    places = np.concatenate([nodes[:-1] + INSIDE[0] * h, at, nodes[:-1] + INSIDE[2] * h])
+    places = np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h])
     inside = profile.at_distance(places)
     quarter, met, far = (LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3))
     halves = (
@@ -167,10 +168,24 @@ def demanded(window: Window, profile: SpeedProfile, closely: bool = True) -> tup
         peak = _vertex(high[three], places_of[three])
         for side, value in zip(used, (peak, -peak), strict=True):
             side[at_row] = np.maximum(side[at_row], value)
-    bent = np.flatnonzero(_missed(window, used, (first, met, last))) if closely else np.zeros(0, dtype=np.intp)
-    if bent.size:
-        used[:, bent] = _closely(window, profile, bent, f[bent], values[[0, 2, 3, 5]][:, bent])
-    return used, values[[0, 1, 4, 5]]
+    if closely:
+        bends = window.bends if every else (window.bends[0][which], window.bends[1][which])
+        missed = _missed(bends, used, (first, met, last))
+        bent, heavy = missed.any(axis=1), missed[:, window.torques].any(axis=1)
+        for torques, these in ((False, np.flatnonzero(bent & ~heavy)), (True, np.flatnonzero(heavy))):
+            if these.size:
+                known = values[[0, 2, 3, 5]][:, these]
+                close = _closely(window, profile, which[these], f[these], known, torques)
+                if not torques:
+                    close[:, :, window.torques] = used[:, these, window.torques]
+                used[:, these] = close
+    found = values[[0, 1, 4, 5]]
+    if every:
+        return used, found
+    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, found)]
+    for kind, own in zip(everywhere, (used, found), strict=True):
+        kind[:, which] = own
+    return everywhere[0], everywhere[1]
 
 
 def _bends(rows: list[Array]) -> Array:
@@ -180,23 +195,25 @@ def _bends(rows: list[Array]) -> Array:
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
-def _missed(window: Window, used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Intervals in which a demand that seems to be kept may be passed between three places. Shape (N,)."""
+def _missed(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
+    """Demands that seem to be kept and may be passed between three places. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
     )
-    of_a, of_j = window.bends
+    of_a, of_j = bends
     miss = [
         np.zeros((len(v), used.shape[2] - of_a.shape[1] - of_j.shape[1])),
         of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2],
         of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
     ]
     missed = np.concatenate(miss, axis=1)
-    return np.asarray(((missed > BEND) & (used.max(axis=0) + missed > 1)).any(axis=1))
+    return np.asarray((missed > BEND) & (used.max(axis=0) + missed > 1))
 
 
-def _closely(window: Window, profile: SpeedProfile, bent: NDArray[np.intp], f: Array, known: Array) -> Array:
+def _closely(
+    window: Window, profile: SpeedProfile, bent: NDArray[np.intp], f: Array, known: Array, torques: bool
+) -> Array:
     """Largest demands, upwards and downwards, of some intervals by places near one another. Shape (2, B, R).
 
     Args:
@@ -204,10 +221,13 @@ def _closely(window: Window, profile: SpeedProfile, bent: NDArray[np.intp], f: A
         bent: The intervals. Shape (B,).
         f: Where in them the jerk changes. Shape (B,).
         known: Demands at their beginning, before and after that change, and at their end. Shape (4, B, R).
+        torques: Whether those of torques are asked for.
     """
     half = FINE // 2
     places = window.nodes[bent] + np.arange(1, FINE)[:, None] / FINE * np.diff(window.nodes)[bent]
-    demands = window.closely(bent).demands(profile.at_distance(places.ravel())).reshape(FINE - 1, len(bent), -1)
+    demands = (
+        window.closely(bent, torques).demands(profile.at_distance(places.ravel())).reshape(FINE - 1, len(bent), -1)
+    )
     fine = np.arange(FINE + 1)[:, None] / FINE + np.zeros(len(bent))
     fine[half] = f
     begin, before, after, end = known[:, None]

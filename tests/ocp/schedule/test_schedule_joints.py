@@ -133,7 +133,7 @@ def test_where_the_curvature_jumps_both_sides_are_kept() -> None:
     limits = LineLimits(9.0, 5.0, 200.0, 2.0, JointLimits(2.0))
     grid, bounds = make_grid(arm.path, limits, arm), arm.path.bounds[1:-1]
     assert grid.distance[grid.jumps] == pytest.approx(bounds, abs=1e-15)
-    left, right = grid.ends()
+    left, right = grid.ends(0, len(grid.asked))
     step = 1e-10 * arm.path.length
     for rows, sides in ((left.of(grid.jumps), bounds + step), (right.of(grid.jumps - 1), bounds - step)):
         expected = rows_at(arm.path, limits, arm, sides)
