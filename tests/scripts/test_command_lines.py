@@ -15,7 +15,6 @@ OPTIONS = {
     "blend": ["--out"],
     "cts": ["--out"],
     "gallery": ["--out", "--only", "space_arm", "panda", "ur5", "posture_set", "mobile_manipulator", "pushing"],
-    "view": ["--lock NAME=VALUE", "--mesh-dir"],
     "benchmark": ["--out", "--only", "--repeats", "costate_rate"],
     "reproduce": ["--out", "--only", "free_floating"],
 }
