@@ -11,6 +11,7 @@ whole, folds and branches that meet are nothing special, and no angle has to be 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from scipy.spatial import cKDTree
 from models import Machine
 from models.arrays import Array
 from ocp.errors import ProblemError
+from ocp.local.branches import Branches, branches_of
 from ocp.problem.formulation import Sampler
 from ocp.tasks.equations import TaskEquations
 
@@ -41,6 +43,8 @@ BENT = 0.1
 """Share of its radius by which the set may leave a chart at its edge; the radius is halved until it does not."""
 HALVINGS = 7
 """Of the radius, at most: nearer to singular postures the cover ends, and says so."""
+LISTED = 64
+"""Places of what is free at which closed forms list all postures of an instant."""
 NEIGHBOURS = 12
 """Charts in which a point of an edge is looked for."""
 APART = 1e3
@@ -231,6 +235,22 @@ class SelfMotions:
 
     # ---- postures ------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def _branches(self) -> Branches | None:
+        return branches_of(self.equations, self.space.lower, self.space.upper)
+
+    def listed(self, number: int) -> Array:
+        """Postures of an instant by closed forms, some of every branch, within limits; none where there are no such.
+
+        Returns:
+            Shape (K, n).
+        """
+        if self._branches is None:
+            return np.zeros((0, len(self.space.scale)))
+        found = self._branches.postures(self.targets[number], LISTED, LISTED * number)
+        on, good = self.corrected(np.full(len(found), number), found)
+        return np.asarray(on[good & self.space.within(on)])
+
     def linearised(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
         """What the tasks miss (M, m), and their Jacobian by joints of the metric (M, m, n)."""
         error, jacobian = self._sampler(joints, self.targets[layer])
@@ -336,7 +356,13 @@ class SelfMotions:
         Raises:
             ProblemError: There are more.
         """
-        charts = self._grown(None, layer, joints, radius, most)
+        charts, left = None, np.arange(len(layer))
+        while charts is None or left.size:
+            # one of each instant, and of what has not grown from it another one
+            _, first = np.unique(layer[left], return_index=True)
+            charts = self._grown(charts, layer[left[first]], joints[left[first]], radius, most)
+            left = np.delete(left, first)
+            left = left[~self.covered(charts, layer[left], joints[left])]
         last, new = len(self.targets) - 1, charts
         while len(new):
             layer = np.concatenate([new.layer - 1, new.layer + 1])

@@ -5,8 +5,9 @@ that are cheapest, each of which becomes a guess for the whole motion's problem.
 that is cheaper than a share of the best one found are left out, the others are halved, and again, until none is left:
 then none is cheaper than that share. Straight steps from instant to instant cost no more than the motion itself.
 
-The bound is a proof under these assumptions, and no others: inverse kinematics found a posture of every part of the set
-of postures that is connected, over all instants; within a box the set strays from its chart, and from the quadratic
+The bound is a proof under these assumptions, and no others: closed forms, where the arm has one, at samples of what is
+free, or inverse kinematics from random starts found a posture of every part of the set of postures that is connected,
+over all instants; within a box the set strays from its chart, and from the quadratic
 form that its rim tells, no farther than at the rim; where something has to be clear, bodies that overlap do so as deep
 as it is measured.
 """
@@ -14,6 +15,7 @@ as it is measured.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -125,6 +127,18 @@ class Search:
     def graph(self, layers: list[Charts], most: Array) -> Graph:
         """The steps between charts, which cost at most so much each. Shape (K - 1,)."""
         return Graph(self.space, layers, np.diff(self.times), self.cost, self.limits, most)
+
+    def whole_graph(self) -> Graph:
+        """All steps between the charts that the search begins with."""
+        return self.graph(self.layers, np.full(len(self.times) - 1, np.inf))
+
+    def part(self, first: int, last: int) -> Search:
+        """The search from one of its instants to another one, both of them included."""
+        own, rows = copy(self), slice(first, last + 1)
+        own.instants, own.times, own.limits = self.instants[rows], self.times[rows], self.limits[first:last]
+        own.covered, own.layers, own._known = self.covered[rows], self.layers[rows], None
+        own.start = self.start if first == 0 else None
+        return own
 
     def steps(self, path: Array) -> float:
         """What straight steps through joints (K, n) at the instants cost."""

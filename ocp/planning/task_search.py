@@ -119,13 +119,17 @@ class TaskSearch:
         return True
 
     def _seeds(self, k: int) -> Array:
-        """Postures at an instant, by inverse kinematics."""
+        """Postures at an instant, by closed forms and by inverse kinematics from random starts."""
         asked, time = self.asked, float(self.times[k])
-        tasks = [part.task for part in self._instants[k].sets.equations.bound]
+        sets, number = self._instants[k]
+        tasks, listed = [part.task for part in sets.equations.bound], sets.listed(number)
         options: dict[str, Any] = {"seed": asked.seed + k, "limits": asked.limits.joints, "starts": STARTS}
         try:
-            return np.array([one.joints for one in inverse_kinematics(asked.machine, tasks, time=time, **options)])
+            found = inverse_kinematics(asked.machine, tasks, time=time, **options)
+            return np.vstack([listed, [one.joints for one in found]])
         except Unreachable as error:
+            if len(listed):
+                return listed
             raise placed(asked, error, time) from error
 
     def followed(self) -> list[Followed]:

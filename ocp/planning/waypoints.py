@@ -4,7 +4,8 @@ The cost is the weighted sum of the ways of all joints, or of the largest of the
 waypoints no joint moves more than a step. Some of the waypoints are searched whole (see `ocp.planning.search`); since a
 way through all of them is no shorter than through some, what bounds these bounds all. The best ways found are then
 drawn tight through all waypoints: dynamic programming over the postures beside the way, nearer and nearer, in which
-what is not allowed is dear, so that a way may come out of it as well.
+what is not allowed is dear, so that a way may come out of it as well. Where no way goes through all, one in the fewest
+pieces may be asked for (see `ocp.planning.reconfigurations`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from ocp.local.touching import Touch, distances_along, touches
 from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import dead_end
 from ocp.planning.planner import clear_of
+from ocp.planning.reconfigurations import fewest_pieces
 from ocp.planning.search import FREE, Search
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
@@ -35,9 +37,10 @@ from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["WayCost", "WaypointPlan", "plan_waypoints"]
+__all__ = ["Reconfigurations", "WayCost", "WaypointPlan", "plan_waypoints"]
 
 WayCost: TypeAlias = Literal["length", "largest", "time"]
+Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 EVERY = 5
 """Of so many waypoints one is searched whole; more where none of the ways found goes through all."""
@@ -61,11 +64,13 @@ class WaypointPlan:
     Attributes:
         machine: What moves.
         joints: At the waypoints. Shape (N, n), rad or m.
-        cost: Of the way.
-        bound: Of the cost of any way through the waypoints; 0 where none is known.
+        cost: Of the way, without what lies in reconfigurations.
+        bound: Of the cost of any way through the waypoints, in no more pieces; 0 where none is known.
         ways: Costs of all ways that were found, and why they are not the plan.
         between: How near bodies come on straight lines of the joints from waypoint to waypoint, proven; its times are
-            numbers of waypoints. None where nothing was to be looked at.
+            numbers of waypoints. None where nothing was to be looked at. Reconfigurations are left out.
+        reconfigurations: Numbers of the waypoints from which the arm comes to the next one in another posture, by a way
+            that is not planned.
     """
 
     machine: FixedBase
@@ -74,11 +79,13 @@ class WaypointPlan:
     bound: float
     ways: tuple[tuple[float, str], ...] = ()
     between: Clearance | None = None
+    reconfigurations: tuple[int, ...] = ()
 
     @property
     def steps(self) -> Array:
-        """Largest way of each joint from one waypoint to the next. Shape (n,), rad or m."""
-        return np.asarray(np.abs(np.diff(self.joints, axis=0)).max(axis=0))
+        """Largest way of each joint from one waypoint to the next, but for reconfigurations. Shape (n,), rad or m."""
+        ways = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
+        return np.asarray(ways.max(axis=0, initial=0.0))
 
     def __repr__(self) -> str:
         return (
@@ -90,6 +97,10 @@ class WaypointPlan:
             f"way through {len(self.joints)} waypoints of {', '.join(self.machine.robot.joint_names)}: "
             f"cost {self.cost:.6g}, at least {self.bound:.6g} any"
         ]
+        if self.reconfigurations:
+            places = ", ".join(map(str, self.reconfigurations))
+            count = f"{len(self.reconfigurations)} time{'s' if len(self.reconfigurations) > 1 else ''}"
+            lines.append(f"  the arm reconfigures {count}, after waypoint {places}")
         if self.between is not None and self.between.worst is not None:
             near = self.between.worst
             how = "too near" if near.missed else "proven clear, the nearest"
@@ -114,6 +125,7 @@ def plan_waypoints(
     srdf: Any = None,
     folders: Any = (),
     missing: str = "raise",
+    reconfigurations: Reconfigurations = "forbidden",
     seed: int = 0,
 ) -> WaypointPlan:
     """The cheapest way through poses of the tip that keeps limits and is clear at every waypoint.
@@ -129,12 +141,15 @@ def plan_waypoints(
         weights: Of the joints' ways in the cost, 0 for what does not count. Shape (n,); all 1 if None. Not for a time.
         limits: Of the joints' positions, and of their velocities for the time; the robot's own if None.
         obstacles, clearance, ignored, srdf, folders, missing: As of `plan`.
+        reconfigurations: "counted": where no way goes through all waypoints, one with the fewest reconfigurations, and
+            of these the cheapest. In a reconfiguration the arm leaves the way at a waypoint and comes back to the next
+            one in any posture; this costs nothing and is not planned. With one free direction at most.
         seed: Of inverse kinematics.
 
     Raises:
         ProblemError: What is asked does not fit the machine; Unreachable, which is one, names the waypoint as time.
-        DeadEnd: No way goes through all waypoints: from which on none does, what stops it, and how far the poses or the
-            clearance would have to give way.
+        DeadEnd: No way goes through all waypoints, in one piece where reconfigurations are forbidden: from which on
+            none does, what stops it, and how far the poses or the clearance would have to give way.
         SolveError: None was found, though some go through a part of them.
     """
     checked_instance("machine", machine, FixedBase)
@@ -146,6 +161,7 @@ def plan_waypoints(
     if not ((heavy >= 0).all() and heavy.any()):
         raise ProblemError(f"weights {heavy.tolist()} must be positive, or 0", name="weights", value=heavy, limit=0.0)
     checked_choice("cost", cost, get_args(WayCost))
+    checked_choice("reconfigurations", reconfigurations, get_args(Reconfigurations))
     for what in ("velocity", "acceleration", "jerk", "torque", "power"):
         if getattr(told, what) is not None and not (what == "velocity" and cost == "time"):
             words = f"limits: a way through waypoints has no time, so no {what}; leave it out, or give a step"
@@ -160,7 +176,7 @@ def plan_waypoints(
     clear = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, told)
     around = None if clear is None else clear.surroundings
     way = _Ways(machine, places, turns, most, (Length if cost == "length" else Largest)(heavy), told, around, int(seed))
-    return way.plan()
+    return way.plan(reconfigurations == "counted")
 
 
 class _Ways:
@@ -192,7 +208,10 @@ class _Ways:
             words += f"; hold joints until at most {FREE} are left over"
             raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
 
-    def plan(self) -> WaypointPlan:
+    def plan(self, in_pieces: bool) -> WaypointPlan:
+        if in_pieces and self.sets.size > 1:
+            words = f"reconfigurations are counted with one free direction at most, not with {self.sets.size}"
+            raise ProblemError(words, name="reconfigurations", value=self.sets.size, limit=1)
         every, bound = EVERY, 0.0
         ways = list[tuple[float, str, Array]]()
         if self.sets.size > 1:
@@ -202,6 +221,8 @@ class _Ways:
             search = self._search(chosen)
             best, least = search.best(np.inf)
             if not np.isfinite(least):
+                if in_pieces:
+                    return self._in_pieces(search, chosen)
                 raise self._ended(search, chosen)
             bound = max(bound, least)
             if best is not None:
@@ -215,6 +236,8 @@ class _Ways:
                 more = np.union1d(chosen, self._every(every))
             chosen = more
         ways.sort(key=lambda one: (bool(one[1]), one[0]))
+        if in_pieces and (not ways or ways[0][1]):
+            return self._in_pieces(self._search(self._every(1)), self._every(1))
         if not ways or ways[0][1]:
             reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways)) or "none goes through all"
             raise SolveError(f"no way through the waypoints keeps all limits: {reasons}", name="waypoints")
@@ -223,15 +246,43 @@ class _Ways:
         bound = bound if bound <= length else 0.0
         return WaypointPlan(self.machine, joints, length, bound, listed, self._between(joints))
 
-    def _between(self, joints: Array) -> Clearance | None:
-        """What is proven of straight lines from waypoint to waypoint, one of each a second."""
+    def _in_pieces(self, search: Search, chosen: NDArray[np.intp]) -> WaypointPlan:
+        """The cheapest way with the fewest reconfigurations, seen from waypoints that are searched already."""
+        while True:
+            found = fewest_pieces(search)
+            if found is None:
+                raise self._ended(search, chosen)
+            pieces, bound = found
+            breaks = [(int(chosen[piece.last]), int(chosen[piece.last + 1])) for piece in pieces[:-1]]
+            # a reconfiguration lies between two waypoints, and what is drawn between others has to be right
+            more = np.union1d(chosen, np.concatenate([chosen, *(np.arange(*pair) for pair in breaks)]))
+            if len(more) == len(chosen):
+                parts = [self._drawn(chosen[piece.first : piece.last + 1], piece.joints)[2] for piece in pieces]
+                joints, after = np.concatenate(parts), tuple(one for one, _ in breaks)
+                why, wrong = self._wrong(joints, after)
+                more = np.union1d(chosen, wrong)
+                if not why:
+                    length = self._length(joints, after)
+                    ways, between = ((length, ""),), self._between(joints, after)
+                    return WaypointPlan(self.machine, joints, length, min(bound, length), ways, between, after)
+                if len(more) == len(chosen):
+                    raise SolveError(f"no way in {len(pieces)} pieces keeps all limits: {why}", name="waypoints")
+            chosen = more
+            search = self._search(chosen)
+
+    def _between(self, joints: Array, breaks: tuple[int, ...] = ()) -> Clearance | None:
+        """What is proven of straight lines from waypoint to waypoint, one of each a second, but for breaks."""
         if self.around is None:
             return None
         numbers, last = np.arange(len(joints), dtype=float), len(joints) - 1.0
         rates = np.abs(np.diff(joints, axis=0))
+        rates[list(breaks)] = 0.0
 
         def along(at: Array) -> Array:
-            return np.stack([np.interp(at * last, numbers, column) for column in joints.T], axis=1)
+            place = at * last
+            held = np.isin(np.floor(place), breaks)  # until the next waypoint, where the arm is back
+            place = np.where(held, np.floor(place), place)
+            return np.stack([np.interp(place, numbers, column) for column in joints.T], axis=1)
 
         return clearance_of(self.around, along, numbers / last, last, rates, np.zeros_like(rates), False)
 
@@ -289,12 +340,17 @@ class _Ways:
         return (None if len(closer) == len(chosen) else dead_end(self._search(closer), WAYPOINT)) or end
 
     def _drawn(self, chosen: NDArray[np.intp], path: Array) -> tuple[float, str, Array]:
-        """A way through all waypoints beside one through some, its length and what is wrong with it."""
-        numbers = [Instant(self.sets, k) for k in range(len(self.places))]
+        """A way through all waypoints beside one through some of them, from the first of these to the last.
+
+        Returns:
+            Its length, what is wrong with it where it goes through all there are, and its joints.
+        """
+        numbers = [Instant(self.sets, k) for k in range(int(chosen[0]), int(chosen[-1]) + 1)]
         far, bounds = np.repeat(self.step[None], len(numbers) - 1, axis=0), (self.lower, self.upper)
         start = self._through(chosen, path)
         joints = drawn_tight(start, numbers, self.cost, np.ones(len(far)), far, bounds, self.around, (WIDTH, TIGHT))
-        return self._length(joints), self._wrong(joints)[0], joints
+        whole = len(joints) == len(self.places)
+        return self._length(joints), self._wrong(joints)[0] if whole else "", joints
 
     def _task(self, number: int) -> TipTask:
         return TipTask(position=self.places[number], orientation=self.turns[number])
@@ -302,16 +358,19 @@ class _Ways:
     def _seeds(self, number: int) -> Array:
         """Postures at a waypoint."""
         options: dict[str, Any] = {"seed": self.seed + number, "limits": self.kept, "starts": STARTS}
+        listed = self.sets.listed(number)
         try:
             found = inverse_kinematics(self.machine, self._task(number), **options)
         except Unreachable as error:
+            if len(listed):
+                return listed
             words = f"waypoint {number} at {self.places[number].round(6).tolist()} m: {error}"
             raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
-        return np.array([one.joints for one in found])
+        return np.vstack([listed, [one.joints for one in found]])
 
     def _through(self, chosen: NDArray[np.intp], path: Array) -> Array:
-        """Joints at all waypoints, (N, n), from those at some, turned within the limits."""
-        numbers = np.arange(len(self.places))
+        """Joints at all waypoints, (N, n), from the first of some to the last, turned within the limits."""
+        numbers = np.arange(chosen[0], chosen[-1] + 1)
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
         on, good = self.sets.corrected(numbers, joints)
         joints[good] = on[good]
@@ -320,15 +379,16 @@ class _Ways:
             joints[:, j] += TURN * np.round(middle / TURN)
         return joints
 
-    def _length(self, joints: Array) -> float:
-        return float(self.cost.of(np.diff(joints, axis=0), 1.0).sum())
+    def _length(self, joints: Array, breaks: tuple[int, ...] = ()) -> float:
+        return float(np.delete(self.cost.of(np.diff(joints, axis=0), 1.0), list(breaks)).sum())
 
-    def _wrong(self, joints: Array) -> tuple[str, NDArray[np.intp]]:
+    def _wrong(self, joints: Array, breaks: tuple[int, ...] = ()) -> tuple[str, NDArray[np.intp]]:
         """What limit a way does not keep, "" if none, and the waypoints where it keeps one not, or is off."""
         names, numbers = self.machine.robot.joint_names, np.arange(len(joints))
         error = np.abs(self.sets.linearised(numbers, joints)[0]).max(axis=1)
         over = np.maximum(joints - self.upper, self.lower - joints)
         steps = np.abs(np.diff(joints, axis=0)) - self.step
+        steps[list(breaks)] = -self.step
         far = (steps > WHOLE).any(axis=1)
         wrong = (error > MISSED) | (over > WHOLE).any(axis=1)
         wrong[:-1] |= far

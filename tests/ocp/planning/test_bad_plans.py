@@ -107,6 +107,7 @@ CASES = [
             "positions": array(3, 3) | {"one": POSES[0][:1], "fewer": POSES[0][:2]},
             "quaternions": array(3, 4) | {"zero": np.zeros((3, 4)), "fewer": POSES[1][:2]},
             "cost": CHOICE,
+            "reconfigurations": CHOICE,
             "step": but(array(7), "inf") | {"zero": 0.0, "negative": -1.0, "one zero": [1.0] * 6 + [0.0]},
             "weights": array(7) | {"zero": np.zeros(7), "negative": [1.0] * 6 + [-1.0]},
             "limits": but(INSTANCE, "None") | {"class": Limits, "velocity": Limits(velocity=1.0)},
