@@ -39,7 +39,7 @@ reproduce: $(VENV)/run.stamp ## run every paper script: figures, tables and summ
 gallery: $(VENV)/gallery.stamp ## real robots: plan, audit and draw each example into results/gallery
 	$(BIN)/python scripts/gallery.py --out "$(OUT)"
 
-benchmark: $(VENV)/peers.stamp $(VENV)/gallery.stamp ## time model functions, builds, solves and plans, beside other packages
+benchmark: $(VENV)/peers.stamp $(VENV)/test.stamp ## time model functions, builds, solves and plans, beside other packages
 	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
 
 site: $(VENV)/site.stamp ## build the documentation into build/site, its tutorials run, and look at every link

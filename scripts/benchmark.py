@@ -22,6 +22,7 @@ PARTS = (
     "native",
     "audit",
     "planning",
+    "waypoints",
     "batch",
     "schedules",
     "cts",
