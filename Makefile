@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test sweep crowded redundancy global brute passages faults browser check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages faults browser check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -49,6 +49,9 @@ site: $(VENV)/site.stamp ## build the documentation into build/site, its tutoria
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
+
+long: $(VENV)/test.stamp ## run the tests that take minutes: the gallery, random paths and robots, standing plans
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m long $(ARGS)
 
 sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is known (ARGS="--only pendulum --seed 3")
 	$(BIN)/python -m tests.sweep --workers $(WORKERS) --out "$(OUT)" $(ARGS)

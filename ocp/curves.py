@@ -52,6 +52,10 @@ class PiecewisePolynomial:
     nodes: np.ndarray
     values: np.ndarray
 
+    def __post_init__(self) -> None:
+        # laid out alike wherever they come from, for sums to be rounded alike
+        object.__setattr__(self, "values", np.ascontiguousarray(self.values))
+
     def __repr__(self) -> str:
         pieces, nodes, columns = self.values.shape
         return f"<PiecewisePolynomial of {pieces} pieces of {nodes} nodes, {columns} columns>"

@@ -6,7 +6,7 @@ shows them, `figure.savefig` writes them, and one of pyplot's may be drawn into 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from typing import Any
 
@@ -241,7 +241,7 @@ def _named(against: Any) -> dict[str, Any]:
         return {}
     if isinstance(against, Mapping):
         named = {str(name): one for name, one in against.items()}
-    elif isinstance(against, Sequence) and not isinstance(against, str):
+    elif isinstance(against, list | tuple):
         named = {f"other {number}": one for number, one in enumerate(against, 1)}
     else:
         named = {"the other": against}

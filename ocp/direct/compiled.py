@@ -45,6 +45,8 @@ LARGE = 300_000
 MOST = 8_000_000
 """Characters of C: gcc takes 130 bytes of memory for each."""
 FEW = 10  # instructions of a block, which take as long to call as to do
+RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
+"""What tells how derivatives are made of a block: the text that does it."""
 SERIALISED = "casadi:"  # before the text of a function
 NICE = 10  # of the compiler in the background
 SECONDS_A_LIBRARY, SECONDS_AN_INSTRUCTION = 0.2, 1.5e-4  # of what the compiler may take, with gcc 12 at -O1
@@ -391,7 +393,7 @@ class _Unit:
 
     @property
     def library(self) -> Library:
-        contents = (_recipe(), self.text)
+        contents = (RECIPE, self.text)
         return Library(contents, lambda: code(self.interpreted))
 
     @property
@@ -424,12 +426,6 @@ def serialised(function: Any) -> str:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
         return str(id(function))
-
-
-@lru_cache
-def _recipe() -> str:
-    """What tells how derivatives are made of a block: the text that does it."""
-    return hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
 
 
 @lru_cache

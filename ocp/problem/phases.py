@@ -29,7 +29,7 @@ import numpy as np
 from ocp.errors import ProblemError, about, checked_text, unknown_name
 from ocp.problem.problem import Constraint, PhaseTimes, Problem, Variable, checked_problem
 from ocp.problem.separation import Separation
-from ocp.problem.values import constant, identity, is_symbolic
+from ocp.problem.values import constant, identity, is_symbolic, numeric
 
 __all__ = ["Phase", "Phases"]
 
@@ -182,7 +182,9 @@ class Phases(Problem):
         Raises:
             ProblemError: ``running`` is given: it belongs to the problem of a phase.
         """
-        if is_symbolic(running) or running != 0:
+        with about("running"):
+            nothing = not is_symbolic(running) and not numeric("running cost", running).any()
+        if not nothing:
             words = f"problem {self.name!r}: a running cost belongs to the problem of a phase"
             raise ProblemError(words, name="running", value=running)
         own = self.declared.running, self.declared.terminal

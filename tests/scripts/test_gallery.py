@@ -26,7 +26,7 @@ from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
 
-pytestmark = pytest.mark.xdist_group("gallery")
+pytestmark = [pytest.mark.xdist_group("gallery"), pytest.mark.long]
 
 NAMES = ["space_arm", "panda", "ur5", "posture_set", "mobile_manipulator", "pushing"]
 LOCAL = ["space_arm", "panda", "ur5", "posture_set"]

@@ -318,7 +318,8 @@ def test_control_c_ends_with_its_status(tmp_path: Path) -> None:
     write_robot(tmp_path)
     task = TASK.partition("[output]")[0].replace('kind = "start"', 'kind = "global"')
     (tmp_path / "long.toml").write_text(task)
-    code = "import sys; from ocp.app import main; sys.exit(main())"
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored by some shells
+    code += "from ocp.app import main; sys.exit(main())"
     words = [sys.executable, "-c", code, "plan", str(tmp_path / "long.toml")]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {})
     assert process.stderr is not None

@@ -33,6 +33,8 @@ from tests.ocp.tasks.space_tasks import (
     ur5,
 )
 
+pytestmark = pytest.mark.long
+
 MANIPULATOR_START = np.array([0.3, -0.6, 0.4, 1.0, -0.4, 0.8, 0.2])
 FINE = Collocation(intervals=50, degree=4)
 

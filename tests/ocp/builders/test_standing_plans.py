@@ -44,6 +44,8 @@ from tests.ocp.builders.standing_tasks import (
 )
 from tests.ocp.tasks.space_tasks import pose, turned
 
+pytestmark = pytest.mark.long
+
 IN_RANGE = InFoot(0.02)
 SWING, ASIDE = 1.5, (0.2, 0.15, -0.05)  # s; m, of the arm with a load at its tip
 

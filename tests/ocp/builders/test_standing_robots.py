@@ -27,7 +27,7 @@ from tests.models.robot.pinocchio_robots import Peer, State
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.builders.standing_tasks import moved_task, sampled, tip_error
 
-pytestmark = pytest.mark.xdist_group("standing robots")
+pytestmark = [pytest.mark.xdist_group("standing robots"), pytest.mark.long]
 
 ROWS = (3, 4, 5)
 RELATIVE = 1e-9

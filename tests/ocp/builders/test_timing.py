@@ -18,7 +18,7 @@ from tests.models.paths.test_paths import example
 from tests.ocp.schedule.test_schedule import line
 from tests.ocp.schedule.test_schedule_joints import SLOW, BrokenJoints
 
-pytestmark = pytest.mark.xdist_group("timing")  # one process, so that the example is solved once
+pytestmark = [pytest.mark.xdist_group("timing"), pytest.mark.long]  # one process, so that the example is solved once
 
 INTERVALS = 100
 HELD = 1e-2

@@ -117,6 +117,7 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
         assert found.cost == pytest.approx(steps.sum(axis=(1, 2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 3])
 def test_paths_past_singularities_that_can_be_done_are_planned(seed: int) -> None:
     given = passage(seed)
