@@ -277,7 +277,7 @@ prepared = prepare(problem, Collocation(600, 4), solver=SOLVER, options=never)
 before = signal.getsignal(signal.SIGINT)
 for check in (False, True):
     # from another process, for a thread may wait long for its turn
-    stop = subprocess.Popen(["sh", "-c", f"sleep 0.1; kill -INT {os.getpid()}"])
+    stop = subprocess.Popen(["sh", "-c", f"sleep 0.05; kill -INT {os.getpid()}"])
     began = time.monotonic()
     try:
         prepared.solve(check=check)
