@@ -1,7 +1,7 @@
 """`make browser`: pages in a real browser, pictures of them in build/browser. 0 when all holds, 1 otherwise.
 
 The browser is Debian's chromium, driven by playwright; both are installed where the user may, else the one command that
-does it is said: then the status is 1, or 0 with --if-there.
+does it is said, and the status is 1. With --if-there nothing is installed, and without a browser the status is 0.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def main() -> int:
     words.add_argument("--if-there", action="store_true", help="no failure where there is no browser to be had")
     words.add_argument("--out", type=Path, default=ROOT / "build" / "browser", help="folder of the pictures")
     options = words.parse_args()
-    lacking = chromium() or playwright()
+    lacking = chromium(not options.if_there) or playwright(not options.if_there)
     if lacking:
         print(f"browser: {lacking}", file=sys.stderr)
         return 0 if options.if_there else 1
@@ -56,10 +56,12 @@ def found() -> str | None:
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
-def chromium() -> str:
+def chromium(install: bool) -> str:
     """Nothing when a browser is there or was installed, else what to do."""
     if found():
         return ""
+    if not install:
+        return f"there is no chromium, and no page was opened: {COMMAND}"
     before = [] if os.geteuid() == 0 else ["sudo", "-n"] if shutil.which("sudo") else None
     if shutil.which("apt-get") and before is not None:
         for words in (["update"], ["install", "--yes", "--no-install-recommends", "chromium"]):
@@ -68,9 +70,9 @@ def chromium() -> str:
     return "" if found() else f"there is no chromium, and it may not be installed from here: sudo {COMMAND}"
 
 
-def playwright() -> str:
+def playwright(install: bool) -> str:
     """Nothing when the driver is there or was installed, else what to do."""
-    if importlib.util.find_spec("playwright") is None:
+    if install and importlib.util.find_spec("playwright") is None:
         ran([sys.executable, "-m", "pip", "install", "--quiet", "--editable", f"{ROOT}[browser]"])
         importlib.invalidate_caches()
     if importlib.util.find_spec("playwright") is None:
