@@ -264,14 +264,7 @@ def dynamics_problem(
     )  # fmt: skip
     push = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": between(2)}
     if control == "jerk":
-        second = problem.state(
-            "accelerations",
-            n,
-            initial=still,
-            terminal=resting if end == "rest" else None,
-            unit=robot.unit("/s^2"),
-            **push,
-        )
+        second = problem.state("accelerations", n, initial=still, terminal=last_rates, unit=robot.unit("/s^2"), **push)
         jerks = problem.control("jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
         problem.dynamics(second, jerks)
     else:

@@ -131,4 +131,4 @@ def test_what_is_demanded_is_what_dense_samples_demand() -> None:
         assert near.sum() > 50
         # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
         assert (side - most)[near].min() > -2 * ROOM
-        assert (side - most)[side > 0.99].max() < 2 * ROOM  # what seems to come to a limit does
+        assert (side - most)[near].max() < 2 * ROOM
