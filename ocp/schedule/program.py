@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs
-from scipy.ndimage import minimum_filter1d, uniform_filter1d
+from scipy.sparse import csr_array
 
 from ocp.errors import SolveError
 from ocp.schedule.profile import Array
@@ -47,11 +47,9 @@ TO_BOUNDARY = 0.995
 LOST = 0.7
 """Share of a coefficient that a step takes at most: a motion that all but stands still somewhere may be a trap."""
 ALIKE = 10
-"""Intervals on either side over which the lengths of steps are made alike."""
+"""Intervals of a block, from whose middle to the next one's the lengths of steps change."""
 FIRM = 0.0, 1e-14, 1e-12, 1e-10
 """Added to the diagonal of the equations of a step, relative, until rounding does not make them indefinite."""
-LONG_ENOUGH = 256
-"""Rows that are worth an addition of their own."""
 ASTRAY, NO_MATTER = 2.0, 1e-2
 """Ratio by which the worst miss may grow in a step, and what it may grow to, relative to the bound, in any case."""
 INFEASIBLE, MORE_SO = 1e-6, 100.0
@@ -238,46 +236,8 @@ class _Steps:
         return np.asarray(dpbtrs(self.factors, right, lower=1)[0])
 
 
-class _ByInterval:
-    """Sums and least values over the rows of each interval.
-
-    Rows of one rank, the first ones of all intervals, the second ones and so on, stand together, in order of the
-    intervals that have most: few additions of long parts. Ranks with few rows are left to one reduction.
-    """
-
-    def __init__(self, interval: NDArray[np.intp], count: int) -> None:
-        each = np.bincount(interval, minlength=count)
-        by_count = np.argsort(-each, kind="stable")
-        self.count, self.place = count, np.argsort(by_count, kind="stable")
-        sizes = np.cumsum(np.bincount(each)[::-1])[::-1][1:]  # of each rank
-        self.sizes = sizes[sizes >= LONG_ENOUGH].tolist()
-        order = np.argsort(interval, kind="stable")
-        inside = interval[order]
-        rank = np.arange(len(order)) - (np.cumsum(each) - each)[inside]
-        seat = self.place[inside]
-        ranked = np.where(
-            rank < len(self.sizes), rank * count + seat, len(self.sizes) * count + seat * len(order) + rank
-        )
-        self.order = order[np.argsort(ranked, kind="stable")]
-        rest = self.place[interval[self.order[sum(self.sizes) :]]]
-        self.first = np.flatnonzero(np.diff(rest, prepend=-1))
-        self.seats = rest[self.first]
-
-    def reduced(self, of: np.ufunc, values: Array, none: float) -> Array:
-        """Of values in `order`, by interval. Shape (..., M) to (..., N)."""
-        out, begin = np.full((*values.shape[:-1], self.count), none), 0
-        for size in self.sizes:
-            part = out[..., :size]
-            of(part, values[..., begin : begin + size], out=part)
-            begin += size
-        if self.seats.size:
-            rest = of.reduceat(values[..., begin:], self.first, axis=-1)
-            out[..., self.seats] = of(out[..., self.seats], rest)
-        return out.take(self.place, axis=-1)
-
-
 class _Rows:
-    """All rows of a program: coefficients that are positive, and at most so much, and others as `by` orders them.
+    """All rows of a program: coefficients that are positive, and at most so much, and others, those of jerk last.
 
     Values of rows, shape (M,), stand in this order.
 
@@ -292,103 +252,101 @@ class _Rows:
         self.count = len(spline.h)
         self.bounded = np.flatnonzero(np.isfinite(most))
         self.alone = self.count + len(self.bounded)
-        self.by = _ByInterval(rows.interval, self.count)
-        order = self.by.order
-        interval = rows.interval[order]
+        order = np.lexsort((rows.interval, rows.jerk))
+        self.others = interval = rows.interval[order]
         self.interval = np.concatenate([np.arange(self.count), np.clip(self.bounded - 1, 0, self.count - 1), interval])
-        self.others = interval
-        bound = np.where(rows.jerk, 0.0, rows.bound)[order]
-        self.bound = np.concatenate([np.zeros(self.count), most[self.bounded], bound])
-        self.sharp = np.where(rows.jerk, rows.bound, 0.0)[order]
+        self.bound = np.concatenate([np.zeros(self.count), most[self.bounded], rows.bound[order]])
         basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
         self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
-        self.square = spline.basis(interval, rows.root[order])[0]
         self.gradients = self.linear.copy()
+        self.jerk = int(len(order) - rows.jerk.sum())  # the first of these
+        self.square = spline.basis(interval[self.jerk :], rows.root[order[self.jerk :]])[0]
+        self.sharp = self.bound[self.alone + self.jerk :].copy()
+        self.bound[self.alone + self.jerk :] = 0.0
+        ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))
+        shape = self.count, len(interval)
+        self.by_interval = csr_array((np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape)
+        block = self.interval // ALIKE
+        starts = np.diff(block, prepend=-1) != 0
+        starts[self.count : self.count + 1] = True
+        self.runs = np.flatnonzero(starts)
+        self.blocks = block[self.runs]
+        self.middles = ALIKE * np.arange(self.blocks.max() + 1) + (ALIKE - 1) / 2
 
     def look(self, b: Array) -> tuple[Array, Array]:
         """What rows miss their bounds by, and the size of these. Takes the tangents of the rows of jerk at b."""
-        near = self._near(b)
-        at = self._others(self.square, near)
+        near, sharp = self._near(b), self.alone + self.jerk
+        at = _weighed(self.square, [each[self.jerk :] for each in near])
         root = self.sharp / np.sqrt(at)
-        gap, size = self._with(b, self._others(self.linear, near)) - self.bound, np.abs(self.bound) + 1e-300
-        gap[self.alone :] -= root
-        size[self.alone :] += root
-        np.multiply(self.square, 0.5 * root / at, out=self.gradients)
-        self.gradients += self.linear
+        gap, size = self._with(b, _weighed(self.linear, near)) - self.bound, np.abs(self.bound) + 1e-300
+        gap[sharp:] -= root
+        size[sharp:] += root
+        tangent = self.gradients[:, self.jerk :]
+        np.multiply(self.square, 0.5 * root / at, out=tangent)
+        tangent += self.linear[:, self.jerk :]
         return gap, size
 
     def of(self, change: Array) -> Array:
         """What a change of the coefficients changes. Shape (M,)."""
-        return self._with(change, self._others(self.gradients, self._near(change)))
+        return self._with(change, _weighed(self.gradients, self._near(change)))
 
     def gathered(self, values: Array) -> Array:
         """Sums of values times gradients, by the coefficients. Shape (N + 2,)."""
-        out = np.zeros(self.count + 2)
-        self._spread(self._sums(self.gradients * values[self.alone :]), out)
+        out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
         """Diagonals of the sum of values times squares of gradients. Shape (N + 2,), (N + 1,), (N,)."""
-        g, main, beside = self.gradients, np.zeros(self.count + 2), np.zeros(self.count + 1)
+        g = self.gradients
         pulled = g * values[self.alone :]
-        self._spread(self._sums(g * pulled), main)
+        main = self._spread(g * pulled)
         main[1:-1] += values[: self.count]
         main[self.bounded] += values[self.count : self.alone]
-        *next_to, apart = self._sums(np.stack([g[0] * pulled[1], g[1] * pulled[2], g[0] * pulled[2]]))
-        self._spread(next_to, beside)
-        return main, beside, apart
+        return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
-    def _near(self, b: Array) -> tuple[Array, ...]:
+    def _near(self, b: Array) -> list[Array]:
         """The three coefficients of the interval of each of the others."""
-        return tuple(b[k : self.count + k].take(self.others) for k in range(3))
+        return [b[k : self.count + k].take(self.others) for k in range(3)]
 
     def _with(self, b: Array, others: Array) -> Array:
         return np.concatenate([-b[1:-1], b[self.bounded], others])
 
-    def _others(self, weights: Array, near: tuple[Array, ...]) -> Array:
-        return np.asarray(weights[0] * near[0] + weights[1] * near[1] + weights[2] * near[2])
+    def _spread(self, values: Iterable[Array]) -> Array:
+        """Sums over the others of each interval, by its first coefficient or pair of these, its second one and so on.
 
-    def _sums(self, values: Array) -> Array:
-        """Over the others of each interval. Shape (k, N)."""
-        return self.by.reduced(np.add, values, 0.0)
-
-    def _spread(self, sums: Iterable[Array], out: Array) -> None:
+        Shapes (M - `alone`,) each to one of N and as many as there are, less one.
+        """
+        sums = [self.by_interval @ each for each in values]
+        out = np.zeros(self.count + len(sums) - 1)
         for k, own in enumerate(sums):
             out[k : self.count + k] += own
-
-    def least(self, values: Array) -> Array:
-        """The least value of the rows of each interval. Shape (N,)."""
-        out = self.by.reduced(np.minimum, values[self.alone :], np.inf)
-        np.minimum(out, values[: self.count], out=out)
-        with np.errstate(invalid="ignore"):  # where a program comes to nothing
-            np.minimum.at(out, self.interval[self.count : self.alone], values[self.count : self.alone])
         return out
 
-    def longest(self, rates: Array, positive: float) -> Array:
-        """Steps, at most 1, by which values that change at relative rates stay positive: one an interval.
+    def longest(self, rates: Array, share: float, of_positive: float) -> Array:
+        """Steps, at most 1, that change slowly along the path: one an interval. Shape (N,).
 
         Args:
-            rates: Over the share of the way to zero that a step takes at most.
-            positive: The same, once more, for those of the coefficients.
+            rates: At which values that stay positive change, relative. Shape (M,).
+            share: Of the way to zero that a step takes at most. of_positive: The same, for those of the coefficients.
         """
-        if positive != 1:
-            rates = rates.copy()
-            rates[: self.count] *= positive
-        return _smooth(1 / np.maximum(-self.least(rates), 1.0))
+        runs = np.minimum.reduceat(rates, self.runs)
+        last = len(self.middles)
+        runs[:last] *= share / of_positive  # those of the coefficients
+        worst = np.zeros(last)
+        np.minimum.at(worst, self.blocks, runs)
+        steps = 1 / np.maximum(-worst / share, 1.0)
+        if not (steps < 1).any():
+            return np.ones(self.count)
+        # of a block and those beside it the least: so no way between the middles of two of them is above either
+        around = np.concatenate([steps[:1], steps, steps[-1:]])
+        least = np.minimum(np.minimum(around[:-2], around[2:]), steps)
+        return np.asarray(np.interp(np.arange(self.count), self.middles, least))
 
 
-def _smooth(steps: Array) -> Array:
-    """Steps no longer than given ones (N,) that change slowly from interval to interval."""
-    if not (steps < 1).any():
-        return steps
-    alike = minimum_filter1d(steps, 2 * ALIKE + 1, mode="nearest")
-    for _ in range(2):
-        alike = uniform_filter1d(alike, ALIKE + 1, mode="nearest")
-    return np.asarray(
-        np.clip(alike, 0.0, steps)
-    )  # its sums run along the path, and with them the rounding of the longest
+def _weighed(weights: Array, values: list[Array]) -> Array:
+    return np.asarray(weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2])
 
 
 def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
@@ -449,7 +407,8 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         if found is None:
             latest = number + MORE_STEPS
 
-        pull, missed = price / slack, gap + slack
+        per_slack, missed = 1 / slack, gap + slack
+        pull = price * per_slack
         squares = every.squares(pull)
         try:
             equations = _Steps(fixing.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
@@ -461,20 +420,20 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
         # the prices' relative rates towards 0 are those of the slacks, mirrored about -1/2
         change = solved(-base)
-        rates = -(missed + every.of(change)) / slack
-        reached = every.longest(np.minimum(rates, -1 - rates), 1.0)
-        far, product = reached[every.interval], slack * price
+        rates = -(missed + every.of(change)) * per_slack
+        reached = every.longest(np.minimum(rates, -1 - rates), 1.0, 1.0)
+        far, product = reached.take(every.interval), slack * price
         after = float((product * (1 + far * rates)) @ (1 - far - far * rates)) / len(gap)
         left = 1 - reached
         sigma = np.maximum(min((after / mean) ** 3, 1.0), left * left * left)
-        target = (mean * sigma)[every.interval] + far * far * product * rates * (1 + rates)
-        wanted = target / slack
+        target = (mean * sigma).take(every.interval) + far * far * product * rates * (1 + rates)
+        wanted = target * per_slack
         change = solved(-(base + every.gathered(wanted)))
         of_slack = -(missed + every.of(change))
         of_price = wanted - price - pull * of_slack
         taken = [
-            every.longest(of_slack / slack / TO_BOUNDARY, TO_BOUNDARY / LOST),
-            every.longest(of_price / price / TO_BOUNDARY, 1.0),
+            every.longest(of_slack * per_slack, TO_BOUNDARY, LOST),
+            every.longest(of_price / price, TO_BOUNDARY, TO_BOUNDARY),
         ]
         shortest = [each.min() for each in taken]
         if together:
@@ -482,8 +441,8 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         else:
             before = (b, shortest[0], change), (slack, shortest[0], of_slack), (price, shortest[1], of_price)
         b = b + np.concatenate([taken[0][:1], taken[0], taken[0][-1:]]) * change
-        slack = slack + taken[0][every.interval] * of_slack
-        price = price + taken[1][every.interval] * of_price
+        slack = slack + taken[0].take(every.interval) * of_slack
+        price = price + taken[1].take(every.interval) * of_price
         gap, size = every.look(b)
     row = int(lacking.argmax())
     place = float(spline.nodes[every.interval[row]])

@@ -1,4 +1,4 @@
-"""The parts of a schedule's programs: sums by interval, the jerk that a motion holds, demands between the nodes."""
+"""The parts of a schedule's programs: rows and their sums, the jerk that a motion holds, demands between the nodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ocp.schedule import LineLimits, schedule
 from ocp.schedule.grid import make_grid
 from ocp.schedule.profile import LineMotion, through
-from ocp.schedule.program import Program, Spline, SplineRows, _ByInterval, least_time
+from ocp.schedule.program import ALIKE, Program, Spline, SplineRows, _Rows, least_time
 from ocp.schedule.rows import rows_at
 from ocp.schedule.stretch import _jerk_of
 from ocp.schedule.window import ROOM, Stretch, Window, demanded, profile_of
@@ -18,20 +18,65 @@ from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
 
 
-@settings(max_examples=40)
-@given(seeds, st.integers(1, 700), st.integers(1, 4))
-def test_sums_and_least_values_by_interval_are_those_of_a_loop(seed: int, count: int, kinds: int) -> None:
+def random_rows(seed: int, count: int) -> tuple[Program, _Rows, np.ndarray]:
+    """Rows at random places of so many intervals, and coefficients."""
     rng = np.random.default_rng(seed)
-    interval = rng.integers(0, count, int(rng.integers(1, 6 * count)))
-    by = _ByInterval(interval, count)
-    values = rng.normal(size=(kinds, len(interval)))
-    sums, least = np.zeros((kinds, count)), np.full((kinds, count), np.inf)
-    for row, k in enumerate(interval.tolist()):
-        sums[:, k] += values[:, row]
-        least[:, k] = np.minimum(least[:, k], values[:, row])
-    ordered = values[:, by.order]
-    assert by.reduced(np.add, ordered, 0.0) == pytest.approx(sums, abs=1e-12)
-    assert by.reduced(np.minimum, ordered, np.inf) == pytest.approx(least)
+    size = int(rng.integers(1, 6 * count + 1))
+    interval, jerk = rng.integers(0, count, size), rng.uniform(size=size) < rng.uniform()
+    rows = SplineRows(
+        interval,
+        rng.uniform(size=size),
+        rng.uniform(size=size),
+        rng.normal(size=(size, 3)),
+        rng.uniform(1, 2, size),
+        jerk,
+    )
+    most = np.where(rng.uniform(size=count + 2) < 0.5, 5.0, np.inf)
+    spline = Spline(np.cumsum(rng.uniform(0.1, 1.0, count + 1)))
+    program = Program(spline, rows, most, (0.0, 0.0), np.arange(0))
+    return program, _Rows(program), rng.uniform(0.5, 2.0, count + 2)
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(1, 90))
+def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
+    """What they miss and its tangents, sums of values times these, and the diagonals of the sum of their squares."""
+    program, every, b = random_rows(seed, count)
+    gap, _ = every.look(b)
+    matrix = np.array([every.of(column) for column in np.eye(len(b))]).T
+    values = np.random.default_rng(seed).uniform(0.1, 1.0, len(gap))
+    assert every.gathered(values) == pytest.approx(matrix.T @ values, abs=1e-9)
+    normal = matrix.T @ (values[:, None] * matrix)
+    for k, diagonal in enumerate(every.squares(values)):
+        assert diagonal == pytest.approx(np.diag(normal, k), abs=1e-9)
+    step = 1e-6 * np.random.default_rng(seed + 1).normal(size=len(b))
+    change = matrix @ step
+    assert (every.look(b + step)[0] - every.look(b - step)[0]) / 2 == pytest.approx(change, abs=1e-10)
+
+    rows, near = program.rows, np.stack([b[program.rows.interval + k] for k in range(3)])
+    x, slope, bend = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
+    root = (program.spline.basis(rows.interval, rows.root)[0] * near).sum(axis=0)
+    bound = rows.bound * np.where(rows.jerk, root**-0.5, 1.0)
+    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.most]
+    every.look(b)
+    assert np.sort(gap) == pytest.approx(np.sort(np.concatenate([part[np.isfinite(part)] for part in missed])))
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(1, 90), st.floats(0.1, 1.0), st.floats(0.1, 1.0))
+def test_steps_keep_what_is_positive_so(seed: int, count: int, share: float, of_positive: float) -> None:
+    """At most so much of the way to zero, the coefficients less, and the worst of all just so; they change slowly."""
+    _, every, _ = random_rows(seed, count)
+    rates = np.random.default_rng(seed).normal(size=len(every.interval)) * 10.0 ** np.random.default_rng(seed).uniform(
+        -1, 1
+    )
+    steps = every.longest(rates, share, of_positive)
+    most = np.where(np.arange(len(rates)) < count, of_positive, share)
+    gone = -rates * steps[every.interval] / most
+    assert gone.max() <= 1 + 1e-12
+    assert steps.max() <= 1
+    assert (steps == 1).all() if (-rates <= most).all() else steps.min() < 1
+    assert np.abs(np.diff(steps)).max(initial=0.0) <= 1 / ALIKE
 
 
 @settings(max_examples=40)
@@ -106,7 +151,7 @@ def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float,
 
 
 def test_what_is_demanded_is_what_dense_samples_demand() -> None:
-    """In every interval, by every limit that comes near: no less, and next to no more."""
+    """In every interval, by every limit that comes near: no less; and next to no more where that would matter."""
     path, joints = panda_path(4)
     limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
     grid = make_grid(path, limits, joints)
@@ -131,4 +176,4 @@ def test_what_is_demanded_is_what_dense_samples_demand() -> None:
         assert near.sum() > 50
         # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
         assert (side - most)[near].min() > -2 * ROOM
-        assert (side - most)[near].max() < 2 * ROOM
+        assert (side - most)[side > 1 - 2 * ROOM].max() < 2 * ROOM
