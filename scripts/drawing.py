@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ocp.app.colors import COMPARED, PLAN
-from scripts.papers.run import written
+from scripts.papers.run import write, written
 
 COLORS = {
     "blue": PLAN,
@@ -62,10 +62,14 @@ STYLE: Any = {
     "legend.frameon": False,
     "lines.linewidth": 1.5,
     "savefig.dpi": 150,
+    "svg.fonttype": "path",  # the same letters everywhere
+    "svg.hashsalt": "selfmotion",
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
 }
 
+TITLE_SIZE = 10.0
+TITLE_CHARACTERS_PER_INCH = 13.0
 NOTE_SIZE = 7.0
 NOTE_CHARACTERS_PER_INCH = 19.0  # of the note's font
 
@@ -77,16 +81,20 @@ def sheet(
     size: tuple[float, float] = (6.3, 3.4),
     note: str = "",
     *,
+    title: str = "",
     xlabel: str = "",
     **subplots: Any,
 ) -> Iterator[tuple[Figure, Any]]:
-    """A figure of rows by columns of axes in the house style, saved as `path` when the block ends.
+    """A figure of rows by columns of axes in the house style, saved when the block ends.
+
+    Beside `path`, a PNG, lie the same picture as SVG and NAME.caption.txt with the title and the whole note.
 
     Args:
         path: PNG file; None to keep the figure and save nothing.
         shape: Rows and columns of axes.
         size: Width and height, inches.
-        note: Fine print under the figure, wrapped to its width: the assumptions it rests on.
+        note: The assumptions it rests on. Its first sentence stands below the figure, the whole in the caption.
+        title: What the figure shows, in a sentence, above it.
         xlabel: Under the lowest axes.
         subplots: Passed to Figure.subplots, for example sharey=True.
 
@@ -99,18 +107,35 @@ def sheet(
         axes = figure.subplots(*shape, squeeze=False, **subplots)
         for ax in axes[-1]:
             ax.set_xlabel(xlabel)
+        if title:
+            figure.suptitle(textwrap.fill(title, int(size[0] * TITLE_CHARACTERS_PER_INCH)), fontsize=TITLE_SIZE)
         yield figure, axes
-        if note:
-            add_note(figure, note)
+        add_note(figure, note)
         if path is not None:
-            with written(path) as temporary:
-                figure.savefig(temporary, format="png", metadata={"Software": None})
+            save(figure, path)
+            caption(path, title, note)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """A figure as PNG and, beside it, as SVG; the same bytes whenever it is drawn."""
+    for ending, metadata in ((".png", {"Software": None}), (".svg", {"Date": None, "Creator": None})):
+        with written(path.with_suffix(ending)) as temporary:
+            figure.savefig(temporary, format=ending[1:], metadata=metadata)
+
+
+def caption(path: Path, title: str, note: str) -> None:
+    """What is to be said of a picture, into a file beside it, NAME.caption.txt."""
+    text = "\n\n".join(textwrap.fill(part, 120) for part in (title, note) if part)
+    if text:
+        write(path.with_suffix(".caption.txt"), text + "\n")
 
 
 def add_note(figure: Figure, note: str) -> None:
-    """Fine print under a figure, wrapped to its width."""
-    text = textwrap.fill(note, int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
-    figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
+    """The first sentence of a note below a figure, wrapped to its width."""
+    if note:
+        line = f"{note.rstrip('.')}. ".split(". ")[0]
+        text = textwrap.fill(f"{line}.", int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
+        figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
 
 
 def time_bar(figure: Figure, axes: Any, horizon: float, *, fraction: float = 0.03, pad: float = 0.01) -> None:

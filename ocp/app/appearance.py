@@ -19,10 +19,11 @@ from models.arrays import Array
 from models.shapes.mesh_files import find_mesh, read_painted_mesh
 from models.shapes.triangles import Triangles, bare, together
 
-__all__ = ["Appearance", "Part", "appearance_of", "part_of", "rod"]
+__all__ = ["ZONE", "Appearance", "Part", "appearance_of", "part_of", "rod"]
 
 GREY = (0.72, 0.74, 0.78, 1.0)
 ZONE = (0.55, 0.58, 0.62, 0.22)
+"""Colour of what a link touches with that a description shows nothing of, while it shows others: a zone, no body."""
 ROD = (0.35, 0.38, 0.42, 1.0)
 MOST_FACES = 200_000
 """Of a robot, beyond which corners that are near to each other become one."""

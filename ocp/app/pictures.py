@@ -1,4 +1,4 @@
-"""Pictures of a motion for a report: the robot's bodies at several times, and the curves of its joints with limits."""
+"""Pictures of a motion for a report: the robot as it looks at several times, the curves of its joints with limits."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Machine, Robot, link_frames
+from models import Machine
 from models.arrays import Array
-from models.shapes.bodies import bodies_of
 from models.shapes.hull import convex_hull
+from ocp.app.appearance import appearance_of, part_of
 from ocp.app.colors import COMPARED, FAULT, LIMIT, PLAN, SURROUNDINGS, TIP
+from ocp.app.frames import frames_along
 from ocp.app.pieces import Motion
-from ocp.problem.formulation import Sampler
-from ocp.problem.hulls import frames_of
+from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
 from ocp.solution import Solution
 from ocp.tasks.limits import JointBounds
 
@@ -32,7 +31,7 @@ __all__ = [
     "obstacles_of",
     "scene",
     "show_limits",
-    "solids_of",
+    "solid_of",
 ]
 
 Solid = tuple[Array, NDArray[np.intp]]
@@ -46,26 +45,13 @@ FAR = 1.5
 """Of the span of a curve: limits further from it would leave nothing of its shape to see."""
 NOTHING = 1e-3
 """Of the largest value of a kind: what changes by less is rounding."""
+PIXELS, LINE = (960, 680), 0.003
+"""Of a rendered picture; and radius of a line in it, of the size of what it shows."""
 WIDTH = 7.4
 """Of a picture, inches."""
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Of what a plan is compared with, so that nothing is known by its colour alone."""
-
-
-def solids_of(robot: Robot, folders: Sequence[Any] = ()) -> list[tuple[str, Solid]]:
-    """Convex bodies of a robot's links, in the frames of the links; of meshes their hulls, once each."""
-    found: list[tuple[str, Solid]] = []
-    seen = set()
-    for body in bodies_of(robot, folders=tuple(folders), missing="skip"):
-        shape: Any = body.shape
-        if body.mesh is not None:
-            if id(body.mesh) in seen:
-                continue
-            seen.add(id(body.mesh))
-            shape = body.mesh.hull
-        found.append((body.link, solid_of(shape.core, shape.swelling)))
-    return found
 
 
 def solid_of(core: Array, radius: float) -> Solid:
@@ -93,54 +79,30 @@ def obstacles_of(solution: Solution) -> tuple[Solid, ...]:
 def scene(
     machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Solid], folders: Sequence[Any] = ()
 ) -> bytes:
-    """The robot at several times, the last boldest, its tip's way, and what stands around; a PNG."""
-    from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+    """The robot as it looks at several times, at the last one solid, its tip's way, and what stands around; a PNG."""
+    from matplotlib.colors import to_rgb
+    from matplotlib.image import imsave
 
-    robot = machine.robot
-    base, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
-    frames = link_frames(robot, q, machine.world_from_base(base))
-    tip = ca.SX(0, 1) if robot.tip is None else machine.tip_pose(base, q).position
-    placed = ca.vertcat(*(ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in frames.values()))
-    sampler = Sampler([base, q], [placed, tip])
     times = np.linspace(motion.t[0], motion.t[-1], POINTS)
-    places = np.zeros((POINTS, 0))
-    if bases is not None:
-        places = np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
-    placements, tips = sampler(places, motion.position.at(times))
-    rotations, positions = frames_of(placements)
-    numbers = {name: k for k, name in enumerate(frames)}
-    solids = solids_of(robot, folders)
-    figure = Figure(figsize=(WIDTH, 5.2))
-    axes: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
-    clouds = [positions[:, :-1].reshape(-1, 3)]
-    for number, k in enumerate(np.linspace(0, POINTS - 1, SHOWN).astype(int)):
-        shade = 0.16 + 0.74 * (number / (SHOWN - 1)) ** 2
-        for link, (corners, faces) in solids:
-            i = numbers[link]
-            world = corners @ rotations[k, i].T + positions[k, i]
-            clouds.append(world)
-            axes.add_collection3d(Poly3DCollection(world[faces], facecolors=PLAN, alpha=shade, shade=True))
-        if not solids:
-            lines = [[positions[k, numbers[j.parent]], positions[k, numbers[j.child]]] for j in robot.joints]
-            for line in np.array(lines):
-                axes.plot(*line.T, "-o", color=PLAN, alpha=shade, lw=2, ms=3)
-    for corners, faces in around:
-        clouds.append(corners)
-        axes.add_collection3d(Poly3DCollection(corners[faces], facecolors=SURROUNDINGS, alpha=0.35, shade=True))
-    if tips.shape[1]:
-        clouds.append(tips)
-        axes.plot(*tips.T, color=TIP, lw=2.5, label="way of the tip")
-        axes.legend(loc="upper left", frameon=False)
+    places = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
+    frames = frames_along(machine, motion.position.at(times), places)
+    looks = appearance_of(machine.robot, folders)
+    shown = [placed(looks, frames, int(k)) for k in np.linspace(0, POINTS - 1, SHOWN)]
+    clouds = [part.vertices for parts in shown for part in parts] + [corners for corners, _ in around]
+    still = [part_of("", corners, faces, (*to_rgb(SURROUNDINGS), 1.0)) for corners, faces in around]
+    if machine.robot.tip is not None:
+        clouds.append(frames.tip)
     cloud = np.vstack(clouds)
     low, high = cloud.min(axis=0), cloud.max(axis=0)
-    room = 0.02 * float((high - low).max()) + 1e-6
-    axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
-    axes.set(zlim=(low[2] - room, high[2] + room), xlabel="x, m", ylabel="y, m", zlabel="z, m")
-    axes.set_box_aspect(high - low + 2 * room, zoom=1.05)
-    axes.view_init(22, -58)
+    size = float((high - low).max())
+    if machine.robot.tip is not None:
+        still.append(tube(frames.tip, LINE * size, to_rgb(TIP)))
+    pale = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(shown[:-1])]
+    floor = None if machine.base_size else Floor(low[2], tuple((low + high)[:2] / 2), 1.1 * size, 0.1)
+    layers = [Layer(shown[-1]), Layer(still), *pale]
+    picture = render(layers, Camera.around(cloud, PIXELS), floor=floor)
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=130, metadata={"Software": None})
+    imsave(stream, picture, format="png")
     return stream.getvalue()
 
 

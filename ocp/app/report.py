@@ -84,8 +84,8 @@ class Report:
             parts.append(
                 "<h2>The motion</h2><figure>"
                 f'<img alt="the robot at several times" src="data:image/png;base64,{data}">'
-                "<figcaption>The robot at four times, the last boldest; its links as the convex hulls of their "
-                "collision shapes; the way of its tip in green, obstacles in grey.</figcaption></figure>"
+                "<figcaption>The robot at four times, at the last one solid; the way of its tip in green, obstacles in "
+                "grey.</figcaption></figure>"
             )
         parts.append(
             f"<h2>The joints</h2><figure>{self.plots}<figcaption>Blue: the motion, between its samples as a controller "

@@ -1,24 +1,22 @@
-"""The mobile manipulator of gallery_standing in the gallery, and what it shares with others that stand."""
+"""The mobile manipulator of standing.py in the gallery, and what it shares with others that stand."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
 from ocp import Audit, TipTask
-from ocp.app.frames import frames_along
 from ocp.audit.clearance import Nearest
 from ocp.tasks.equations import task_errors
 from scripts.robots import standing
-from scripts.robots.drawing import Scene, animate
+from scripts.robots.drawing import animate
 from scripts.robots.results import joint_return, save_motion, save_plan
 
-__all__ = ["StandingExample", "animated", "draw", "plan"]
+__all__ = ["StandingExample", "draw", "plan", "save"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +76,21 @@ def plan(coarse: bool = False) -> StandingExample:
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
     """mobile_manipulator.png, .gif and .npz."""
-    found = example.results
-    standing.draw(folder, found)
-    save(folder / "mobile_manipulator.npz", example)
-    if not animation:
-        return
-    corners = np.asarray(found.footprint.support.vertices)
-    ground = np.column_stack([np.vstack([corners, corners[:1]]), np.zeros(len(corners) + 1)])
+    found, nearest = example.results, example.nearest
     note = (
-        f"Grey: footprint; diamond: zero moment point; the arm from the wheels to the hand. A rope pulls the hand "
-        f"forward with {standing.PULL:g} N."
+        f"TIAGo of {found.robot.total_mass:.0f} kg leads {standing.LOAD:g} kg round a circle in {standing.SECONDS:g} s "
+        f"while a rope pulls its hand forward with {standing.PULL:g} N; earlier postures pale, disc: zero moment "
+        "point. Footprint, inertias and limits from its URDF (example-robot-data); both motions have the same hand "
+        f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of the "
+        f"limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
+        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
-    animated(folder / "mobile_manipulator.gif", found, ground, note=note, nearest=example.nearest)
+    title = "Resolved instant by instant the robot tips over; planned as a whole it stands, within all limits"
+    standing.figure(folder / "mobile_manipulator.png", found, note=note, title=title)
+    save(folder / "mobile_manipulator.npz", example)
+    if animation:
+        scenes = standing.scenes_of(found, (14.0, -50.0), nearest.points)
+        animate(folder / "mobile_manipulator.gif", scenes, frames=40, seconds=0.1, note=note)
 
 
 def save(path: Path, example: StandingExample) -> None:
@@ -98,29 +99,3 @@ def save(path: Path, example: StandingExample) -> None:
     save_plan(path, found.machine, found.solution, [example.task])
     names = found.machine.robot.joint_names
     save_motion(path.with_suffix(".local.csv"), names, local.t, local.joints, local.joint_velocities)
-
-
-def animated(
-    path: Path,
-    found: standing.Results,
-    outline: Array,
-    *,
-    note: str,
-    nearest: Nearest,
-    view: tuple[float, float] = (16.0, -50.0),
-) -> None:
-    """A GIF of the local motion beside the plan, with their zero moment points; arguments as of Scene and animate.
-
-    The bodies that come nearest to each other along the plan are joined by a line.
-    """
-    note += (
-        f" Purple: where {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, {1000 * nearest.distance:.1f} mm."
-    )
-    robot, machine, scenes = found.robot, found.machine, []
-    for title, motion, color in (("instant by instant", found.local, "orange"), ("planned", found.motion, "blue")):
-        frames = frames_along(machine, motion.joints)
-        zmp = np.column_stack([motion.zero_moment_point, np.zeros(len(motion.t))])
-        scenes.append(Scene(title, robot, frames, motion.t, color, outline=outline, mark=zmp, view=view))
-        if motion is found.motion:
-            scenes[-1] = replace(scenes[-1], nearest_points=nearest.points)
-    animate(path, scenes, frames=50, seconds=0.1, note=note)

@@ -89,26 +89,32 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     """panda.png, panda.gif and panda.npz."""
     machine, local, laps = example.machine, example.local, example.more["laps"]
     robot, again = machine.robot, repeated(example)
+    look: dict[str, Any] = {"view": VIEW, "floor": 0.0}
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(machine, local.joints), local.t, "orange", view=VIEW),
-        Scene("optimal cyclic plan", robot, frames_along(machine, again), local.t, "blue", view=VIEW),
+        Scene("pseudo-inverse", robot, frames_along(machine, local.joints), local.t, "orange", **look),
+        Scene("cyclic plan", robot, frames_along(machine, again), local.t, "blue", **look),
     ]
     note = (
-        f"{example.file.name} on a fixed base, fingers locked: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool "
-        f"leaning {np.degrees(np.arctan(TILT)):.0f} deg outwards; six task rows, seven joints. Cost: integral of half "
-        "the squared joint rates."
+        f"{example.file.name}: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool leaning "
+        f"{np.degrees(np.arctan(TILT)):.0f}° outwards; the arm at the start of each of {laps} laps (pale) and at their "
+        "end. Fixed base, fingers locked; six task rows, seven joints. Cost: integral of half the squared joint rates. "
+        "The pseudo-inverse begins where the inverse kinematics from the arm's ready posture end."
     )
+    left_at = example.facts["first_leaves_limits_local_s"]
+    title = "Lap after lap the pseudo-inverse drifts" + (
+        f" and leaves the joints' limits after {left_at:.0f} s" if left_at is not None else ""
+    )
+    title += "; the cyclic plan comes back to where it began"
     each = example.facts["cost_by_lap_local"]
     note += (
         f" A lap of the cyclic plan costs {example.plan.cost:.2f} rad²/s, the laps of the pseudo-inverse, which need "
         f"not return, {each.min():.2f} to {each.max():.2f}."
     )
-    above = f" Upper row: where the arm is at the start of each of {laps} laps, and at their end (darkest)."
     path, starts = folder / "panda.png", [lap * LAP for lap in range(laps + 1)]
-    with page(path, scenes, starts, height=6.6, share=1.8, note=note + above) as (drift, left, right):
+    with page(path, scenes, starts, height=6.2, share=1.6, note=note, title=title) as (drift, left, right):
         for name, values, color, mark in (
             ("pseudo-inverse", drifts(local.joints), "orange", "o"),
-            ("optimal cyclic", drifts(again), "blue", "D"),
+            ("cyclic plan", drifts(again), "blue", "D"),
         ):
             drift.plot(np.arange(laps + 1), values, "-" + mark, color=COLORS[color], ms=4, label=name)
         drift.set(xlabel="laps", ylabel="largest |q − q(0)|, rad", xticks=range(laps + 1))
@@ -123,4 +129,4 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         right.legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
     example.save(folder / "panda.npz")
     if animation:
-        animate(folder / "panda.gif", scenes, frames=24 * laps // 2, seconds=0.1, note=note)
+        animate(folder / "panda.gif", scenes, frames=20 * laps // 2, seconds=0.12, note=note)

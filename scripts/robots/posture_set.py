@@ -141,17 +141,18 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     shown.sort(key=lambda number: least[number])
     left = len(least) - len(shown)
     note = (
-        f"{example.file.name} ({np.degrees(TOOL_ANGLE):.0f} deg to the flange) runs a bowed seam of "
-        f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s, position and axis told, roll free; joints within "
-        "their limits, links clear of each other. Each column holds all postures of one time, found by continuation; "
-        "colour: the least that any motion through a posture costs, a bound, of the plan's cost. One panel a family "
-        f"that no motion leaves{f'; {left} dearer ones are left out' if left else ''}. Costs: integral of half the "
+        f"All postures of a UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, along a bowed seam of "
+        f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s, position and axis told, roll free; one panel a family "
+        "that no motion leaves. Joints within their limits, links clear of each other. Each column holds all postures "
+        "of one time, found by continuation; colour: the least that any motion through a posture costs, a bound, of the plan's "
+        "cost"
+        f"{f'; {left} dearer families are left out' if left else ''}. Costs: integral of half the "
         f"squared joint rates, rad²/s; no motion costs less than {best.bound:.4g}."
     )
-    with sheet(folder / "posture_set.png", (1, len(shown)), size=(3.0 * len(shown) + 1.2, 4.2), note=note) as (
-        figure,
-        axes,
-    ):
+    dearer = 100 * (ways[-2][3] / best.cost - 1)
+    title = f"The best motion from where the arm is best conditioned is {dearer:.0f} % dearer than another family's"
+    size = (3.0 * len(shown) + 1.2, 4.2)
+    with sheet(folder / "posture_set.png", (1, len(shown)), size, note, title=title) as (figure, axes):
         for ax, number in zip(np.ravel(axes), shown, strict=True):
             own = np.flatnonzero(family == number)
             own = own[np.argsort(-through[own], kind="stable")]  # the cheapest on top
@@ -176,10 +177,6 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
             ax.grid(visible=False)
             if ax.get_legend_handles_labels()[0]:
                 ax.legend(loc="lower left", fontsize=7)
-        dearer = 100 * (ways[-2][3] / best.cost - 1)
-        figure.suptitle(
-            f"The best motion from where the arm is best conditioned is {dearer:.0f} % dearer than another family's"
-        )
         np.ravel(axes)[0].set_ylabel("roll of the tool, deg")
         figure.colorbar(made, ax=axes, label="cost of the best motion through, of the plan's", pad=0.01)
     example.save(folder / "posture_set.npz")

@@ -15,14 +15,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, with_load
-from models.arrays import Array
+from models import Footprint, Standing, Surroundings, Wrench, footprint, with_load
 from models.machines.standing import External
 from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
-from ocp.app.frames import frames_along
 from ocp.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
-from scripts.robots.mobile_manipulator import StandingExample, animated, save
+from scripts.robots.drawing import animate
+from scripts.robots.mobile_manipulator import StandingExample, save
 from scripts.robots.robots import RobotFile
 
 __all__ = ["anymal", "draw", "plan", "problem", "reach", "reaction", "task"]
@@ -47,6 +46,7 @@ LOAD = 1.0  # kg
 PUSH = (0.0, -60.0, 0.0)  # of the hand on what resists, N
 MARGIN = 0.01  # m
 FRICTION = 0.7
+VIEW = (24.0, -38.0)  # deg
 METHOD = Collocation(24, degree=3, scheme="legendre")
 
 
@@ -110,40 +110,20 @@ def plan(coarse: bool = False) -> StandingExample:
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
     """pushing.png, pushing.gif and pushing.npz."""
-    found = example.results
-    machine, robot = found.machine, found.robot
+    found, nearest = example.results, example.nearest
     force = float(np.linalg.norm(PUSH))
     note = (
-        f"ANYmal of {robot.total_mass - LOAD:.1f} kg, legs locked, with {LOAD:g} kg in its hand pushes to its right "
-        f"(-y) with {force:g} N; the reaction on its hand acts to its left, where the hand gives way by "
-        f"{STEP[1]:g} m in {SECONDS:g} s. Feet, inertias and limits from its URDF (example-robot-data); both motions "
-        f"have the same path and force. Plan: zero moment point {1000 * MARGIN:g} mm inside."
+        f"ANYmal of {found.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right (-y) with {force:g} N and "
+        f"{LOAD:g} kg in its hand; earlier postures pale, disc: zero moment point. The reaction on its hand acts "
+        f"to its left, where the hand gives way by {STEP[1]:g} m in {SECONDS:g} s. Feet, inertias and limits from its "
+        "URDF (example-robot-data); both motions have the same path and force. Plan: zero moment point "
+        f"{1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
+        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
-    standing.figure(
-        folder / "pushing.png",
-        found,
-        note=note,
-        force="reaction of the push on the hand",
-        prefix="j2s6s200_",
-        inset=(0.36, 0.1, 0.5, 0.5),
-    )
+    title = "Resolved instant by instant the push lifts the robot off its feet; planned as a whole it stays on them"
+    look: dict[str, Any] = {"view": VIEW, "prefix": "j2s6s200_", "inset": (0.36, 0.1, 0.5, 0.5)}
+    standing.figure(folder / "pushing.png", found, note=note, title=title, **look)
     save(folder / "pushing.npz", example)
     if animation:
-        note = (
-            f"Grey: legs, and the footprint of the feet; diamond: zero moment point. The hand pushes to the right (-y) "
-            f"with {force:g} N and gives way to the left."
-        )
-        outline = _legs(machine, robot)
-        animated(folder / "pushing.gif", found, outline, note=note, nearest=example.nearest, view=(24.0, -38.0))
-
-
-def _legs(machine: Standing, robot: Robot) -> Array:
-    """One line from foot to foot round the footprint, on the way up every leg and down again. Shape (k, 3), m."""
-    places = frames_along(machine, START[None]).positions
-    points: list[Array] = []
-    for leg in ("LF", "RF", "RH", "LH", "LF"):
-        x, y, _ = places[f"{leg}_FOOT"][0]
-        names = [*(f"{leg}_{part}" for part in ("FOOT", "SHANK", "THIGH", "HIP")), robot.root]
-        up = [np.array([x, y, 0.0]), *(places[name][0] for name in names)]
-        points += [*up, *up[::-1]]
-    return np.array(points)
+        scenes = standing.scenes_of(found, VIEW, nearest.points)
+        animate(folder / "pushing.gif", scenes, frames=40, seconds=0.1, note=note)

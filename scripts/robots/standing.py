@@ -22,11 +22,13 @@ from models.machines.standing import External
 from models.machines.standing_motion import StandingMotion, standing_motion
 from models.paths import rest_to_rest
 from ocp import Clear, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
+from ocp.app.frames import frames_along
 from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
 from ocp.tasks.tip_task import timed
-from scripts.drawing import COLORS, DASHES, sheet
+from scripts.drawing import COLORS, DASHES
+from scripts.robots.drawing import Scene, page
 
-__all__ = ["Results", "draw", "figure", "plan", "problem", "robot_file", "tiago"]
+__all__ = ["Results", "figure", "plan", "problem", "robot_file", "scenes_of", "tiago"]
 
 PACKAGE, FILE = "example-robot-data", "tiago_description/robots/tiago.urdf"
 JOINTS = ("torso_lift_joint", *(f"arm_{i}_joint" for i in range(1, 8)))
@@ -160,15 +162,20 @@ def plan() -> Results:
     return Results(robot_file(), machine, ground, solution, sampled(machine, solution, pulled), local, pulled)
 
 
-def draw(folder: Path, results: Results) -> None:
-    """Write mobile_manipulator.png: zero moment point from above, its distance from the edge, rope, limits."""
-    note = (
-        f"TIAGo of {results.robot.total_mass:.1f} kg with {LOAD:g} kg in its hand on a circle of {SECONDS:g} s; a rope "
-        f"pulls the hand forward with {PULL:g} N. Footprint, inertias and limits from its URDF (example-robot-data); "
-        f"both motions have the same hand path and force. Plan: zero moment point {1000 * MARGIN:g} mm inside, "
-        f"{100 * SHARE:g} % of the limits of velocity and torque."
-    )
-    figure(folder / "mobile_manipulator.png", results, note=note, force="force of the rope on the hand")
+def scenes_of(results: Results, view: tuple[float, float], nearest_points: Array | None = None) -> list[Scene]:
+    """The local motion and the plan as scenes, on the ground, with the footprint and their zero moment points.
+
+    Args:
+        nearest_points: Of the two bodies that come nearest along the plan. Shape (2, 3), m.
+    """
+    found = []
+    feet = np.asarray(results.footprint.support.vertices)
+    for title, motion, color in (("instant by instant", results.local, "orange"), ("plan", results.motion, "blue")):
+        frames = frames_along(results.machine, motion.joints)
+        about: dict[str, Any] = {"view": view, "floor": 0.0, "footprint": feet, "mark": motion.zero_moment_point}
+        points = nearest_points if motion is results.motion else None
+        found.append(Scene(title, results.robot, frames, motion.t, color, nearest_points=points, **about))
+    return found
 
 
 def figure(
@@ -176,38 +183,36 @@ def figure(
     results: Results,
     *,
     note: str,
-    force: str,
+    title: str,
     prefix: str = "",
+    view: tuple[float, float] = (14.0, -50.0),
     inset: tuple[float, float, float, float] = (0.1, 0.27, 0.46, 0.46),
 ) -> None:
-    """A plan and the local motion: zero moment point from above, its distance from the edge, force, limits.
+    """The local motion and the plan above: zero moment point from above, its distance from the edge, limits.
 
     Args:
         path: PNG file.
-        note: Fine print.
-        force: Title over the force from outside.
+        note, title: As of sheet.
         prefix: Of joint names, left out.
+        view: Elevation and azimuth, deg.
         inset: Left, bottom, width and height of the enlarged part, in shares of the picture from above.
     """
-    kinds = (("instant by instant", results.local, "orange", 1), ("planned", results.motion, "blue", 0))
+    kinds = (("instant by instant", results.local, "orange", 1), ("plan", results.motion, "blue", 0))
     span = (0.0, results.solution.horizon)
-    with sheet(path, (2, 2), (8.4, 6.6), note) as (drawn, axes):
-        above, edge, outside, shares = axes.flat
+    scenes = scenes_of(results, view)
+    with page(path, scenes, 4, height=7.4, share=1.45, note=note, title=title) as (above, edge, shares):
         _from_above(above, results, kinds, inset)
         for label, motion, color, dash in kinds:
             edge.plot(motion.t, 1000 * motion.foot_margin, color=COLORS[color], ls=DASHES[dash], label=label)
         edge.axhline(0.0, color=COLORS["black"], lw=0.8)
         low = 1.5 * 1000 * min(0.0, float(results.local.foot_margin.min()), float(results.motion.foot_margin.min()))
-        edge.axhspan(low, 0.0, color=COLORS["orange"], alpha=0.12, lw=0)
+        edge.axhspan(low, 0.0, color=COLORS["grey"], alpha=0.2, lw=0)
+        edge.annotate("tips over", (0.03, low), xycoords=("axes fraction", "data"), fontsize=7, va="bottom")
         edge.set_ylim(bottom=low)
-        edge.set(xlabel="time, s", ylabel="mm", title="zero moment point inside the footprint", xlim=span)
-        for i, (name, color) in enumerate(zip("xyz", ("black", "green", "purple"), strict=True)):
-            values = results.motion.external_force[:, i]
-            outside.plot(results.motion.t, values, color=COLORS[color], ls=DASHES[i], label=name)
-        outside.set(xlabel="time, s", ylabel="N", title=force, xlim=span)
-        outside.legend(ncols=3)
+        edge.set(xlabel="time, s", ylabel="zero moment point\ninside the footprint, mm", xlim=span)
+        edge.legend(fontsize=7, loc="upper left")
+        edge.set_ylim(top=1.25 * edge.get_ylim()[1])
         _shares(shares, results, kinds, prefix)
-        drawn.legend(handles=edge.get_lines()[:2], loc="outside upper left", ncols=2)
 
 
 def _from_above(ax: Any, results: Results, kinds: Any, inset: tuple[float, float, float, float]) -> None:
@@ -230,8 +235,7 @@ def _from_above(ax: Any, results: Results, kinds: Any, inset: tuple[float, float
         spine.set_visible(True)
     ax.indicate_inset_zoom(enlarged, edgecolor=COLORS["black"])
     ax.plot(*corners.T, "o", color=COLORS["grey"], ms=3)
-    title = f"zero moment point from above; inset {200 * half:.0f} cm wide"
-    ax.set(xlabel="x, forward, m", ylabel="y, m", title=title)
+    ax.set(xlabel=f"x, forward, m; inset {200 * half:.0f} cm wide", ylabel="y, m")
 
 
 def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
@@ -247,4 +251,5 @@ def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
     names = [name.removeprefix(prefix).removesuffix("_joint").replace("_", " ") for name in robot.joint_names]
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
-    ax.set(xlabel="peak over limit: bars torque, diamonds velocity", title="joints against their limits")
+    ax.tick_params(axis="y", labelsize=7)
+    ax.set(xlabel="peak over its limit:\nbars torque, ◆ velocity")

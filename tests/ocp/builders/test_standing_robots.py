@@ -246,7 +246,7 @@ def test_a_start_in_a_singular_posture_may_be_left() -> None:
 
 
 def test_the_picture_of_the_gallery_is_written(tiago: gallery.Results, tmp_path: Path) -> None:
-    gallery.draw(tmp_path, tiago)
+    gallery.figure(tmp_path / "mobile_manipulator.png", tiago, note="A note.", title="A title")
     assert (tmp_path / "mobile_manipulator.png").stat().st_size > 20_000
 
 
