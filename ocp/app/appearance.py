@@ -19,14 +19,14 @@ from models.arrays import Array
 from models.shapes.mesh_files import find_mesh, read_painted_mesh
 from models.shapes.triangles import Triangles, bare, together
 
-__all__ = ["ZONE", "Appearance", "Part", "appearance_of", "part_of", "rod"]
+__all__ = ["MOST_FACES", "ZONE", "Appearance", "Part", "appearance_of", "part_of", "rod"]
 
 GREY = (0.72, 0.74, 0.78, 1.0)
 ZONE = (0.55, 0.58, 0.62, 0.22)
 """Colour of what a link touches with that a description shows nothing of, while it shows others: a zone, no body."""
 ROD = (0.35, 0.38, 0.42, 1.0)
 MOST_FACES = 200_000
-"""Of a robot, beyond which corners that are near to each other become one."""
+"""Of a robot."""
 FINEST = 2.5e-4
 """m, the first size of the cells in which corners become one; doubled until the faces are few enough."""
 CREASE = np.cos(np.deg2rad(38.0))
@@ -70,13 +70,16 @@ class Appearance:
     missing: dict[str, str]
 
 
-def appearance_of(robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True) -> Appearance:
+def appearance_of(
+    robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = MOST_FACES
+) -> Appearance:
     """The surfaces of a robot's links.
 
     Args:
         robot: The robot, however it was changed: shapes move with the links that they were merged into.
         folders: Where meshes are looked for first, see `models.shapes.mesh_files.find_mesh`.
         meshes: Whether files are read at all.
+        most: Faces in all, beyond which corners that are near to each other become one.
     """
     missing: dict[str, str] = {}
     dressed = any(link.visuals for link in robot.links)
@@ -89,7 +92,7 @@ def appearance_of(robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = T
         found += [(link.name, triangles) for triangles in shown]
     seen = {name for name, _ in found}
     found += [(name, rod) for name, rod in _rods(robot, seen)]
-    return Appearance(tuple(_parts(_few(found))), missing)
+    return Appearance(tuple(_parts(_few(found, most))), missing)
 
 
 def _shown(
@@ -185,11 +188,11 @@ def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
     return found
 
 
-def _few(found: list[tuple[str, Triangles]]) -> list[tuple[str, Triangles]]:
-    """The same, of at most MOST_FACES faces in all."""
+def _few(found: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
+    """The same, of at most so many faces in all."""
     size = FINEST
     coarse = found
-    while sum(len(one.faces) for _, one in coarse) > MOST_FACES and size < 1.0:
+    while sum(len(one.faces) for _, one in coarse) > most and size < 1.0:
         coarse = [(link, _coarser(one, size)) for link, one in found]
         size *= 2
     return coarse

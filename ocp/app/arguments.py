@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, HalfSpace, Robot, cache, locked, rectangle, with_load
+from models import FixedBase, FreeFloating, Robot, cache, locked, rectangle, with_load
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
 from ocp.app.planned import WRITERS, check_period, export, run_task
@@ -276,20 +276,15 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     )
     if options.report is not None:
         progress("report")
+        from ocp.app.obstacles import of_shapes
         from ocp.app.report import report_of_check  # draws, which takes a while to import
 
         machine = FreeFloating(robot) if options.floating else FixedBase(robot, place, turn)
-        around = solids_of(obstacles)
-        report = report_of_check(found, machine, bounds_of(robot, **limits), around, tuple(options.folder))
+        report = report_of_check(
+            found, machine, bounds_of(robot, **limits), of_shapes(obstacles), tuple(options.folder)
+        )
         write_text(options.report, report.html())
     return (0 if found.passed else 1), str(found), found.to_dict()
-
-
-def solids_of(obstacles: Any) -> list[Any]:
-    """Obstacles to draw; no half-spaces."""
-    from ocp.app.pictures import solid_of
-
-    return [solid_of(one.core, one.swelling) for one in obstacles if not isinstance(one, HalfSpace)]
 
 
 def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:

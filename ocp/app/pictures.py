@@ -7,35 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
-from models.shapes.hull import convex_hull
 from ocp.app.appearance import appearance_of, part_of
 from ocp.app.colors import COMPARED, FAULT, LIMIT, PLAN, SURROUNDINGS, TIP
 from ocp.app.frames import frames_along
+from ocp.app.obstacles import Obstacle
 from ocp.app.pieces import Motion
 from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
-from ocp.solution import Solution
 from ocp.tasks.limits import JointBounds
 
-__all__ = [
-    "STYLE",
-    "Solid",
-    "add_names",
-    "as_svg",
-    "curves",
-    "draw_joints",
-    "look",
-    "obstacles_of",
-    "scene",
-    "show_limits",
-    "solid_of",
-]
-
-Solid = tuple[Array, NDArray[np.intp]]
-"""Corners (k, 3), m, and triangles of them (f, 3)."""
+__all__ = ["STYLE", "add_names", "as_svg", "curves", "draw_joints", "look", "scene", "show_limits"]
 
 SHOWN = 4
 """Times at which the robot is shown."""
@@ -54,32 +37,13 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Of what a plan is compared with, so that nothing is known by its colour alone."""
 
 
-def solid_of(core: Array, radius: float) -> Solid:
-    """The hull of points swelled by a radius."""
-    around = np.zeros((1, 3))
-    if radius > 0:
-        u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(-np.pi / 2, np.pi / 2, 7))
-        around = radius * np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1).reshape(-1, 3)
-    hull = convex_hull((np.asarray(core)[:, None] + around).reshape(-1, 3))
-    return np.asarray(hull.vertices), hull.faces
-
-
-def obstacles_of(solution: Solution) -> tuple[Solid, ...]:
-    """Obstacles that stand still, as the problem of a solution knows them; no half-spaces."""
-    if solution.problem is None:
-        return ()
-    found = {}
-    for apart in solution.problem.declared.apart.values():
-        for name, hull in apart.hulls.items():
-            if hull.frame < 0 and not hull.normal.size:
-                found[name] = solid_of(hull.core, hull.radius)
-    return tuple(found.values())
-
-
 def scene(
-    machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Solid], folders: Sequence[Any] = ()
+    machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Obstacle], folders: Sequence[Any] = ()
 ) -> bytes:
-    """The robot as it looks at several times, at the last one solid, its tip's way, and what stands around; a PNG."""
+    """The robot as it looks at several times, at the last one solid, its tip's way, and what is around; a PNG.
+
+    Obstacles that move stand where they are at the end; `around` has them at equal times of the motion.
+    """
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
 
@@ -88,8 +52,15 @@ def scene(
     frames = frames_along(machine, motion.position.at(times), places)
     looks = appearance_of(machine.robot, folders)
     shown = [placed(looks, frames, int(k)) for k in np.linspace(0, POINTS - 1, SHOWN)]
-    clouds = [part.vertices for parts in shown for part in parts] + [corners for corners, _ in around]
-    still = [part_of("", corners, faces, (*to_rgb(SURROUNDINGS), 1.0)) for corners, faces in around]
+    clouds = [part.vertices for parts in shown for part in parts]
+    before, still = np.vstack(clouds), []
+    for one in around:
+        corners, faces = one.solid(before)
+        if one.rotations is not None and one.positions is not None:
+            corners = corners @ one.rotations[-1].T + one.positions[-1]
+        still.append(part_of("", corners, faces, (*to_rgb(SURROUNDINGS), 1.0)))
+        if one.normal is None:
+            clouds.append(corners)
     if machine.robot.tip is not None:
         clouds.append(frames.tip)
     cloud = np.vstack(clouds)

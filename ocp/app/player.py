@@ -223,7 +223,17 @@ def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
     rows = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), POSES)).round().astype(int))
     frames = frames_along(one.machine, one.joints[rows], one.base[rows])
     tip = one.machine.robot.tip is not None
-    names = [*_movers(one.machine.robot), *([TIP] if tip else [])]
+    before = np.vstack([*frames.positions.values()])
+    movers = _movers(one.machine.robot)
+    around = []
+    for number, obstacle in enumerate(one.around):
+        mover = None
+        if obstacle.rotations is not None and obstacle.positions is not None:
+            mover, name = len(movers), f"what moves by itself, {number}"
+            movers.append(name)
+            frames.rotations[name], frames.positions[name] = obstacle.rotations[rows], obstacle.positions[rows]
+        around.append({**_solid(*obstacle.solid(before), buffers), "mover": mover})
+    names = [*movers, *([TIP] if tip else [])]
     told: dict[str, Any] = {
         "name": one.name,
         "verdict": one.verdict,
@@ -255,7 +265,7 @@ def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
             for target in one.targets
             if np.isfinite(target.position).any()
         ],
-        "around": [_solid(vertices, faces, buffers) for vertices, faces in one.around],
+        "around": around,
         "rows": [
             [row.name, _plain(row.value), _plain(row.limit), row.unit, _plain(row.time), row.verdict, row.note]
             for row in one.rows

@@ -31,8 +31,8 @@ EDGE = 0.1
 """Of the lesser side of a picture, within which the floor fades towards its edge."""
 SUN = (np.deg2rad(38.0), np.deg2rad(52.0))
 """Of the sun: azimuth from the camera's, to its left, and elevation."""
-MAP = 1200
-"""Places along each side of the map of shadows."""
+MAP = 1.25
+"""Places along each side of the map of shadows, of the pixels along the greater side of the picture."""
 BEHIND = 3e-3
 """A veil that is less than this share of its distance before what is solid counts as behind it."""
 BLUR, BIAS = (-2, 0, 2), 6.0
@@ -283,6 +283,7 @@ class _Sun:
     axes: Array
     low: Array
     step: float
+    places: int
     height: Array
 
     @classmethod
@@ -292,12 +293,12 @@ class _Sun:
         way = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
         right = np.array([-np.sin(turn), np.cos(turn), 0.0])
         axes = np.stack([right, np.cross(way, right), way])
-        points = mesh.corners @ axes.T
+        points, places = mesh.corners @ axes.T, round(MAP * max(camera.size)) + 16
         low = points.min(axis=0)[:2]
-        step = float((points.max(axis=0)[:2] - low).max()) / (MAP - 8) or 1.0
+        step = float((points.max(axis=0)[:2] - low).max()) / (places - 8) or 1.0
         low = low - 4 * step
-        height, _ = _nearest(((points[:, :2] - low) / step)[mesh.faces], points[:, 2][mesh.faces], (MAP, MAP))
-        return cls(way, axes, low, step, height)
+        height, _ = _nearest(((points[:, :2] - low) / step)[mesh.faces], points[:, 2][mesh.faces], (places, places))
+        return cls(way, axes, low, step, places, height)
 
     def lit(self, points: Array) -> Array:
         """Share of the sun that reaches points (k, 3), 0 to 1."""
@@ -308,8 +309,8 @@ class _Sun:
         found = np.zeros(len(points), dtype=np.float32)
         for i in BLUR:
             for j in BLUR:
-                inside = (row + i >= 0) & (row + i < MAP) & (column + j >= 0) & (column + j < MAP)
-                cell = np.where(inside, (row + i) * MAP + column + j, 0)
+                inside = (row + i >= 0) & (row + i < self.places) & (column + j >= 0) & (column + j < self.places)
+                cell = np.where(inside, (row + i) * self.places + column + j, 0)
                 found += ~(inside & (self.height[cell] > z + self.step))
         return np.asarray(found / len(BLUR) ** 2)
 

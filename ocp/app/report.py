@@ -16,7 +16,8 @@ import numpy as np
 from models import FreeFloating, Machine
 from models.arrays import Array
 from ocp.app.joint_limits import Row
-from ocp.app.pictures import Solid, curves, obstacles_of, scene
+from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
+from ocp.app.pictures import curves, scene
 from ocp.app.pieces import Motion
 from ocp.app.verdict import Check, bounds_of, check_trajectory
 from ocp.files import RawTrajectory
@@ -118,7 +119,7 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def report_of_check(
-    check: Check, machine: Machine, bounds: JointBounds, around: Sequence[Solid] = (), folders: Sequence[Any] = ()
+    check: Check, machine: Machine, bounds: JointBounds, around: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
 ) -> Report:
     """Of a check. The limits are those that it held the motion against."""
     motion, robot = check.readable.motion, machine.robot
@@ -189,7 +190,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
             f"{len(plan.candidates)} motions found",
         ),
         tuple(str(fault) for fault in check.faults),
-        scene(machine, motion, bases, list(obstacles_of(plan.solution))),
+        scene(machine, motion, bases, obstacles_of(plan.solution, looks_of(plan, sample.t))),
         curves(motion, plan.names, units, bounds, check.faults),
         (("The audit", rows), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
         tuple(f"unlimited: {one}" for one in check.unlimited),

@@ -16,8 +16,8 @@ from models import FreeFloating, Machine, Standing
 from models.arrays import Array
 from ocp.app.bases import floating_base
 from ocp.app.joint_limits import Row
+from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.oddities import readable
-from ocp.app.pictures import Solid, obstacles_of
 from ocp.app.quantities import Curve, Footing, footing_of, joint_curves, machine_curves, so_far
 from ocp.app.verdict import bounds_of
 from ocp.audit.clearance import nearest_along
@@ -72,7 +72,7 @@ class Shown:
         targets: What tips were asked to do.
         footing: Where the ground pushes; None of a machine that does not stand.
         near: The nearest bodies; None where nothing is known of them.
-        around: Obstacles that stand still, in world.
+        around: Obstacles; what moves has its places at the times t.
         verdict: Of the audit, a sentence, or "". passed: Whether it is good; None where nothing was looked at.
         rows: Of the audit.
         cost: Of it; None where it is not known.
@@ -87,7 +87,7 @@ class Shown:
     targets: tuple[Target, ...] = ()
     footing: Footing | None = None
     near: Near | None = None
-    around: tuple[Solid, ...] = ()
+    around: tuple[Obstacle, ...] = ()
     verdict: str = ""
     passed: bool | None = None
     rows: tuple[Row, ...] = ()
@@ -109,7 +109,7 @@ def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
     given = sample.joints, sample.rates, sample.accelerations
     about: dict[str, Any] = {
         "near": near,
-        "around": obstacles_of(plan.solution),
+        "around": tuple(obstacles_of(plan.solution, looks_of(plan, times))),
         "cost": plan.cost,
         "targets": plan.targets,
     }
@@ -157,7 +157,7 @@ def shown_solution(
     q, v, a = (one[:, columns[joints]] for one in (states, slopes, bends))
     place = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     moves = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    about: dict[str, Any] = {"cost": solution.cost, "around": obstacles_of(solution)}
+    about: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
     about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
         looks = np.linspace(0.0, solution.horizon, LOOKS)
@@ -316,11 +316,9 @@ def _near(plan: Plan) -> Near | None:
     if problem is None:
         return None
     looks = np.linspace(0.0, plan.horizon, LOOKS)
-    which = np.clip(np.searchsorted([part.begin for part in plan.parts], looks, "right") - 1, 0, len(plan.parts) - 1)
     found = []
-    for k, part in enumerate(plan.parts):
-        fractions = plan._fractions(part, looks[which == k])
-        found += nearest_along(problem, plan.solution, fractions * plan.solution.horizon, part.suffix)
+    for suffix, times in looks_of(plan, looks):
+        found += nearest_along(problem, plan.solution, times, suffix)
     return _joined(looks, found)
 
 

@@ -26,7 +26,16 @@ from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of
 
-__all__ = ["Clearance", "Nearest", "Track", "clearance", "clearance_along", "nearest_along", "nearest_at"]
+__all__ = [
+    "Clearance",
+    "Nearest",
+    "Track",
+    "clearance",
+    "clearance_along",
+    "nearest_along",
+    "nearest_at",
+    "placements_along",
+]
 
 SETTLED = 0.02
 """Of what the least distance is more or less than is asked: it is known to so much."""
@@ -167,6 +176,24 @@ def nearest_along(problem: Problem, solution: Solution, times: Iterable[float], 
     return [
         min((near for search in searches for near in search.at(time)), key=lambda near: near.distance) for time in times
     ]
+
+
+def placements_along(
+    problem: Problem, solution: Solution, times: np.ndarray, suffix: str = ""
+) -> list[tuple[Separation, Frames]]:
+    """Where the frames are at times (K,), s, on which bodies ride that have to stay apart, of each separation.
+
+    Args:
+        suffix: As of `nearest_along`.
+
+    Raises:
+        ProblemError: The plan does not belong to the problem.
+    """
+    form = Formulation.of(problem)
+    check_belongs(form, solution)
+    solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
+    moved = [one for one in problem.declared.apart.values() if all(name.endswith(suffix) for name in one.movers)]
+    return [(one, _track_of(form, one, solution, p).frames(times / solution.horizon)) for one in moved if len(one)]
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from models import Robot
 from models.arrays import Array
-from ocp.app.appearance import ZONE, Appearance, Part, appearance_of, part_of, rod
+from ocp.app.appearance import MOST_FACES, ZONE, Appearance, Part, appearance_of, part_of, rod
 from ocp.app.frames import Frames
 from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
@@ -36,6 +36,8 @@ LINE = 0.0028
 """Radius of a line, of the size of the scene."""
 GHOSTS = (0.16, 0.34)
 """Opacity of the first and of the last of the earlier postures."""
+FILM = 30_000
+"""Faces of a robot in an animation."""
 LOOKS = 9
 """Times at which a scene is measured."""
 
@@ -56,6 +58,7 @@ class Scene:
         mark: A point on the ground that moves, such as the zero moment point. Shape (M, 2), m.
         nearest_points: Of two bodies, where they come nearest to each other along the motion. Shape (2, 3), m.
         solids: What stands around, in world.
+        detail: Faces of the robot, at most.
     """
 
     title: str
@@ -70,11 +73,12 @@ class Scene:
     mark: Array | None = None
     nearest_points: Array | None = None
     solids: tuple[Part, ...] = ()
+    detail: int = MOST_FACES
 
     @cached_property
     def looks(self) -> Appearance:
         """Of the robot; without the zones of its description that are no bodies."""
-        looks = appearance_of(self.robot)
+        looks = appearance_of(self.robot, most=self.detail)
         return Appearance(tuple(part for part in looks.parts if part.color != ZONE), looks.missing)
 
     @cached_property
@@ -210,6 +214,7 @@ def animate(path: Path, scenes: Sequence[Scene], *, frames: int, seconds: float,
         note: Its first sentence stands below.
     """
     wide, tall = 3.6, 3.5
+    scenes = [replace(scene, detail=FILM) for scene in scenes]
     with sheet(None, (1, len(scenes)), (wide * len(scenes), tall + 0.4)) as (figure, axes):
         figure.set_dpi(DPI)
         camera = camera_of(scenes, (round(DPI * wide), round(DPI * (tall - 0.4))))

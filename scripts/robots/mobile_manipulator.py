@@ -81,8 +81,8 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
         f"TIAGo of {found.robot.total_mass:.0f} kg leads {standing.LOAD:g} kg round a circle in {standing.SECONDS:g} s "
         f"while a rope pulls its hand forward with {standing.PULL:g} N; earlier postures pale, disc: zero moment "
         "point. Footprint, inertias and limits from its URDF (example-robot-data); both motions have the same hand "
-        f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of the "
-        f"limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
+        f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of "
+        f"the limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
         f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
     title = "Resolved instant by instant the robot tips over; planned as a whole it stands, within all limits"

@@ -144,8 +144,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         f"All postures of a UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, along a bowed seam of "
         f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s, position and axis told, roll free; one panel a family "
         "that no motion leaves. Joints within their limits, links clear of each other. Each column holds all postures "
-        "of one time, found by continuation; colour: the least that any motion through a posture costs, a bound, of the plan's "
-        "cost"
+        "of one time, found by continuation; colour: the least that any motion through a posture costs, a bound, of "
+        "the plan's cost"
         f"{f'; {left} dearer families are left out' if left else ''}. Costs: integral of half the "
         f"squared joint rates, rad²/s; no motion costs less than {best.bound:.4g}."
     )

@@ -2,6 +2,7 @@
 
 const SPACE = "http://www.w3.org/2000/svg";
 const WIDE = 240, TALL = 96, LEFT = 42, RIGHT = 6, TOP = 6, BOTTOM = 14;
+const LEAST = 0.02;  // of a chart's largest value is its range at least: less would show rounding as if it were something
 const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
 
 function shape(kind, given, inside) {
@@ -63,11 +64,8 @@ class Chart {
     for (const limit of [...limits])  // limits far away would flatten the curve
       if (limit < low - 3 * reach || limit > high + 3 * reach) limits.delete(limit);
     for (const limit of limits) { low = Math.min(low, limit); high = Math.max(high, limit); }
-    if (high - low < 1e-6 * Math.max(Math.abs(low), Math.abs(high), 1e-3)) {
-      const more = 0.05 * Math.max(Math.abs(low), 1e-3);
-      low -= more;
-      high += more;
-    }
+    const least = LEAST * Math.max(Math.abs(low), Math.abs(high), 1e-3), more = (least - (high - low)) / 2;
+    if (more > 0) { low -= more; high += more; }
     const room = 0.05 * (high - low);
     low -= room;
     high += room;

@@ -26,7 +26,7 @@ class Motion {
     this.width = told.poses.shape[1];
     this.time = arrays(told.time);
     this.curves = told.curves.map((one) => ({...one, times: this.time, values: arrays(one.values)}));
-    this.around = told.around.map((one) => scene.surface(one, arrays));
+    this.around = told.around.map((one) => ({surface: scene.surface(one, arrays), mover: one.mover}));
     this.way = told.tip ? this.trail(this.width - 1) : new Float32Array(0);
     this.done = scene.line(this.way);
     this.targets = told.targets.map((one) => {
@@ -219,8 +219,11 @@ class Player {
     }
     for (const {motion} of visible.slice(0, 1)) this.drawGlass(motion, motion.at(Math.min(this.time, motion.horizon)));
     if (shown.around) scene.drawFaint(() => {
-      for (const {motion} of visible.slice(0, 1))
-        for (const one of motion.around) scene.drawSurface(one, IDENTITY, COLORS.solid);
+      for (const {motion} of visible.slice(0, 1)) {
+        const pose = motion.at(Math.min(this.time, motion.horizon));
+        for (const {surface, mover} of motion.around)
+          scene.drawSurface(surface, mover === null ? IDENTITY : matrixOf(pose, 7 * mover), COLORS.solid);
+      }
     });
     if (shown.ghosts) for (const {motion, kind} of visible) for (const share of GHOSTS) {
       const pose = motion.at(share * motion.horizon);

@@ -15,12 +15,15 @@ import numpy as np
 import pytest
 
 from models import (
+    Box,
     CollisionShape,
     FixedBase,
     FreeFloating,
+    HalfSpace,
     Joint,
     Link,
     Machine,
+    Moving,
     Robot,
     Sphere,
     Standing,
@@ -235,8 +238,7 @@ def test_meshes_of_many_faces_become_coarse_and_stay_where_they_are(monkeypatch:
     monkeypatch.setattr(appearance, "ROUND", 200)
     robot = Robot((Link("a", visuals=(VisualShape("sphere", (0.2,)),)),))
     (fine,) = appearance_of(robot).parts
-    monkeypatch.setattr(appearance, "MOST_FACES", 4000)
-    (coarse,) = appearance_of(robot).parts
+    (coarse,) = appearance_of(robot, most=4000).parts
     assert 500 < len(coarse.faces) <= 4000 < len(fine.faces)
     np.testing.assert_allclose(np.linalg.norm(coarse.vertices, axis=1), 0.2, atol=0.01)
 
@@ -327,6 +329,43 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
     ball = told["motions"][0]["around"][0]
     corners = np.array(ball["low"]) + np.array(ball["step"]) * arrays[ball["vertices"]["at"]][:, :3]
     np.testing.assert_allclose(np.linalg.norm(corners - [0.9, 0.4, 0.2], axis=1), 0.05, atol=1e-4)
+
+
+def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spaces_as_planes() -> None:
+    machine = FixedBase(armoured_arm())
+    start = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
+
+    def way(time: Any) -> Any:
+        return ca.vertcat(0.9 - 0.1 * time, 0.5 + 0.2 * ca.sin(3 * time), 0.3)
+
+    def turn(time: Any) -> Any:
+        return ca.blockcat([[ca.cos(time), -ca.sin(time), 0], [ca.sin(time), ca.cos(time), 0], [0, 0, 1]])
+
+    around: list[Any] = [
+        Moving(Box((0.1, 0.2, 0.05), (0.02, 0, 0)), way, turn),
+        HalfSpace((0.6, 0.0, 0.8), (0.0, 0.0, -1.5)),
+    ]
+    clear = Clear(Surroundings(machine, around))
+    problem = minimum_velocity_problem(machine, (0.0, 0.1, 0.0), (3, 4, 5), start, 1.0, clear=clear)
+    plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
+    shown = shown_plan(plan)
+    plane, moved = shown.around
+    assert plane.normal is not None
+    assert moved.rotations is not None
+    assert moved.positions is not None
+    np.testing.assert_allclose(moved.positions, [np.array(way(t)).ravel() for t in shown.t], atol=1e-12)
+    np.testing.assert_allclose(moved.rotations, [np.array(turn(t)) for t in shown.t], atol=1e-12)
+    corners, _ = plane.solid(np.random.default_rng(0).normal(size=(20, 3)))
+    np.testing.assert_allclose((corners - [0.0, 0.0, -1.5]) @ [0.6, 0.0, 0.8], 0.0, atol=1e-12)
+    told, arrays = unpacked(page([shown]).text)
+    motion = told["motions"][0]
+    still, box = motion["around"]
+    assert still["mover"] is None
+    t, poses = arrays[motion["t"]["at"]], arrays[motion["poses"]["at"]]
+    np.testing.assert_allclose(poses[:, box["mover"], :3], [np.array(way(float(one))).ravel() for one in t], atol=1e-6)
+    np.testing.assert_allclose(poses[:, box["mover"], 3:] @ [0, 1, 1, 0], 0.0, atol=1e-6)  # it turns about z alone
+    np.testing.assert_allclose(2 * np.arctan2(poses[:, box["mover"], 6], poses[:, box["mover"], 3]), t, atol=1e-6)
+    np.testing.assert_allclose(poses[:, -1, :3], plan.sampled(t.astype(float)).tip[:, :3], atol=1e-6)  # the tip is last
 
 
 def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Robot) -> None:
