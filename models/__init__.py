@@ -4,6 +4,7 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
+from models.machines.actuators import Thruster, wheels_of, with_wheels
 from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
@@ -76,6 +77,7 @@ __all__ = [
     "Standing",
     "Support",
     "Surroundings",
+    "Thruster",
     "Tunnel",
     "VisualShape",
     "Wrench",
@@ -116,5 +118,7 @@ __all__ = [
     "subtree",
     "tip_jacobian",
     "tip_pose",
+    "wheels_of",
     "with_load",
+    "with_wheels",
 ]

@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice
+from models.arrays import NOT_NUMBERS, Array, ArrayInput, checked_array, checked_choice
 from models.errors import ModelError
 from models.machines.machine import require_joints
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
@@ -75,6 +75,10 @@ class FreeFloating:
     (angular velocity, velocity of the root frame's origin) in world axes, shape (6, 1); for a planar base
     (angular velocity, vx, vy), shape (3, 1).
 
+    Where something acts from outside, the momentum is a state beside the configuration: every function takes it below
+    the configuration of the base, (pose, momentum), of shape (base_size + 6, 1), or (base_size + 3, 1) if planar,
+    instead of the conserved one; `momentum_rate` is its derivative.
+
     Attributes:
         robot: The kinematic tree.
         base: "planar" or "spatial".
@@ -125,8 +129,7 @@ class FreeFloating:
 
     def world_from_base(self, base: Expression) -> Frame:
         """Placement of the root link's frame in the world."""
-        meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
-        base = checked_vector(base, self.base_size, "base", meaning)
+        base = self._split(base)[0]
         if self.base == "planar":
             return Frame(rotation((0, 0, 1), base[2]), ca.vertcat(base[0:2], type(base)(1, 1)))
         return Frame(rotation_from_quaternion(base[3:7]), base[0:3])
@@ -152,7 +155,7 @@ class FreeFloating:
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Twist of the base that conserves the momentum, E1^-1 (momentum - E2 joint_rates) (24).
+        """Twist of the base that has the momentum, E1^-1 (momentum - E2 joint_rates) (24).
 
         Shape (6, 1) or (3, 1).
         """
@@ -163,14 +166,14 @@ class FreeFloating:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Time derivative of the base configuration that conserves the momentum. Shape (base_size, 1)."""
+        """Time derivative of the base configuration that has the momentum. Shape (base_size, 1)."""
         if self.base == "planar":
             twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
-        base = expression(base)
+        pose = self._split(base)[0]
         reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
         turn = self.world_from_base(base).rotation
-        quaternion, spin = base[3:7], reaction.base_angular
+        quaternion, spin = pose[3:7], reaction.base_angular
         turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # in base axes: no rotation
         return ca.densify(ca.vertcat(ca.mtimes(turn, reaction.base_linear), turning))
 
@@ -178,7 +181,7 @@ class FreeFloating:
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
         """Twist of a base whose configuration changes with `base_rate`. Shape (6, 1), or (3, 1) if planar."""
         rate = checked_vector(base_rate, self.base_size, "base_rate", "the derivative of the base configuration")
-        base = checked_vector(base, self.base_size, "base", "the base configuration")
+        base = self._split(base)[0]
         if self.base == "planar":
             return ca.vertcat(rate[2], rate[0:2])
         return ca.vertcat(angular_velocity_from_quaternion(base[3:7], rate[3:7]), rate[0:3])
@@ -210,15 +213,37 @@ class FreeFloating:
         return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
 
     @on_scalars
+    def momentum_rate(self, base: Expression, q: Expression, wrench: Expression) -> Expression:
+        """Time derivative of the momentum under what acts from outside, in the order of `conserved_momentum`.
+
+        The linear one changes by the force, the angular one about the centre of mass by the moment about it.
+
+        Args:
+            wrench: (Moment about the world's origin, force), world axes, as of `external_wrench`. Shape (6, 1).
+
+        Returns:
+            Shape (6, 1) or (3, 1).
+        """
+        wrench = checked_vector(wrench, TWIST_SIZE, "wrench", "moment about the world's origin, then force")
+        center = center_of_mass(self.robot, q, self.world_from_base(base))
+        about_center = wrench[0:3] - cross(center, wrench[3:6])
+        return ca.densify(ca.vertcat(about_center, wrench[3:6]))[self.twist_rows, :]
+
+    @on_scalars
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Momentum, as above, of a motion given by its configuration's derivatives, less the conserved one:
+        """Momentum, as above, of a motion given by its configuration's derivatives, less the one that it has:
 
         Zero if the motion is possible.
         """
         found = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
-        return found - self._momentum_about_origin(base, q) if self._moves_by_itself else found
+        carried = self._carried(base)
+        if carried is None:
+            return found
+        angular, linear = carried
+        center = center_of_mass(self.robot, q, self.world_from_base(base))
+        return found - ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
@@ -247,30 +272,39 @@ class FreeFloating:
         angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
         return ca.densify(ca.vertcat(angular, linear))
 
-    @property
-    def _moves_by_itself(self) -> bool:
-        return bool(np.any(self.conserved_momentum))
+    def _split(self, base: Expression) -> tuple[Expression, Expression | None]:
+        """Pose of the base, and the momentum where it is given with it."""
+        meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
+        size, whole = self.base_size, self.base_size + len(self.twist_rows)
+        try:
+            given = expression(base)
+        except NOT_NUMBERS:
+            given = ca.DM()
+        if given.shape == (whole, 1):
+            both = checked_vector(given, whole, "base", f"{meaning} and the momentum")
+            return both[:size], both[size:]
+        return checked_vector(base, size, "base", meaning), None
 
-    def _spatial_momentum(self) -> tuple[Expression, Expression]:
-        """(Angular about the centre of mass, linear), world axes. Shape (3, 1) each."""
-        full = np.zeros(6)
-        full[self.twist_rows] = self.conserved_momentum
-        return expression(full[:3]), expression(full[3:])
-
-    def _momentum_about_origin(self, base: Expression, q: Expression) -> Expression:
-        angular, linear = self._spatial_momentum()
-        center = center_of_mass(self.robot, q, self.world_from_base(base))
-        return ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
+    def _carried(self, base: Expression) -> tuple[Expression, Expression] | None:
+        """(Angular about the centre of mass, linear) momentum, world axes, shape (3, 1) each; None where it is zero."""
+        momentum = None if base is None else self._split(base)[1]
+        if momentum is None:
+            if not np.any(self.conserved_momentum):
+                return None
+            momentum = expression(self.conserved_momentum)
+        if self.base == "planar":
+            zero = ca.DM(1, 1)
+            return ca.vertcat(zero, zero, momentum[0]), ca.vertcat(momentum[1:3], zero)
+        return momentum[0:3], momentum[3:6]
 
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Of the robot, with the conserved momentum in the base's axes where rates are given."""
+        """Of the robot, with the momentum in the base's axes where rates are given."""
         carried = None
-        if joint_rates is not None and self._moves_by_itself:
+        if joint_rates is not None and (momentum := self._carried(base)) is not None:
             turn = self.world_from_base(base).rotation
-            angular, linear = self._spatial_momentum()
-            carried = ca.mtimes(turn.T, angular), ca.mtimes(turn.T, linear)
+            carried = ca.mtimes(turn.T, momentum[0]), ca.mtimes(turn.T, momentum[1])
         return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar", tip=tip)
 
 

@@ -8,6 +8,9 @@ those of the inverse dynamics,
 with viscous friction d and Coulomb friction c, smoothed below the speed w. On a floating base the momentum is kept, the
 base moves as the joints make it move, and the torques are those of the joints alone. So no mass matrix is inverted, and
 limits of torque are path constraints like all others (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
+Where something acts on a floating machine from outside, thrusters above all, its momentum is a state:
+
+    P' = sum of forces,    L' = sum of moments about the centre of mass.
 
 A motion goes from point to point, along tasks of the tool, or both; through points on the way and with loads that are
 picked up and put down as :class:`~ocp.problem.phases.Phases` of such problems, whose joints and velocities go on.
@@ -22,13 +25,23 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Standing
+from models import FixedBase, FreeFloating, ModelError, Robot, Standing, Thruster, link_frames, wheels_of
 from models.arrays import Array
-from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
+from models.robot.dynamics import GRAVITY, Wrench, external_wrench, inverse_dynamics
+from models.robot.kinematics import center_of_mass
+from models.spatial import cross, quaternion_product
 from ocp.builders.clearance import Clear
 from ocp.builders.standing.problem import FreeTime
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_instance, checked_nonnegative, floats
+from ocp.errors import (
+    NOT_NUMBERS,
+    ProblemError,
+    checked_choice,
+    checked_each,
+    checked_instance,
+    checked_nonnegative,
+    floats,
+)
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import (
     check_length,
@@ -39,7 +52,7 @@ from ocp.tasks.checks import (
     rates_at_rest,
 )
 from ocp.tasks.equations import TaskEquations, bind
-from ocp.tasks.limits import Limits
+from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
 __all__ = ["Effort", "JointFriction", "dynamics_problem", "joint_torques"]
@@ -88,6 +101,9 @@ class Effort:
         torque: Of the squared torques, one number or one for each joint: losses in the windings, 1/(N m)^2/s.
         energy: Of what the drives give, the sum of max(torque times rate, 0): nothing is won back by braking, 1/J.
         acceleration: Of the squared accelerations. jerk: Of the squared jerks, where they are the control.
+        fuel: Of the thrust of all thrusters, 1/(N s). It is linear: what is best is full on or off but for singular
+            arcs, so that thrusters that only switch cost no more than these, as far as the mesh resolves the switching.
+        turning: Of the squared angular velocity of a base that floats, 1/(rad/s)^2/s.
         time: Of the final time, 1/s.
 
     Raises:
@@ -98,6 +114,8 @@ class Effort:
     energy: float = 0.0
     acceleration: float = 0.0
     jerk: float = 0.0
+    fuel: float = 0.0
+    turning: float = 0.0
     time: float = 0.0
 
     def __post_init__(self) -> None:
@@ -141,9 +159,13 @@ def joint_torques(
     Args:
         machine: On a fixed base, or floating freely.
         base, joints, rates: Symbols, (base_size, 1) and (n, 1) each: of a floating machine they are differentiated.
+            Where something acts on it from outside, (pose, momentum) of the base.
         accelerations: Shape (n, 1).
         friction: In the joints. wrenches: From outside.
         gravity: Acceleration of free fall, m/s^2; None is GRAVITY on a fixed base and none for a machine that floats.
+
+    Raises:
+        ProblemError: Another machine; something acts on a floating machine whose momentum is not given.
     """
     robot = _checked_motors("joint_torques", machine).robot
     if isinstance(machine, FixedBase):
@@ -152,7 +174,7 @@ def joint_torques(
     else:
         fall = (0.0, 0.0, 0.0) if gravity is None else gravity
         twist = machine.base_twist(base, joints, rates)
-        along = ca.vertcat(machine.base_rate(base, joints, rates), rates, accelerations)
+        along = ca.vertcat(_base_rate(machine, base, joints, rates, wrenches, gravity), rates, accelerations)
         changes = ca.jtimes(twist, ca.vertcat(base, joints, rates), along)
         spatial = ca.DM.eye(6)[:, machine.twist_rows]
         found = inverse_dynamics(
@@ -169,6 +191,24 @@ def joint_torques(
     return found if friction is None else found + friction.torques(rates)
 
 
+def _base_rate(machine: Any, base: Any, joints: Any, rates: Any, wrenches: Sequence[Wrench], gravity: Any) -> Any:
+    """Rate of the configuration of the base, and of the momentum where it is given with it."""
+    pose = machine.base_rate(base, joints, rates)
+    if not isinstance(machine, FreeFloating):
+        return pose
+    if base.numel() == machine.base_size:
+        if wrenches or gravity is not None:
+            words = "what acts on a floating machine changes its momentum: give the base with it, (pose, momentum)"
+            raise ProblemError(words, name="wrenches", value=wrenches)
+        return pose
+    placement = machine.world_from_base(base)
+    outside = external_wrench(machine.robot, joints, wrenches, placement)
+    if gravity is not None:
+        weight = machine.robot.total_mass * ca.DM(floats(gravity).ravel())
+        outside += ca.vertcat(cross(center_of_mass(machine.robot, joints, placement), weight), weight)
+    return ca.vertcat(pose, machine.momentum_rate(base, joints, outside))
+
+
 @interruptible
 def dynamics_problem(
     machine: Motors,
@@ -182,17 +222,21 @@ def dynamics_problem(
     effort: Effort | None = None,
     friction: JointFriction | None = None,
     wrenches: Sequence[Wrench] = (),
+    thrusters: Sequence[Thruster] = (),
     gravity: Any = None,
     control: Literal["acceleration", "jerk"] = "acceleration",
-    start: Literal["rest", "free"] = "rest",
-    end: Literal["rest", "free"] = "rest",
+    start: Literal["rest", "free"] | Any = "rest",
+    end: Literal["rest", "free"] | Any = "rest",
+    end_base: Any = None,
+    end_momentum: Any = None,
     clear: Clear | None = None,
     symbols: Any = ca.SX,
 ) -> Problem:
     """A motion within the limits of the drives, at the least effort, energy or time.
 
-    States "joints", "velocities" (and "accelerations" where the jerk is the control), "base" of a machine that floats;
-    controls "accelerations" or "jerks" (and "power", W, what drives give, where energy costs or power is limited). Path
+    States "joints", "velocities" (and "accelerations" where the jerk is the control), "base" of a machine that floats,
+    and its "momentum" where something acts on it from outside; controls "accelerations" or "jerks" (and "power", W,
+    what drives give, where energy costs or power is limited), "thrust", N, where there are thrusters. Path
     constraints "torques", "power", and "tip" where there are tasks: the derivative of their velocities, with the gaps
     of their poses fed back, which a start that is free has to begin with.
 
@@ -206,8 +250,14 @@ def dynamics_problem(
         limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         effort: Weights of the cost; the squared torques if None.
         friction, wrenches, gravity: As of `joint_torques`.
+        thrusters: Of a machine that floats, as of `models.Thruster`.
         control: "jerk" makes accelerations continuous, zero at ends at rest.
-        start, end: Whether the joints are at rest there, or free to move.
+        start, end: Whether the joints are at rest there, or free to move; or their velocities, nan where free, shape
+            (n,): wheels that hold the momentum of a base at rest turn.
+        end_base: Configuration of a floating base at the end, nan where free; a quaternion is given whole or not at
+            all. Shape (base_size,).
+        end_momentum: Likewise, of a machine on which something acts, in the order of
+            `FreeFloating.conserved_momentum`, with which it begins. Shape (6,) or (3,).
         clear: What the motion has to stay clear of, see `ocp.builders.clearance`.
         symbols: casadi.SX, or casadi.MX when a task calls an interpolant.
 
@@ -221,10 +271,10 @@ def dynamics_problem(
     effort = Effort() if effort is None else checked_instance("dynamics_problem: effort", effort, Effort)
     if friction is not None:
         checked_instance("dynamics_problem: friction", friction, JointFriction)
-    for what, given in (("start", start), ("end", end)):
-        checked_choice(what, given, ("rest", "free"))
     checked_choice("control", control, ("acceleration", "jerk"))
     robot, n = machine.robot, machine.joint_size
+    first_rates, last_rates = (_rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
+    pushers = _checked_thrusters(machine, thrusters)
     bounds = limits.bounds(machine)
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
         words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
@@ -246,37 +296,64 @@ def dynamics_problem(
         if isinstance(horizon, FreeTime)
         else problem.horizon(duration)
     )
-    still = 0.0 if start == "rest" else None
-    last_rates = resting if end == "rest" else None
+    rests = [bool((given == 0).all()) for given in (first_rates, last_rates)]
+    if rests[1]:
+        last_rates = resting
 
     def between(order: int) -> Any:
         """The quintic from rest to rest, or a derivative of it."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         return lambda t: known * (order == 0) + (towards - known) * shape(t / duration) / duration**order
 
+    sizes = _wheel_sizes(robot, bounds, duration)
     joints = problem.state(
         "joints", n, initial=first, terminal=last, lower=bounds.lower, upper=bounds.upper, guess=between(0),
-        unit=robot.unit(),
+        unit=robot.unit(), scale=sizes[0],
     )  # fmt: skip
     rates = problem.state(
-        "velocities", n, initial=still, terminal=last_rates, lower=-bounds.velocity, upper=bounds.velocity,
-        guess=between(1), unit=robot.unit("/s"),
+        "velocities", n, initial=first_rates, terminal=last_rates, lower=-bounds.velocity, upper=bounds.velocity,
+        guess=between(1), unit=robot.unit("/s"), scale=sizes[1],
     )  # fmt: skip
-    push = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": between(2)}
+    push = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": between(2), "scale": sizes[2]}
     if control == "jerk":
-        second = problem.state("accelerations", n, initial=still, terminal=last_rates, unit=robot.unit("/s^2"), **push)
-        jerks = problem.control("jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        ends = {what: 0.0 * rate for what, rate in (("initial", first_rates), ("terminal", last_rates))}
+        second = problem.state("accelerations", n, unit=robot.unit("/s^2"), **ends, **push)
+        jerks = problem.control(
+            "jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"), scale=sizes[3]
+        )
         problem.dynamics(second, jerks)
     else:
         second = problem.control("accelerations", n, unit=robot.unit("/s^2"), **push)
         jerks = ca.DM(0, 1)
     problem.dynamics(joints, rates)
     problem.dynamics(rates, second)
-    base: Any = ca.DM(0, 1)
+    base: Any = ca.DM(0, 1)  # and the momentum below it
+    thrust: Any = ca.DM(0, 1)
+    if pushers:
+        most = np.array([each.force for each in pushers])
+        thrust = problem.control("thrust", len(pushers), lower=0.0, upper=most, guess=0.0, unit="N")
     if machine.base_size:
-        free_base = None if start_joints is None else home
-        base = problem.state("base", machine.base_size, initial=free_base, guess=home)
-        problem.dynamics(base, machine.base_rate(base, joints, rates))
+        known_base = None if start_joints is None else home
+        base = problem.state("base", machine.base_size, initial=known_base, guess=home)
+    if isinstance(machine, FreeFloating) and (pushers or wrenches or gravity is not None):
+        held = machine.conserved_momentum
+        momentum = problem.state(
+            "momentum", initial=None if start_joints is None else held, guess=held,
+            terminal=end_momentum, size=len(machine.twist_rows), unit="N m s, N s",
+        )  # fmt: skip
+        base = ca.vertcat(base, momentum)
+        frames = link_frames(robot, joints, machine.world_from_base(base))
+        wrenches = [*wrenches, *(each.wrench(frames, thrust[k]) for k, each in enumerate(pushers))]
+    elif end_momentum is not None:
+        words = "nothing acts on the machine from outside, so that its momentum stays as it is"
+        raise ProblemError(words, name="end_momentum", value=end_momentum)
+    moving = _base_rate(machine, base, joints, rates, wrenches, gravity)
+    if machine.base_size:
+        for name, place in (("base", slice(0, machine.base_size)), ("momentum", slice(machine.base_size, None))):
+            if name in problem.declared.states:
+                problem.dynamics(problem.declared.states[name].symbol, moving[place])
+    if end_base is not None:
+        _declare_end_base(problem, machine, base, end_base)
 
     torques = joint_torques(machine, base, joints, rates, second, friction=friction, wrenches=wrenches, gravity=gravity)
     limited = np.flatnonzero(np.isfinite(bounds.torque)).tolist()
@@ -284,6 +361,10 @@ def dynamics_problem(
         most = bounds.torque[limited]
         problem.path("torques", torques[limited], lower=-most, upper=most, unit=robot.effort_unit)
     running = effort.acceleration * ca.sumsqr(second) + effort.jerk * ca.sumsqr(jerks)
+    running += effort.fuel * ca.sum1(thrust)
+    if effort.turning and isinstance(machine, FreeFloating):
+        spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
+        running += effort.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
     running += ca.dot(ca.DM(_nonnegative("effort: torque", effort.torque, n)), torques**2)
     if effort.energy or np.isfinite(bounds.power).any():
         given = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
@@ -292,11 +373,11 @@ def dynamics_problem(
     if equations is not None:
         if free:
             raise ProblemError("tasks say their own time: give a horizon in s", name="horizon")
-        _declare_tasks(problem, equations, (home, first), (base, joints, rates, second), duration, start, end)
+        _declare_tasks(problem, equations, (home, first), (base, joints, rates, second, moving), duration, rests)
     if clear is not None:
         clear = checked_instance("dynamics_problem: clear", clear, Clear)
         name = "base" if machine.base_size else ""
-        clear.declare(problem, base, joints, base_name=name, horizon=None if free else duration)
+        clear.declare(problem, base[: machine.base_size], joints, base_name=name, horizon=None if free else duration)
     problem.minimize(running=running, terminal=effort.time * final)
     return problem
 
@@ -331,27 +412,84 @@ def _ends(what: str, given: Any, lower: Array, upper: Array) -> Array:
     return found
 
 
+def _wheel_sizes(robot: Robot, bounds: JointBounds, duration: float) -> Array:
+    """About how large angles, speeds, accelerations and jerks of wheels become, nan of other joints. Shape (4, n).
+
+    Rotors are light and turn fast: a fraction of what they saturate at and of what their motors give, or else what
+    1 N m s and 1 N m make of them.
+    """
+    found = np.full((4, robot.dof), np.nan)
+    for name, inertia in wheels_of(robot).items():
+        k = robot.joint_names.index(name)
+        speed, torque = bounds.velocity[k], bounds.torque[k]
+        speed = speed / 4 if np.isfinite(speed) else 1 / inertia
+        acceleration = torque / inertia / 4 if np.isfinite(torque) else 1 / inertia
+        found[:, k] = speed * duration / 4, speed, acceleration, 4 * acceleration / duration
+    return found
+
+
+def _rates_at(what: str, given: Any, n: int) -> Array:
+    """Velocities at an end, nan where free. Shape (n,)."""
+    if isinstance(given, str):
+        return np.full(n, 0.0 if checked_choice(what, given, ("rest", "free")) == "rest" else np.nan)
+    endless = np.full(n, np.inf)
+    if given is None:
+        raise ProblemError(f"{what} must be 'rest', 'free' or velocities, not None", name=what, value=given)
+    return _ends(what, given, -endless, endless)
+
+
+def _checked_thrusters(machine: Motors, thrusters: Any) -> tuple[Thruster, ...]:
+    found = checked_each("thrusters", thrusters, Thruster)
+    if found and not isinstance(machine, FreeFloating):
+        words = "thrusters push a machine that floats; this one stands on a fixed base"
+        raise ProblemError(words, name="thrusters", value=machine)
+    for each in found:
+        try:
+            machine.robot.link(each.link)
+        except ModelError as error:
+            raise ProblemError(str(error), name="thrusters", value=each.link) from error
+    return found
+
+
+def _declare_end_base(problem: Problem, machine: Motors, base: Any, given: Any) -> None:
+    """Hold the configuration of the base at the end, its attitude by three equations."""
+    if not machine.base_size:
+        raise ProblemError("a fixed base has no end_base", name="end_base", value=given)
+    endless = np.full(machine.base_size, np.inf)
+    goal = _ends("end_base", given, -endless, endless)
+    gaps = base[: machine.base_size] - goal
+    rows = np.flatnonzero(~np.isnan(goal)).tolist()
+    if machine.base_size == 7 and set(rows) & {3, 4, 5, 6}:
+        if not abs(np.linalg.norm(goal[3:]) - 1) <= 1e-9:
+            words = f"end_base has the quaternion {goal[3:].tolist()}: all of it is expected, and of unit length"
+            raise ProblemError(words, name="end_base", value=goal[3:])
+        turned = quaternion_product(ca.DM([goal[3], *(-goal[4:])]), base[3:7])
+        gaps = ca.vertcat(gaps[:3], 2 * turned[1:4])
+        rows = [row for row in rows if row < 3] + [3, 4, 5]
+    if rows:
+        problem.end("base", gaps[rows], 0.0, 0.0, unit="m, rad")
+
+
 def _declare_tasks(
     problem: Problem,
     equations: TaskEquations,
     begin: tuple[Array, Array],
-    motion: tuple[Any, Any, Any, Any],
+    motion: tuple[Any, Any, Any, Any, Any],
     duration: float,
-    start: str,
-    end: str,
+    rests: Sequence[bool],
 ) -> None:
     """Hold the tips to their tasks by their accelerations, and watch where they are."""
     home, first = begin
-    base, joints, rates, second = motion
+    base, joints, rates, second, base_rate = motion
     if not np.isnan(first).any():
         checked_tasks(equations, home, first, duration)
     check_length(equations, home, duration)
-    check_rest(equations, 0.0 if start == "rest" else None, duration if end == "rest" else None)
+    check_rest(equations, 0.0 if rests[0] else None, duration if rests[1] else None)
     targets = equations.targets(problem.time)
-    if start == "free":
+    if not rests[0]:
         residual = equations.residual(base, joints, rates, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, problem.time)
+    gap = equations.acceleration(base, joints, rates, second, problem.time, base_rate=base_rate)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, stray in equations.strays(base, joints, rates, targets).items():
         problem.watch(name, **stray)

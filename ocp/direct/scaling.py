@@ -3,7 +3,7 @@
 A solver's tolerances are absolute: they suit numbers near 1. Each variable is divided by its size, each row and the
 cost by how far they move when the variables move by theirs. Scaling is linear, so the optimum stays the same; sizes are
 powers of two, so nothing is rounded; and what lies within :data:`USUAL` of 1 is left alone, so that plans in usual
-units do not depend on it at all.
+units do not depend on it at all, but for what the problem tells the size of.
 
 Sizes are those of given ends and guesses. What has none of these takes the size that the dynamics give it, since a
 state moves by its derivative times the horizon, in the least-squares sense over all couplings (Curtis, Reid 1972), then
@@ -239,7 +239,7 @@ def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
     cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
     largest = np.where(largest > ROUNDING * largest.max(initial=0.0), largest, 1.0)
-    return Scales(_powers(by), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
+    return Scales(_told(pattern, _powers(by)), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
 def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:
@@ -262,6 +262,14 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
         i = int(np.argmax(off))
         return f"state {form.state_labels[i]} moves by {drive[i]:.1g} times its size {sizes.states[i]:.1g}"
     return ""
+
+
+def _told(pattern: Pattern, found: np.ndarray) -> np.ndarray:
+    """The sizes of variables with those, as powers of two, that the problem tells."""
+    form = pattern.form
+    told = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.fragment)
+    told[~np.isin(pattern.fragment.variable_role, ("state", "control"))] = np.nan
+    return np.where(np.isnan(told), found, np.exp2(np.round(np.log2(told))))
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:

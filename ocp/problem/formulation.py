@@ -114,6 +114,8 @@ class Formulation:
         bounds: The bound table.
         horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
         free_parameters: Which states stand still whatever is done. Shape (nx,), bool.
+        scales: What the entries of states and controls are divided by to be solved for, nan where nothing is told of
+            them. Shape (nx + nu,).
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
         ties_ends: Whether anything at the end refers to the start.
         indifferent: Whether the cost is a constant, so that every plan that meets the constraints is optimal.
@@ -167,6 +169,9 @@ class Formulation:
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
         both = ca.vertcat(self.end.expression, self.terminal)
         self.ties_ends = bool(ca.depends_on(both, ca.vertcat(self.x0, self.u0)))
+        variables = (*declared.states.values(), *declared.controls.values())
+        told = [np.full(v.size, np.nan) if v.scale is None else v.scale for v in variables]
+        self.scales = np.concatenate(told)
         self.guesses = {v.name: v.guess for v in (*declared.states.values(), *declared.controls.values())}
 
     @classmethod

@@ -304,7 +304,9 @@ class _Placed:
         if callable(guess):
             guess = None if self.guessed is None else _stretched(guess, self.guessed)
         declare = self.whole.state if kind == "state" else self.whole.control
-        return declare(self._called(variable.name), variable.size, **known, guess=guess, unit=variable.unit)
+        return declare(
+            self._called(variable.name), variable.size, **known, guess=guess, unit=variable.unit, scale=variable.scale
+        )
 
     def _constraint(self, given: Constraint, duration: Any) -> Constraint:
         parts = {part: self._column(getattr(given, part)) for part in ("lower", "upper")}

@@ -70,6 +70,7 @@ class Variable:
         initial, terminal: Values at both ends, nan where an entry is free. Shape (n, 1). States only.
         guess: A value, a function of time, or None. States and controls only.
         unit: For those who read it, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
+        scale: Sizes that solvers divide the entries by, nan where they find them. Shape (n,), or None for all nan.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Variable:
     terminal: Any = None
     guess: Guess = None
     unit: str = ""
+    scale: Any = None
 
     @property
     def size(self) -> int:
@@ -267,6 +269,7 @@ class Problem:
         upper: Value = None,
         guess: Guess = None,
         unit: str = "",
+        scale: Value = None,
     ) -> Any:
         """Declare a state and return its symbol, shape (n, 1).
 
@@ -278,9 +281,12 @@ class Problem:
             lower, upper: Bounds at every time; may be expressions of parameters.
             guess: A value, or a function ``time -> value``.
             unit: Shown beside its values, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
+            scale: About how large its entries become, by which they are divided to be solved for; nan for an entry, and
+                None for all, leaves that to what is given: numbers that are usual are left alone then. For entries
+                of one vector that differ by orders of magnitude, as the speeds of a rotor and of an arm.
         """
         what, given = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
-        variable = self._variable("state", name, size, given, guess, unit)
+        variable = self._variable("state", name, size, given, guess, unit, scale)
         low, high = constant(variable.lower), constant(variable.upper)
         ends = {label: self._column(f"{what}: {label}", given[label], variable.size, np.nan) for label in ENDS}
         for label, value in ends.items():
@@ -298,10 +304,11 @@ class Problem:
         upper: Value = None,
         guess: Guess = None,
         unit: str = "",
+        scale: Value = None,
     ) -> Any:
         """Declare a control and return its symbol, shape (n, 1). Arguments as for :meth:`state`."""
         bounds = {"lower": lower, "upper": upper}
-        self.declared.controls[name] = self._variable("control", name, size, bounds, guess, unit)
+        self.declared.controls[name] = self._variable("control", name, size, bounds, guess, unit, scale)
         return self.declared.controls[name].symbol
 
     @_about_its_name
@@ -562,7 +569,7 @@ class Problem:
     # ---- checks ----------------------------------------------------------------------------------------------
 
     def _variable(
-        self, kind: str, name: str, size: int | None, given: dict[str, Value], guess: Guess, unit: str
+        self, kind: str, name: str, size: int | None, given: dict[str, Value], guess: Guess, unit: str, scale: Value
     ) -> Variable:
         what = f"{kind} {name!r}"
         checked_text(f"{what}: unit", unit)
@@ -576,7 +583,18 @@ class Problem:
                 raise ProblemError(
                     f"{what}: guess has {array.size} entries, {size} expected", value=array.size, limit=size
                 )
-        return Variable(name, symbol, low, high, guess=guess, unit=unit)
+        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=self._scale(what, scale, size))
+
+    @staticmethod
+    def _scale(what: str, given: Value, size: int) -> Any:
+        """Sizes of the entries, nan where none is told. Shape (size,), or None."""
+        if given is None:
+            return None
+        array = numeric(f"{what}: scale", given)
+        if array.size not in (1, size) or not (np.isnan(array) | (np.isfinite(array) & (array > 0))).all():
+            words = f"{what}: scale must be positive, one number or {size}, nan where none is told, not {given!r}"
+            raise ProblemError(words, value=given, limit=size)
+        return np.array(np.broadcast_to(array.ravel(), size))
 
     def _horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
         if self.declared.horizon is not None:

@@ -194,7 +194,15 @@ class TaskEquations:
         return np.array(found, dtype=bool)
 
     def acceleration(
-        self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
+        self,
+        base: Any,
+        joints: Any,
+        rates: Any,
+        second: Any,
+        time: Any,
+        pace: Any = 1,
+        change: Any = 0,
+        base_rate: Any = None,
     ) -> Any:
         """J u' - c, by differentiating `residual` along the motion, with the feedback of its own. Shape (size, 1).
 
@@ -205,11 +213,13 @@ class TaskEquations:
             second: Joint accelerations u', (joint_size, 1).
             time, pace: As of `targets`; a pace other than 1 is a symbol too.
             change: Rate of the pace, 1/s^2.
+            base_rate: Of the base, where it is not the machine's alone: of (pose, momentum).
         """
         residual = self.residual(base, joints, rates, self.targets(time, pace))
         at, moving = [joints, rates, time], [rates, second, 1]
         if self.machine.base_size:
-            at, moving = [base, *at], [self.machine.base_rate(base, joints, rates), *moving]
+            change_of_base = self.machine.base_rate(base, joints, rates) if base_rate is None else base_rate
+            at, moving = [base, *at], [change_of_base, *moving]
         if isinstance(pace, ca.SX | ca.MX):
             at, moving = [*at, pace], [*moving[:-1], pace, change]
         gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])

@@ -19,11 +19,14 @@ from models import (
     Standing,
     Support,
     Surroundings,
+    Thruster,
     footprint,
     planar_chain,
     rectangle,
     scara_along,
     smooth,
+    wheels_of,
+    with_wheels,
 )
 from models.machines.machine import with_tip
 from models.machines.standing import tip_spring
@@ -34,6 +37,8 @@ from tests.bad_values import (
     FLAG,
     INF,
     INSTANCE,
+    LIMIT,
+    NAME,
     NONNEGATIVE,
     NOTHING,
     POSITIVE,
@@ -160,6 +165,7 @@ FLOATING_CASES = [
     method(
         floating, "momentum", {**MOVING, "base_twist": [0, 0, 1]}, **PLACED, joint_rates=array(2), base_twist=array(3)
     ),
+    method(floating, "momentum_rate", {**AT, "wrench": np.ones(6)}, **PLACED, wrench=array(6)),
     method(
         floating,
         "momentum_residual",
@@ -167,6 +173,31 @@ FLOATING_CASES = [
         **PLACED,
         joint_rates=array(2),
         base_rate=array(3),
+    ),
+]
+ACTUATOR_CASES = [
+    Case(
+        "with_wheels",
+        with_wheels,
+        {"robot": CHAIN, "axes": np.eye(3), "inertia": 0.02},
+        {
+            "robot": INSTANCE,
+            "axes": but(array(3, 3), "wrong shape") | {"of two": np.eye(2), "zero": np.zeros((3, 3))},
+            "inertia": POSITIVE,
+            "momentum": LIMIT,
+            "torque": LIMIT,
+            "mass": NONNEGATIVE,
+            "translations": array(3, 3),
+            "link": but(UNKNOWN, "None"),
+            "prefix": but(NAME, "empty"),
+        },
+    ),
+    Case("wheels_of", wheels_of, {"robot": CHAIN}, {"robot": INSTANCE}),
+    Case(
+        "Thruster",
+        Thruster,
+        {"link": "hull", "direction": (1, 0, 0), "force": 2.0},
+        {"link": NAME, "direction": array(3) | {"zero": (0, 0, 0)}, "force": POSITIVE, "point": array(3)},
     ),
 ]
 STANDING_CASES = [
@@ -276,7 +307,7 @@ SCARA_CASES = [
         {"scara": INSTANCE, "path": INSTANCE, "elbow": CHOICE, "clearance": NONNEGATIVE | NOTHING},
     ),
 ]
-CASES = [*BOLTED_CASES, *FLOATING_CASES, *STANDING_CASES, *SCARA_CASES]
+CASES = [*BOLTED_CASES, *FLOATING_CASES, *ACTUATOR_CASES, *STANDING_CASES, *SCARA_CASES]
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))

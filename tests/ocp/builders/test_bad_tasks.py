@@ -8,7 +8,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Link, Standing, planar_chain, rectangle, reference_rig, reference_tunnel
+from models import (
+    FixedBase,
+    FreeFloating,
+    Link,
+    Standing,
+    Thruster,
+    planar_chain,
+    rectangle,
+    reference_rig,
+    reference_tunnel,
+)
 from ocp import (
     Collocation,
     Effort,
@@ -69,6 +79,10 @@ CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia
 ARM = FixedBase(CHAIN)
 UPRIGHT = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]
 STANDING = Standing(CHAIN, rotation=UPRIGHT, support=rectangle((-0.3, 0.3), (-0.3, 0.3)))
+FLOATING = FreeFloating(
+    planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0], base=Link("hub", 9.0, (0, 0, 0), np.eye(3))), "planar"
+)
+THRUSTER = Thruster("hub", (1, 0, 0), 1.0)
 UP = [1.4, 0.3, 0.3]
 REACHED = np.array(ca.DM(ARM.tip_pose((), START).position)).ravel()
 FORWARD = TipTask(velocity=[0.1, 0.0], rows=(3, 4))
@@ -418,6 +432,8 @@ DYNAMICS = [
             "energy": NONNEGATIVE,
             "acceleration": NONNEGATIVE,
             "jerk": NONNEGATIVE,
+            "fuel": NONNEGATIVE,
+            "turning": NONNEGATIVE,
             "time": NONNEGATIVE,
         },
     ),
@@ -438,6 +454,18 @@ DYNAMICS = [
             "end": CHOICE,
             "clear": but(INSTANCE, "None"),
             "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "dynamics_problem of a floating machine",
+        dynamics_problem,
+        {"machine": FLOATING, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "thrusters": [THRUSTER]},
+        {
+            "thrusters": SEQUENCE | {"nowhere": [Thruster("nowhere", (1, 0, 0), 1.0)]},
+            "start": but(array(3), "nan"),
+            "end": but(array(3), "nan"),
+            "end_base": but(array(3), "nan"),
+            "end_momentum": but(array(3), "nan"),
         },
     ),
     Case(

@@ -141,6 +141,7 @@ DECLARATIONS = [
         lower=BOUND | {"inf": INF},
         upper=BOUND | {"minus inf": -INF},
         guess=GUESS,
+        scale=but(POSITIVE, "nan") | {"of two": [1.0, 2.0]},
         unit=UNIT,
     ),
     about_blank(

@@ -1,0 +1,169 @@
+"""What turns and pushes a spacecraft: reaction wheels, which keep its momentum, and thrusters, which change it.
+
+A reaction wheel is a joint as any other: a rotor turns about an axis of the link that carries it, its motor's torque is
+the limit of the joint's effort, and the momentum at which it saturates, h = I w, that of the joint's speed w. So
+momentum, torques and limits follow from the robot, for FreeFloating machines and in every problem. The rotor is
+symmetric: where it stands does not matter, and its angle winds on.
+
+A thruster is a wrench from outside, fixed in its link, between nothing and what it gives at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from models.arrays import (
+    Array,
+    ArrayInput,
+    checked_array,
+    checked_instance,
+    checked_name,
+    checked_nonnegative,
+    checked_text,
+    one_for_each,
+)
+from models.errors import ModelError
+from models.robot.dynamics import Wrench
+from models.robot.parts import Joint, Link
+from models.robot.robot import Robot
+from models.spatial import Expression, Frame
+
+ACROSS = 0.6
+"""Of the moment of a rotor about its axis; of a thin ring it is a half."""
+SYMMETRY = 1e-9
+"""Relative: of the moments and of the place of the mass of a body whose angle does not matter."""
+
+
+def with_wheels(
+    robot: Robot,
+    axes: ArrayInput,
+    inertia: ArrayInput,
+    *,
+    momentum: ArrayInput = np.inf,
+    torque: ArrayInput = np.inf,
+    mass: ArrayInput = 0.0,
+    translations: ArrayInput | None = None,
+    link: str | None = None,
+    prefix: str = "wheel",
+) -> Robot:
+    """The robot with reaction wheels, whose joints "wheel1", ... come last; its tip stays.
+
+    Args:
+        axes: Of the wheels, in the link that carries them; of any length but zero. Shape (k, 3).
+        inertia: Of each rotor about its axis, one number or (k,), kg m^2. It is a disc: ACROSS of it across. The
+            carrier's own mass and inertia are those without the rotors.
+        momentum: At which each saturates, relative to the carrier, one number or (k,), N m s. The joint's speed limit
+            is this over the inertia.
+        torque: Of each motor at most, one number or (k,), N m.
+        mass: Of each rotor, one number or (k,), kg.
+        translations: Places of the rotors in the link. Shape (k, 3), m; its origin if None.
+        link: That carries them; the root if None.
+        prefix: Of the names of joints, and with "_rotor" of links.
+
+    Raises:
+        ModelError: Sizes that differ, an axis of no length, numbers that are not positive, names that are taken.
+    """
+    owner = "reaction wheels"
+    robot = checked_instance(robot, Robot, owner, "robot")
+    along = checked_array(axes, ("wheels", 3), owner, "axes")
+    count = len(along)
+    checked_text(prefix, owner, "prefix")
+    carrier = robot.root if link is None else robot.link(link).name
+    moments = one_for_each(inertia, count, owner, "inertia", "wheels", positive=True)
+    fastest = one_for_each(momentum, count, owner, "momentum", "wheels", finite=False, positive=True) / moments
+    most = one_for_each(torque, count, owner, "torque", "wheels", finite=False, positive=True)
+    masses = one_for_each(mass, count, owner, "mass", "wheels", least=0)
+    places = np.zeros((count, 3)) if translations is None else translations
+    places = checked_array(places, (count, 3), owner, "translations")
+    links, joints = [*robot.links], [*robot.joints]
+    for k in range(count):
+        name = f"{prefix}{k + 1}"
+        across = _across(along[k], name)
+        disc = moments[k] * (ACROSS * across + (np.eye(3) - across))
+        links.append(Link(f"{name}_rotor", masses[k], (0.0, 0.0, 0.0), disc))
+        joint = Joint(name, "continuous", carrier, f"{name}_rotor", places[k], axis=along[k])
+        joints.append(replace(joint, velocity=float(fastest[k]), effort=float(most[k])))
+    return replace(robot, links=tuple(links), joints=tuple(joints))
+
+
+def _across(axis: Array, name: str) -> Array:
+    """What is left of a vector across an axis, as a matrix. Shape (3, 3)."""
+    length = np.linalg.norm(axis)
+    if not length > 0:
+        message = f"reaction wheels: axis {axis.tolist()} of {name!r} has no direction"
+        raise ModelError(message, name="axes", value=axis)
+    unit = axis / length
+    return np.asarray(np.eye(3) - np.outer(unit, unit))
+
+
+def wheels_of(robot: Robot) -> dict[str, float]:
+    """Joints whose angle does not matter, and the inertia about each, kg m^2.
+
+    Each turns without end one body alone, symmetric about its axis, on which its mass is; that carries neither the tip
+    nor a shape that could touch anything.
+    """
+    robot = checked_instance(robot, Robot, "wheels", "robot")
+    carrying = {joint.parent for joint in robot.joints} | {robot.tip}
+    followed = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    found = {}
+    for joint in robot.moving_joints:
+        body = robot.link(joint.child)
+        if joint.kind == "prismatic" or np.isfinite([joint.lower, joint.upper]).any():
+            continue
+        if body.name in carrying or body.collisions or joint.name in followed:
+            continue
+        axis, inertia = np.asarray(joint.axis), np.asarray(body.inertia)
+        about = float(axis @ inertia @ axis)
+        across = np.eye(3) - np.outer(axis, axis)
+        ring = about * np.outer(axis, axis) + across * np.trace(across @ inertia) / 2
+        away = np.linalg.norm(across @ np.asarray(body.center_of_mass))
+        if about > 0 and np.abs(inertia - ring).max() <= SYMMETRY * about and away**2 * body.mass <= SYMMETRY * about:
+            found[joint.name] = about
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Thruster:
+    """A force fixed in a link, in one direction alone, from nothing to what it gives at most.
+
+    Attributes:
+        link: Name of the link that carries it.
+        direction: Of the force on the link, in the link's frame; stored with unit length. Shape (3,).
+        force: At most, N.
+        point: Where the force acts, in the link's frame. Shape (3,), m.
+
+    Raises:
+        ModelError: No direction, a force that is not positive, wrong sizes.
+    """
+
+    link: str
+    direction: ArrayInput
+    force: float
+    point: ArrayInput = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        owner = f"thruster on link {checked_name(self.link, 'thruster', 'link')!r}"
+        direction = checked_array(self.direction, (3,), owner, "direction")
+        length = float(np.linalg.norm(direction))
+        if not length > 0:
+            raise ModelError(f"{owner}: direction {direction.tolist()} is none", name="direction", value=direction)
+        force = checked_nonnegative(self.force, owner, "force", "N")
+        if not force > 0:
+            raise ModelError(f"{owner}: force must be positive, not {force}", name="force", value=force, limit=0.0)
+        object.__setattr__(self, "direction", checked_array(direction / length, (3,), owner, "direction"))
+        object.__setattr__(self, "force", force)
+        object.__setattr__(self, "point", checked_array(self.point, (3,), owner, "point"))
+
+    def wrench(self, frames: Mapping[str, Frame], thrust: Expression) -> Wrench:
+        """What it does to its link.
+
+        Args:
+            frames: Of the links in the world, by name, as of `link_frames`.
+            thrust: N. Shape (1, 1).
+        """
+        along = ca.mtimes(frames[self.link].rotation, ca.DM(np.asarray(self.direction)))
+        return Wrench(self.link, along * thrust, point=self.point)

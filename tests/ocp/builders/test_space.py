@@ -1,0 +1,211 @@
+"""Spacecraft planned by what drives them: closed forms of wheels and thrusters, attitudes, momentum that changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FreeFloating, Link, Robot, Thruster, Wrench, mass_matrix, planar_chain, with_wheels
+from models.machines.machine import with_tip
+from models.robot.dynamics import external_wrench
+from models.spatial import quaternion_about
+from ocp import (
+    Collocation,
+    Effort,
+    ProblemError,
+    Solution,
+    TipTask,
+    dynamics_problem,
+    joint_torques,
+    minimum_velocity_problem,
+    solve,
+)
+from tests.models.machines.test_actuators import satellite, state, wheeled
+from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+from tests.models.robot.trees import Array
+
+nan = np.nan
+SHORT = Collocation(6, 4)
+MASS, INERTIA, ROTOR = 50.0, 4.0, 0.05
+
+
+def hub() -> FreeFloating:
+    """A body with one wheel, in the plane."""
+    body = Link("hub", MASS, (0, 0, 0), np.diag([3.0, 3.0, INERTIA]))
+    return FreeFloating(with_wheels(Robot((body,), ()), [[0, 0, 1]], ROTOR, momentum=9.0), "planar")
+
+
+def body(momentum: Array | None = None) -> FreeFloating:
+    """A body with three wheels."""
+    link = Link("hub", 80.0, (0, 0, 0), np.diag([9.0, 12.0, 15.0]))
+    return FreeFloating(with_wheels(Robot((link,), ()), np.eye(3), 0.02), conserved_momentum=momentum)
+
+
+# ---- closed forms ------------------------------------------------------------------------------------------------
+
+
+def test_a_wheel_turns_its_carrier_at_the_least_effort_that_is_known() -> None:
+    """The motor turns the carrier alone: 12 J^2 a^2 / T^3, whatever the rotor; the rotor winds on the other way."""
+    machine, angle, horizon = hub(), 0.7, 5.0
+    problem = dynamics_problem(machine, [0.0], horizon, end_base=[nan, nan, angle])
+    plan = solve(problem, Collocation(8, 4))
+    assert plan.cost == pytest.approx(12 * INERTIA**2 * angle**2 / horizon**3, rel=1e-8)
+    assert plan["joints"][-1, 0] == pytest.approx(-angle * (INERTIA + ROTOR) / ROTOR, rel=1e-8)
+    assert plan["base"][-1] == pytest.approx([0.0, 0.0, angle], abs=1e-10)
+    assert plan.audit().passed
+
+
+def test_thrusters_burn_coast_and_brake() -> None:
+    """From rest to rest over d in T: both burns take t, (F / m) t (T - t) = d; least fuel is 2 F t, full on and off."""
+    machine, force, way, horizon = hub(), 5.0, 2.775, 20.0
+    thrusters = [Thruster("hub", (1, 0, 0), force), Thruster("hub", (-1, 0, 0), force)]
+    problem = dynamics_problem(
+        machine, [0.0], horizon, end_base=[way, 0.0, 0.0], end_momentum=np.zeros(3), thrusters=thrusters,
+        effort=Effort(torque=1e-3, fuel=1.0),
+    )  # fmt: skip
+    plan = solve(problem, Collocation(40, 2))
+    burn = (horizon - np.sqrt(horizon**2 - 4 * way * MASS / force)) / 2
+    least = 2 * force * burn
+    assert burn == pytest.approx(1.5)  # three intervals
+    assert plan.cost == pytest.approx(least, rel=1e-5)
+    assert plan["momentum"][:, 1].max() == pytest.approx(force * burn, rel=1e-4)
+    assert np.abs(plan["momentum"][:, [0, 2]]).max() < 1e-6
+    assert plan["thrust"].max() <= force * (1 + 1e-6)
+
+
+def test_momentum_that_is_given_is_kept_by_wheels() -> None:
+    """A base that tumbles is stopped by its wheels, which then hold the momentum; nothing else has it."""
+    momentum = np.array([1.0, -2.0, 1.5, 0.0, 0.0, 0.0])
+    machine = body(momentum)
+    horizon = 30.0
+    problem = dynamics_problem(machine, np.zeros(3), horizon, start=np.zeros(3), end="free")
+    states = {name: v.symbol for name, v in problem.declared.states.items()}
+    problem.end("spin", machine.base_twist(states["base"], states["joints"], states["velocities"])[:3], 0, 0)
+    plan = solve(problem, Collocation(8, 4))
+    turn = np.array(ca.DM(machine.world_from_base(plan["base"][-1]).rotation))
+    assert turn @ (0.02 * plan["velocities"][-1]) == pytest.approx(momentum[:3], abs=1e-7)
+    assert plan.audit().feasible
+
+
+# ---- laws ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_the_drives_give_is_kinetic_energy() -> None:
+    """Power of motors and of what pushes is the rate of the energy of joints and base together, in any motion."""
+    machine = FreeFloating(wheeled(2))
+    n = machine.joint_size
+    push = Wrench("arm1_link1", (0.5, 2.0, -1.0), (0.3, 0.1, -0.4), (0.4, 0.0, 0.1))
+    b, q, v, a = (ca.SX.sym("z", size) for size in (13, n, n, n))
+    twist = machine.base_twist(b, q, v)
+    locked, coupled = machine.momentum_matrices(b, q)
+    at_origin = ca.vertcat(twist[:3], twist[3:] - ca.cross(twist[:3], b[:3]))
+    energy = ca.dot(v, ca.mtimes(mass_matrix(machine.robot, q), v)) + ca.dot(at_origin, ca.mtimes(locked, twist))
+    energy = energy / 2 + ca.dot(at_origin, ca.mtimes(coupled, v))
+    outside = external_wrench(machine.robot, q, [push], machine.world_from_base(b))
+    moving = ca.vertcat(machine.base_rate(b, q, v), machine.momentum_rate(b, q, outside), v, a)
+    rate = ca.jtimes(energy, ca.vertcat(b, q, v), moving)
+    carrier = with_tip(machine, push.link, np.array(push.point).ravel())
+    power = ca.dot(joint_torques(machine, b, q, v, a, wrenches=[push]), v)
+    power += ca.dot(ca.vertcat(push.moment, push.force), carrier.tip_twist(b, q, v))
+    both = ca.Function("both", [b, q, v, a], [rate, power])
+    for seed in range(5):
+        pose, joints, rates, accelerations = state(machine, seed)
+        momentum = np.random.default_rng(seed).normal(size=6)
+        found, given = (float(value) for value in both(np.concatenate([pose, momentum]), joints, rates, accelerations))
+        assert found == pytest.approx(given, rel=1e-9, abs=1e-9)
+
+
+def turned(plan: Solution) -> float:
+    """Largest angle by which the base turns, between the nodes too, rad."""
+    fine = plan.at_fraction(np.linspace(0, 1, 2001))["base"][:, 3:]
+    return float((2 * np.linalg.norm(fine[:, 1:], axis=1) / np.linalg.norm(fine, axis=1)).max())
+
+
+def along(start: Array, shift: Any) -> Any:
+    """A line from rest to rest in 20 s."""
+
+    def where(t: Any) -> Any:
+        s = t / 20.0
+        return ca.DM(start) + (10 * s**3 - 15 * s**4 + 6 * s**5) * ca.DM(shift)
+
+    return where
+
+
+def null_space(machine: FreeFloating, start: Array, shift: Any, method: Collocation) -> None:
+    """The tip runs along a line, and the base does not turn."""
+    at = np.array(ca.DM(machine.tip_pose(machine.base_home(), start).position)).ravel()
+    reach = TipTask(position=along(at[: len(shift)], shift), rows=(3, 4, 5)[: len(shift)])
+    still = TipTask(link=machine.robot.root, rows=(0, 1, 2), velocity=np.zeros(3))
+    held = solve(minimum_velocity_problem(machine, task=[reach, still], start_joints=start, horizon=20.0), method)
+    assert turned(held) < 1e-9
+    end = np.array(ca.DM(machine.tip_pose(held["base"][-1], held["joints"][-1]).position)).ravel()
+    assert end[: len(shift)] == pytest.approx(at[: len(shift)] + shift, abs=1e-4)
+    assert held.audit().feasible
+
+
+def test_two_arms_work_and_the_base_does_not_turn() -> None:
+    """Reaction null space, 20 s: two rows of the tip and the attitude of the base, for six joints."""
+    null_space(
+        FreeFloating(satellite(2)), np.array([0.4, -0.5, 0.9, -0.3, 0.6, -0.8]), [-0.05, 0.1], Collocation(12, 6)
+    )
+
+
+@pytest.mark.long
+def test_an_arm_of_seven_joints_works_and_the_base_does_not_turn() -> None:
+    owner, ending, told = ROBOTS["floating manipulator"]
+    machine = FreeFloating(Robot.from_urdf(urdf_file(owner, ending), **told))
+    start = np.array([0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4])
+    null_space(machine, start, [0.1, 0.25, -0.1], Collocation(40, 4))
+
+
+@pytest.mark.long
+def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
+    """The attitude as a task of the base, by torques, through 20 s."""
+    machine = FreeFloating(wheeled(1))
+    start, goal = [0.2, -0.4, 0.9, *[0.0] * 4], [0.9, 0.3, 0.1, *[nan] * 4]
+    attitude = TipTask(link="hub", orientation=(1.0, 0.0, 0.0, 0.0))
+    asked: dict[str, Any] = {"end_joints": goal, "end": [0.0] * 3 + [nan] * 4}
+    held = solve(dynamics_problem(machine, start, 20.0, tasks=attitude, **asked), Collocation(20, 5))
+    assert turned(held) < 1e-9
+    assert held.audit().feasible
+
+
+def test_turning_that_costs_is_less() -> None:
+    chain = planar_chain([0.8, 0.6], [4.0, 3.0], base=Link("hub", 40.0, (0, 0, 0), 4.0 * np.eye(3)))
+    machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.02), "planar")
+    asked: dict[str, Any] = {"end_joints": [1.2, 0.3, nan], "end": [0.0, 0.0, nan]}
+
+    def most(effort: Effort | None) -> float:
+        plan = solve(dynamics_problem(machine, [0.2, -0.9, 0.0], 10.0, effort=effort, **asked), SHORT)
+        return float(np.abs(plan["base"][:, 2]).max())
+
+    assert most(Effort(turning=1e4)) < 0.1 * most(None)
+
+
+def test_an_attitude_is_held_at_the_end_whatever_the_sign_of_its_quaternion() -> None:
+    machine = body()
+    goal = np.array(ca.DM(quaternion_about((0.6, 0.0, 0.8), 0.4))).ravel()
+    plans = []
+    for sign in (1.0, -1.0):
+        problem = dynamics_problem(machine, np.zeros(3), 20.0, end_base=[nan, nan, nan, *(sign * goal)])
+        plans.append(solve(problem, SHORT))
+    for plan in plans:
+        assert plan["base"][-1, 3:] == pytest.approx(goal, abs=1e-8)
+    assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-8)
+
+
+def test_what_does_not_fit_a_spacecraft_is_refused_by_name() -> None:
+    machine = hub()
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"end_momentum": np.zeros(3)}, "end_momentum"),
+        ({"end_base": [0.0, 0.0]}, "end_base"),
+        ({"thrusters": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
+        ({"start": [0.0, 1.0]}, "start"),
+    ]
+    for told, name in wrong:
+        with pytest.raises(ProblemError) as caught:
+            dynamics_problem(machine, [0.0], 5.0, **told)
+        assert caught.value.name == name
