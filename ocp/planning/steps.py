@@ -52,6 +52,11 @@ class Values(NamedTuple):
         """Some of them."""
         return Values(*(part[chosen] for part in self))
 
+    def at(self, places: Array) -> Array:
+        """Values (N,) at places (N, r)."""
+        pressed = np.einsum("nab,nb->na", self.curve, places)
+        return np.asarray(self.least + (places * (self.slope + pressed / 2)).sum(axis=1))
+
 
 class Sheets(NamedTuple):
     """Charts, and how the set that they touch bends away from them: bends[t, t] / 2 + rest.

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,15 +141,24 @@ class Graph:
         r = here.tangents.shape[2]
         seconds = float(self.seconds[min(k, other)])
         found = Values(np.full(len(here), np.inf), np.zeros((len(here), r)), np.zeros((len(here), r, r)))
+        # steps that are nowhere the cheapest from their chart are left out: seen from far, then by their tangents
+        here_spans, there_spans = here.spans, there.spans
+        place = np.clip(0.0, there.low, there.high)
+        lowest, middle = self.least(after, other), after.at(place)
         for i, j in self.steps(k, other):
             alive = np.isfinite(after.least[j])
             i, j = i[alive], j[alive]
             if not i.size:
                 continue
             delta = self.space.difference(there.centers[j], here.centers[i])
+            way, span = np.abs(delta), here_spans[i] + there_spans[j]
+            low = self.cost.of(np.maximum(way - span, 0.0), seconds) + lowest[j]
+            high = self.cost.of(way + span, seconds) + middle[j]
+            near = low <= _least_of_groups(high, i)
+            i, j, delta = i[near], j[near], delta[near]
             steps = self.cost.below(delta, self.sheets[k].of(i), self.sheets[other].of(j), after.of(j), seconds)
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _below_all(steps, here.of(i), starts)
+            parts = _below_all(*_lowest(steps, here.of(i), starts))
             for whole, part in zip(found, parts, strict=True):
                 whole[i[starts]] = part
         return found
@@ -162,6 +172,38 @@ class Graph:
         """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
         both = Values(*(one + other for one, other in zip(passed[k], to_come[k], strict=True)))
         return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
+
+
+def _least_of_groups(values: Array, group: Indices) -> Array:
+    """Of values whose groups are together, the least of the group, for each. Shape (P,)."""
+    starts = np.flatnonzero(np.diff(group, prepend=-1))
+    return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
+
+
+def _lowest(steps: Steps, own: Charts, starts: Indices) -> tuple[Steps, Charts, Indices]:
+    """Of steps as of `_below_all` those that are not above another one from the same chart in its whole box.
+
+    A tangent less what bends it down is concave, and a step's bound, but for what bends it down, lies below what is
+    interpolated from corner to corner: where the one is above the other at all corners it is so everywhere.
+    """
+    r = own.tangents.shape[2]
+    count = np.diff(np.append(starts, len(own)))
+    if not r or len(own) == len(starts):
+        return steps, own, starts
+    group = np.repeat(np.arange(len(starts)), count)
+    middle, half = (own.low + own.high) / 2, (own.high - own.low) / 2
+    value, slope = steps.at(middle)
+    best = np.lexsort((value, group))[starts]
+    down = np.minimum(lowest_curvature(steps.curve), 0.0) / 2 * (half**2).sum(axis=1)
+    known = steps.of(best)
+    above = np.ones(len(own), dtype=bool)
+    for signs in product((-1.0, 1.0), repeat=r):
+        corner = half * np.array(signs)
+        there = known.at(middle[best] + corner[best])[0] - down[best]
+        above &= value + (slope * corner).sum(axis=1) + down >= there[group]
+    above[best] = False
+    kept = np.flatnonzero(~above)
+    return steps.of(kept), own.of(kept), np.flatnonzero(np.diff(group[kept], prepend=-1))
 
 
 def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:

@@ -203,6 +203,7 @@ class _Ways:
         targets[:, :3] = places
         targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)
         self.sets = SelfMotions(self.space, equations, targets)
+        self._known = dict[int, Array]()
         if not 0 <= self.sets.size <= FREE:
             words = f"{machine.robot.name}: {machine.joint_size} joints for the {equations.size} rows of a pose"
             words += f"; hold joints until at most {FREE} are left over"
@@ -356,7 +357,12 @@ class _Ways:
         return TipTask(position=self.places[number], orientation=self.turns[number])
 
     def _seeds(self, number: int) -> Array:
-        """Postures at a waypoint."""
+        """Postures at a waypoint, looked for once."""
+        if number not in self._known:
+            self._known[number] = self._sought(number)
+        return self._known[number]
+
+    def _sought(self, number: int) -> Array:
         options: dict[str, Any] = {"seed": self.seed + number, "limits": self.kept, "starts": STARTS}
         listed = self.sets.listed(number)
         try:

@@ -15,6 +15,7 @@ from ocp import TipTask, inverse_kinematics
 from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions, _rim
 from ocp.planning.search import Search
 from ocp.planning.steps import Largest, Length, Sheets, Squares, StepCost, Values, least_in_box
+from ocp.planning.value import _lowest
 from ocp.tasks.equations import bind
 from tests.ocp.planning.test_charts import planar
 
@@ -102,6 +103,15 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
 
 
+def flat_charts(rng: np.random.Generator, count: int, scale: Array, free: int, half: float) -> Charts:
+    """Charts of sets that lie flat, their boxes cut at random."""
+    n = len(scale)
+    ways = np.linalg.qr(rng.normal(size=(count, n, free)))[0] / scale[:, None]
+    ends = rng.uniform(0.0, half, (2, count, free))
+    flat, none = np.zeros((count, len(_rim(free)), n)), np.zeros(count, dtype=np.intp)
+    return Charts(none, np.zeros((count, n)), ways, np.full(count, half), -ends[0], ends[1], flat)
+
+
 @pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
 def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free: int) -> None:
     rng = np.random.default_rng(3)
@@ -109,16 +119,7 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     weights = rng.uniform(0.5, 2.0, n)
     cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
 
-    def charts() -> Charts:
-        """That lie flat."""
-        ways = np.linalg.qr(rng.normal(size=(count, n, free)))[0] / scale[:, None]
-        ends = rng.uniform(0.0, half, (2, count, free))
-        flat = np.zeros((count, len(_rim(free)), n))
-        return Charts(
-            np.zeros(count, dtype=np.intp), np.zeros((count, n)), ways, np.full(count, half), -ends[0], ends[1], flat
-        )
-
-    out, into = charts(), charts()
+    out, into = (flat_charts(rng, count, scale, free, half) for _ in range(2))
     curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
     after = Values(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
     delta = 0.3 * rng.normal(size=(count, n))
@@ -148,6 +149,47 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     near = somewhere()
     lower = steps.lower(near, np.zeros((count, free)), np.zeros((count, free, free)))
     assert (steps.at(lower)[0] <= steps.at(near)[0] + 1e-9).all()
+
+
+@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+def test_steps_that_are_left_out_are_nowhere_the_cheapest(kind: Any, free: int) -> None:
+    rng = np.random.default_rng(7)
+    groups, each, n, seconds, half = 12, 40, 4, 0.7, 0.2
+    count = groups * each
+    weights = rng.uniform(0.5, 2.0, n)
+    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
+    out = flat_charts(rng, groups, scale, free, half).of(np.repeat(np.arange(groups), each))
+    into = flat_charts(rng, count, scale, free, half)
+    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
+    after = Values(rng.normal(size=count) / 5, rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
+    delta = 0.3 * rng.normal(size=(count, n))
+    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    kept, own, starts = _lowest(steps, out, np.arange(0, count, each))
+    assert len(own) < count / 2
+    assert len(starts) == groups
+    for share in rng.uniform(size=(50, groups, free)):
+        place = out.low + (out.high - out.low) * np.repeat(share, each, axis=0)
+        least = steps.at(place)[0].reshape(groups, each).min(axis=1)
+        lengths = np.diff(np.append(starts, len(own)))
+        left = own.low + (own.high - own.low) * np.repeat(share, lengths, axis=0)
+        assert np.minimum.reduceat(kept.at(left)[0], starts) == pytest.approx(least, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Squares, Length])
+def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All steps to every chart that limits allow, beside those that are thought to be worth it."""
+    machine, _, places, weights = random_case(4)
+    search = search_of(machine, places, kind(weights))
+    graph = search.whole_graph()
+    some = [graph.to_come(), graph.passed()]
+    monkeypatch.setattr("ocp.planning.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
+    monkeypatch.setattr("ocp.planning.value._lowest", lambda *steps: steps)
+    whole = [graph.to_come(), graph.passed()]
+    for k in range(INSTANTS):
+        for few, every in zip(some, whole, strict=True):
+            assert graph.least(few[k], k) == pytest.approx(graph.least(every[k], k), rel=0.02, abs=1e-9)
+    low = [float(graph.least(each[0][0], 0).min()) for each in (some, whole)]
+    assert low[0] >= low[1] * (1 - 1e-9)
 
 
 @pytest.mark.parametrize("free", [1, 2])
