@@ -5,7 +5,9 @@ from ocp.audit.certificate import Certificate
 from ocp.builders.clearance import Clear
 from ocp.builders.cts import roll_problem, spline_targets
 from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem, joint_torques
+from ocp.builders.dynamics_plan import plan_dynamics
 from ocp.builders.joint_spline import joint_path
+from ocp.builders.legs import Leg, dynamics_phases
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
 from ocp.builders.standing.plan import plan_standing
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
@@ -50,6 +52,7 @@ __all__ = [
     "Indirect",
     "JointFriction",
     "Layer",
+    "Leg",
     "Limits",
     "MultipleShooting",
     "Phases",
@@ -67,6 +70,7 @@ __all__ = [
     "WaypointPlan",
     "Weights",
     "certificate",
+    "dynamics_phases",
     "dynamics_problem",
     "inverse_kinematics",
     "joint_path",
@@ -74,6 +78,7 @@ __all__ = [
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan",
+    "plan_dynamics",
     "plan_minimum_time",
     "plan_minimum_velocity",
     "plan_standing",

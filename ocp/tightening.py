@@ -18,7 +18,7 @@ from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution
 
-__all__ = ["tighten"]
+__all__ = ["exceeded", "tighten"]
 
 PLACES_A_DEGREE = 10  # places looked at for each degree of the plan's polynomials in an interval
 MOST_ROUNDS = 20
@@ -37,6 +37,7 @@ def tighten(
     options: ByName = None,
     guess: Guess = None,
     time_limit: float | None = None,
+    dearest: float = np.inf,
 ) -> Solution:
     """Solve so that every inequality holds between the points of the grid as well.
 
@@ -50,16 +51,17 @@ def tighten(
         tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
         time_limit: After so many seconds, the build and all solves included, the solver is stopped between two
             iterations, which counts as a failure. None for no limit.
+        dearest: Cost above which it gives up: what is drawn in adds to it.
 
     Raises:
         ProblemError: tolerance not positive, another method, a time limit that is none.
-        SolveError: A solve failed, or the excess does not fall under the tolerance, or not in time; says what remains
-            and where. Where there was a plan before the time limit, it names ``time_limit`` and carries, as an
-            unsuccessful one, the plan that exceeds its bounds least.
+        SolveError: A solve failed, or the excess does not fall under the tolerance, not in time or not at the cost that
+            it may have; says what remains and where. Where there was a plan before the time limit, it names
+            ``time_limit`` and carries, as an unsuccessful one, the plan that exceeds its bounds least.
     """
     check_meshed("tighten", method, tolerance)
     with limited(checked_time_limit(time_limit)):
-        return _tightened(problem, method, tolerance, parameters, solver, options, guess, time_limit)
+        return _tightened(problem, method, tolerance, parameters, solver, options, guess, time_limit, dearest)
 
 
 def _tightened(
@@ -71,6 +73,7 @@ def _tightened(
     options: ByName,
     guess: Guess,
     time_limit: float | None,
+    dearest: float,
 ) -> Solution:
     """:func:`tighten` inside its time limit."""
     prepared = method.prepare(problem, solver=solver, options=options)
@@ -105,6 +108,9 @@ def _tightened(
         if beyond.max(initial=0.0) <= tolerance:
             return solution
         remains, details = _worst(form, beyond, times)
+        if solution.cost > dearest:
+            told = f"problem {form.name!r}: bounds drawn in cost {solution.cost:.6g} already, and {remains}"
+            raise SolveError(told, solution, name="cost", value=solution.cost, limit=dearest)
         if best is None or details["value"] < best[2]["value"]:
             best = solution, remains, details
         # as in the secant method, each bound by itself; one that its neighbours moved says nothing
@@ -115,6 +121,15 @@ def _tightened(
         move = drawn - drawn_before
     told = f"problem {form.name!r}: after {MOST_ROUNDS} rounds {remains}; take more intervals"
     raise SolveError(told, solution, limit=tolerance, **details)
+
+
+def exceeded(problem: Any, solution: Solution) -> float:
+    """By how much a plan goes beyond a bound or inequality between the points of its grid, in the unit of that one."""
+    form = Formulation.of(problem)
+    p = form.parameter_vector(solution.parameters)
+    index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
+    low, high = (bound[index] for bound in form.bound_values(p))
+    return float(_excess(form, solution, p, low, high)[0].max(initial=0.0))
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:

@@ -38,7 +38,7 @@ FLOORS = {
         ["direct", "audit", "local"],
         ["indirect"],
         ["methods"],
-        ["confirmation", "refinement", "tightening"],
+        ["confirmation", "refinement", "switching", "tightening"],
         ["builders"],
         ["planning"],
         ["batch", "files"],

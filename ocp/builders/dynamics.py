@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import casadi as ca
 import numpy as np
@@ -55,11 +55,31 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Effort", "JointFriction", "dynamics_problem", "joint_torques"]
+__all__ = ["AskedOfDrives", "Effort", "JointFriction", "Motors", "checked_motors", "dynamics_problem", "joint_torques"]
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 Motors = FixedBase | FreeFloating
 """Machines that are moved by the torques of their joints alone."""
+
+
+class AskedOfDrives(TypedDict, total=False):
+    """The options of `dynamics_problem` but what has to stay clear."""
+
+    end_joints: Any
+    tasks: TipTask | Sequence[TipTask]
+    start_base: Any
+    limits: Limits | None
+    effort: Effort | None
+    friction: JointFriction | None
+    wrenches: Sequence[Wrench]
+    thrusters: Sequence[Thruster]
+    gravity: Any
+    control: Literal["acceleration", "jerk"]
+    start: Any
+    end: Any
+    end_base: Any
+    end_momentum: Any
+    symbols: Any
 
 
 @dataclass(frozen=True)
@@ -167,7 +187,7 @@ def joint_torques(
     Raises:
         ProblemError: Another machine; something acts on a floating machine whose momentum is not given.
     """
-    robot = _checked_motors("joint_torques", machine).robot
+    robot = checked_motors("joint_torques", machine).robot
     if isinstance(machine, FixedBase):
         fall = GRAVITY if gravity is None else gravity
         found = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
@@ -246,7 +266,8 @@ def dynamics_problem(
         horizon: Final time, s, or FreeTime(...).
         end_joints: Shape (n,), nan where free; all free if None.
         tasks: A TipTask, or several that are done at once over the whole motion, of the time, s.
-        start_base: Configuration of the base at the start; home if None.
+        start_base: Configuration of the base at the start, nan where it is free in a phase that is joined to another;
+            home if None.
         limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         effort: Weights of the cost; the squared torques if None.
         friction, wrenches, gravity: As of `joint_torques`.
@@ -266,7 +287,7 @@ def dynamics_problem(
             are the control, a task that does not begin at its tip or moves where the joints rest, a free horizon with
             tasks, whose time is theirs.
     """
-    _checked_motors("dynamics_problem", machine)
+    checked_motors("dynamics_problem", machine)
     limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
     effort = Effort() if effort is None else checked_instance("dynamics_problem: effort", effort, Effort)
     if friction is not None:
@@ -283,7 +304,8 @@ def dynamics_problem(
     last = _ends("end_joints", end_joints, bounds.lower, bounds.upper)
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
     known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
-    _, home = checked_configuration(machine, known, start_base)
+    joined = start_joints is None or _is_free(start_base)
+    _, home = checked_configuration(machine, known, None if _is_free(start_base) else start_base)
     towards = np.where(np.isnan(last), known, last)
 
     equations = bind(machine, tasks) if isinstance(tasks, TipTask) or tasks else None
@@ -333,12 +355,12 @@ def dynamics_problem(
         most = np.array([each.force for each in pushers])
         thrust = problem.control("thrust", len(pushers), lower=0.0, upper=most, guess=0.0, unit="N")
     if machine.base_size:
-        known_base = None if start_joints is None else home
+        known_base = None if joined else home
         base = problem.state("base", machine.base_size, initial=known_base, guess=home)
     if isinstance(machine, FreeFloating) and (pushers or wrenches or gravity is not None):
         held = machine.conserved_momentum
         momentum = problem.state(
-            "momentum", initial=None if start_joints is None else held, guess=held,
+            "momentum", initial=None if joined else held, guess=held,
             terminal=end_momentum, size=len(machine.twist_rows), unit="N m s, N s",
         )  # fmt: skip
         base = ca.vertcat(base, momentum)
@@ -382,12 +404,21 @@ def dynamics_problem(
     return problem
 
 
-def _checked_motors(what: str, machine: Any) -> Motors:
+def checked_motors(what: str, machine: Any) -> Motors:
+    """The machine; ProblemError unless it is one that the torques of its joints alone move."""
     if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
         words = f"{what}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; what stands is "
         words += "for standing_problem"
         raise ProblemError(words, name="machine", value=machine)
     return machine
+
+
+def _is_free(given: Any) -> bool:
+    """Whether a configuration of the base is told to be free."""
+    try:
+        return given is not None and bool(np.isnan(floats(given)).any())
+    except NOT_NUMBERS:
+        return False
 
 
 def _ends(what: str, given: Any, lower: Array, upper: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -40,13 +41,15 @@ def arm(mass: float = 2.0) -> Robot:
     return planar_chain([0.5, 0.4, 0.3], [mass, 1.5, 1.0])
 
 
-def torques_along(machine: Any, plan: Solution, friction: JointFriction | None = None, **more: Any) -> Any:
-    """Torques of a plan at its reported points. Shape (M, n)."""
+def torques_along(
+    machine: Any, plan: Solution | Mapping[str, Any], friction: JointFriction | None = None, **more: Any
+) -> Any:
+    """Torques of a plan at its reported points, or of samples of one. Shape (M, n)."""
     base, q, qd, qdd = (ca.SX.sym("z", n) for n in (machine.base_size, *[machine.joint_size] * 3))
     torques = ca.Function(
         "t", [base, q, qd, qdd], [joint_torques(machine, base, q, qd, qdd, friction=friction, **more)]
     )
-    at = plan["base"].T if machine.base_size else np.zeros((0, len(plan.t)))
+    at = plan["base"].T if machine.base_size else np.zeros((0, len(plan["joints"])))
     return np.array(torques(at, plan["joints"].T, plan["velocities"].T, plan["accelerations"].T)).T
 
 
