@@ -15,11 +15,15 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, from anywhere
 
 from scripts.papers.run import Table, command, progress, write
+from scripts.timing import optimal_control
 
+ROOT = Path(__file__).resolve().parents[1]
 PARTS = (
     "build_and_solve",
     "costate_rate",
     "native",
+    "optimal_control",
+    "arms",
     "audit",
     "planning",
     "waypoints",
@@ -50,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in TOGETHER:
             summary |= {name if key == "rows" else key: value for key, value in found[name].items()}
         write(folder / "summary.json", summary)
+    if "optimal_control" in found and options.out.resolve() == ROOT / "results":
+        optimal_control.write_readme(ROOT / "README.md", found["optimal_control"]["first"])
     for name, numbers in found.items():
         print(f"{importlib.import_module(f'scripts.timing.{name}').report(numbers)}\n")
     print(f"written to {folder}")

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy.sparse as sp
 
 from ocp.direct.fragment import Block, Fragment
 from ocp.problem.values import symbols_of
@@ -42,6 +44,70 @@ class Program:
     values: Any
     inside: Any
     parametric: Any
+
+    @cached_property
+    def numbers(self) -> Numbers:
+        """The derivatives as arrays."""
+        return Numbers(self)
+
+
+class Numbers:
+    """Derivatives of a program as arrays of numpy and scipy; those at the last point are kept.
+
+    CasADi hands its matrices to Python number by number, which takes longer than computing them: here functions write
+    into arrays, and where the nonzeros stand is asked once.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self._gradient, self._jacobian, self._hessian = (
+            Written(function, output)
+            for function, output in ((program.gradient, 1), (program.jacobian, 1), (program.hessian, 0))
+        )
+        self._at: tuple[np.ndarray, np.ndarray] | None = None
+        self._first: tuple[np.ndarray, sp.csc_array] | None = None
+
+    def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, sp.csc_array]:
+        """Gradient of the cost (n,), and Jacobian of the rows (m, n)."""
+        at = self._at
+        if self._first is None or at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
+            self._first = self._gradient(x, p).data, self._jacobian(x, p)
+            self._at = x.copy(), p.copy()
+        return self._first
+
+    def gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Gradient of the cost alone. Shape (n,)."""
+        return np.asarray(self._gradient(x, p).data)
+
+    def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> sp.csc_array:
+        """Upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
+        return self._hessian(x, p, np.array([sigma]), lam)
+
+
+class Written:
+    """An output of a casadi Function of dense vectors, written into an array of its nonzeros."""
+
+    def __init__(self, function: Any, output: int) -> None:
+        self._function, self._output = function, output
+        pattern = function.sparsity_out(output)
+        self._index = np.array(pattern.row(), dtype=np.int32), np.array(pattern.colind(), dtype=np.int32)
+        self._shape = pattern.shape
+        self._buffer, self._run = function.buffer()
+
+    def __call__(self, *given: np.ndarray) -> sp.csc_array:
+        """Its value, a matrix of its own.
+
+        Raises:
+            RuntimeError: The function fails, as an integrator does.
+        """
+        found = np.zeros(len(self._index[0]))
+        kept = [np.ascontiguousarray(each, dtype=float).ravel() for each in given]
+        for i, each in enumerate(kept):
+            self._buffer.set_arg(i, each.data)
+        self._buffer.set_res(self._output, found.data)
+        self._run()
+        if self._buffer.ret():
+            raise RuntimeError(f"{self._function.name()} cannot be evaluated")
+        return sp.csc_array((found, *self._index), shape=self._shape)
 
 
 class Derivatives(NamedTuple):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
@@ -46,9 +45,9 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     """The conditions at what a solver found under these arguments (p and bounds)."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
-    slope = np.asarray(program.gradient(v, p)[1].full()).ravel() * a / c
-    jacobian = sp.diags_array(1 / b) @ matrix(program.jacobian(v, p)[1]) @ sp.diags_array(a)
-    half = sp.diags_array(a / c) @ matrix(program.hessian(v, p, 1.0, lam)) @ sp.diags_array(a)
+    slope, jacobian = program.numbers.first(v, p)
+    slope, jacobian = slope * a / c, scaled(jacobian, 1 / b, a)
+    half = scaled(program.numbers.second(v, p, 1.0, lam), a / c, a)
     hessian = half + sp.triu(half, 1).T
     of_rows = lam * b / c
     of_bounds = -(slope + jacobian.T @ of_rows)
@@ -60,9 +59,8 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
 def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
     """Multipliers of the bounds of the variables (n,) and of the rows (m,), in units of the solver."""
     v, lam = outcome.variables, outcome.multipliers
-    slope = np.asarray(program.gradient(v, p)[1].full()).ravel()
-    slope += matrix(program.jacobian(v, p)[1]).T @ lam
-    return -slope * scales.variables / scales.cost, lam * scales.rows / scales.cost
+    slope, jacobian = program.numbers.first(v, p)
+    return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
 
 
 def held_by(
@@ -139,7 +137,7 @@ def positive_definite(symmetric: sp.coo_array) -> bool:
     return True
 
 
-def matrix(found: ca.DM) -> sp.csc_array:
-    """A matrix of casadi as one of scipy."""
-    pattern = found.sparsity()
-    return sp.csc_array((np.array(found.nonzeros()), pattern.row(), pattern.colind()), shape=found.shape)
+def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:
+    """A matrix with its rows and its columns times factors."""
+    by = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
+    return sp.csc_array((matrix.data * by, matrix.indices, matrix.indptr), shape=matrix.shape)

@@ -526,10 +526,10 @@ class Prepared:
         fragment = self.fragment
         costates = outcome.multipliers[fragment.costate_rows] * fragment.costate_scale[:, None]
         inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
-        jacobian = self.program.jacobian(outcome.variables, p)[1]
-        rows, columns = (np.array(part, dtype=int) for part in jacobian.sparsity().get_triplet())
+        _, jacobian = self.program.numbers.first(outcome.variables, p)
+        rows, columns = jacobian.indices, np.repeat(np.arange(fragment.size), np.diff(jacobian.indptr))
         with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
-            terms = np.array(jacobian.nonzeros()) * inner[rows]
+            terms = jacobian.data * inner[rows]
         running = np.asarray(self.program.inside(outcome.variables, p).full()).reshape(-1)
 
         node_of = np.full(fragment.size, -2)
@@ -548,8 +548,8 @@ class Prepared:
         form, fragment = self.formulation, self.fragment
         v, lam = outcome.variables, outcome.multipliers
         direct = np.asarray(self.program.parametric(v, p, lam).full()).reshape(-1)
-        gradient = self.program.gradient(v, p)[1] + self.program.jacobian(v, p)[1].T @ lam
-        lam_x = -np.asarray(gradient.full()).reshape(-1)
+        slope, jacobian = self.program.numbers.first(v, p)
+        lam_x = -(slope + jacobian.T @ lam)
         push = np.zeros((2, sum(len(place) for place in form.bounds.places.values())))
         for index, force in ((fragment.variable_bounds, lam_x), (fragment.row_bounds, lam)):
             np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound

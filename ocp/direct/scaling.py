@@ -209,9 +209,9 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
 def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Horizon times the largest derivative of each state's rate in each other state and control. (nx, nx + nu)."""
     found = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
-    jacobian = _second_output(pattern.program.jacobian, point, p)
-    if jacobian is not None:
-        entries = np.abs(np.array(jacobian.nonzeros()))
+    slopes = _slopes(pattern.program, point, p)
+    if slopes is not None:
+        entries = np.abs(slopes[1].data)
         keep = (pattern.to >= 0) & np.isfinite(entries) & (entries > 0)
         # a row sees the rate over its interval
         np.maximum.at(found, (pattern.to[keep], pattern.source[keep]), entries[keep] / pattern.width[keep])
@@ -223,17 +223,17 @@ def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     program, by = pattern.program, sizes.of_variables(pattern.fragment)
     by = np.where(by > LEAST, by, 1.0)
     largest = np.zeros(pattern.fragment.n_rows)  # of all rows of a label, the same at all times
-    jacobian = _second_output(program.jacobian, point, p)
-    if jacobian is not None:
+    slopes = _slopes(program, point, p)
+    if slopes is not None:
         with np.errstate(invalid="ignore"):
-            entries = np.abs(np.array(jacobian.nonzeros())) * by[pattern.columns]
+            entries = np.abs(slopes[1].data) * by[pattern.columns]
         np.maximum.at(largest, pattern.label[pattern.rows], np.where(np.isfinite(entries), entries, 0.0))
     moves = []
     for place in (point, point + by):  # where a start rests on the least of the cost, beside it
-        slope = _second_output(program.gradient, place, p)
+        slope = _slope(program, place, p)
         if slope is not None:
             with np.errstate(invalid="ignore"):
-                moves.append(float(np.abs(np.asarray(slope.full()).ravel() * by).sum()))
+                moves.append(float(np.abs(slope * by).sum()))
     usual = [move for move in moves if np.isfinite(move) and move > 0]
     cost = min(usual, default=1.0)
     # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
@@ -278,9 +278,17 @@ def _powers(sizes: np.ndarray) -> np.ndarray:
     return np.where(odd, np.exp2(np.round(np.log2(np.where(odd, sizes, 1.0)))), 1.0)
 
 
-def _second_output(function: Any, point: np.ndarray, p: np.ndarray) -> Any:
-    """The second output of a function of the program; None where an integrator breaks down."""
+def _slope(program: Program, point: np.ndarray, p: np.ndarray) -> Any:
+    """Gradient of the program; None where an integrator breaks down."""
     try:
-        return function(point, p)[1]
+        return program.numbers.gradient(point, p)
+    except RuntimeError:
+        return None
+
+
+def _slopes(program: Program, point: np.ndarray, p: np.ndarray) -> Any:
+    """Gradient and Jacobian of the program; None where an integrator breaks down."""
+    try:
+        return program.numbers.first(point, p)
     except RuntimeError:
         return None
