@@ -10,6 +10,7 @@ from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
 from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
+from models.machines.stance import Foot, Foothold, Stance
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
 from models.machines.surroundings import Moving, Surroundings
@@ -54,6 +55,8 @@ __all__ = [
     "CollisionShape",
     "Cylinder",
     "FixedBase",
+    "Foot",
+    "Foothold",
     "Footprint",
     "Frame",
     "FreeFloating",
@@ -74,6 +77,7 @@ __all__ = [
     "Scara",
     "SmoothPath",
     "Sphere",
+    "Stance",
     "Standing",
     "Support",
     "Surroundings",

@@ -9,8 +9,12 @@ from ocp.builders.dynamics_plan import plan_dynamics
 from ocp.builders.joint_spline import joint_path
 from ocp.builders.legs import Leg, dynamics_phases
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
-from ocp.builders.standing.plan import plan_standing
+from ocp.builders.standing.loads import StepsMotion, steps_motion
+from ocp.builders.standing.plan import plan_standing, plan_steps
+from ocp.builders.standing.postures import standing_posture
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.builders.standing.stances import StancePhase, Steps, walk
+from ocp.builders.standing.steps import StepWeights, steps_problem
 from ocp.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.confirmation import certificate
 from ocp.direct.collocation import Collocation
@@ -65,6 +69,10 @@ __all__ = [
     "Solution",
     "SolveError",
     "Stabiliser",
+    "StancePhase",
+    "StepWeights",
+    "Steps",
+    "StepsMotion",
     "TipTask",
     "Unreachable",
     "WaypointPlan",
@@ -82,6 +90,7 @@ __all__ = [
     "plan_minimum_time",
     "plan_minimum_velocity",
     "plan_standing",
+    "plan_steps",
     "plan_waypoints",
     "prepare",
     "refine",
@@ -90,6 +99,10 @@ __all__ = [
     "roll_problem",
     "solve",
     "spline_targets",
+    "standing_posture",
     "standing_problem",
+    "steps_motion",
+    "steps_problem",
     "tighten",
+    "walk",
 ]

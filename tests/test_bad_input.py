@@ -50,6 +50,7 @@ MADE_BY_THE_PACKAGE = {
     "Schedule",
     "SmoothPath",
     "Solution",
+    "StepsMotion",
     "Stretch",
     "TimedProgram",
     "WaypointPlan",

@@ -255,7 +255,8 @@ class _Placed:
         ]
         inside = ca.Function("placed", [old for old, _ in pairs], [expression])
         inline = inside.is_a("MXFunction") or self.whole.symbols is ca.SX
-        return ca.densify(inside.call([new for _, new in pairs], inline, False)[0])
+        placed = inside.call([new for _, new in pairs], inline, False)[0]  # numbers of what has no symbols
+        return self.whole.symbols(ca.densify(placed))
 
     def _column(self, values: Any) -> Any:
         """As :meth:`_placed`, entry by entry, so that what is a number remains one."""

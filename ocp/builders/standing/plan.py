@@ -11,8 +11,11 @@ import casadi as ca
 import numpy as np
 
 from models.machines.standing import External, Standing
+from ocp.audit.audit import Audit
 from ocp.builders.clearance import Clear, keeping_clear, touching_error
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.builders.standing.stances import Steps
+from ocp.builders.standing.steps import StepWeights, steps_problem
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
@@ -27,19 +30,22 @@ from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import ZmpRule
 from ocp.tightening import tighten
 
-__all__ = ["Asked", "Attempt", "plan_standing"]
+__all__ = ["Asked", "AskedOfSteps", "Attempt", "plan_standing", "plan_steps"]
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 """Controls at the points: smooth plans, certified on few intervals."""
 LINEAR = MultipleShooting(50, control="linear")
 """Controls linear between the nodes: plans that switch between limits, as those of least time do."""
+STEPS = Collocation(12, degree=3, scheme="legendre")
+"""Of each phase."""
 MESHES = 3
 """Of each formulation, each twice as fine as the one before."""
 STRAY = 1e-5
 """Pose error, m and rad, that the re-integrated plan may have anywhere, if its task allows no gap at the start."""
 IPOPT = {"max_iter": 300}
 
-Formulation = tuple[Literal["position", "acceleration"], Collocation | MultipleShooting]
+Level = Literal["position", "acceleration"]
+Formulation = tuple[Level | None, Collocation | MultipleShooting]
 
 
 class Asked(TypedDict, total=False):
@@ -55,6 +61,16 @@ class Asked(TypedDict, total=False):
     end: Literal["rest", "free"]
     end_joints: Any
     symbols: Any
+
+
+class AskedOfSteps(TypedDict, total=False):
+    """The options of steps_problem."""
+
+    balance: Literal["dynamic", "static"]
+    margin: float
+    clearance: float
+    weights: StepWeights | None
+    limits: Limits | None
 
 
 @dataclass(frozen=True)
@@ -111,25 +127,56 @@ def plan_standing(
     if method is not None:
         checked_instance("method", method, Collocation)
     options = checked_mapping("options", options)
-    judge = _Judge(machine, tasks, tolerances, asked.get("along") == "parameter")
+    along_parameter = asked.get("along") == "parameter"
+    judge = _Judge(tolerances, partial(_stray, machine, tasks, along_parameter))
     settings = {**IPOPT, **options}
-    breaks = [] if isinstance(horizon, FreeTime) or judge.along_parameter else _breaks(machine, tasks, horizon)
+    breaks = [] if isinstance(horizon, FreeTime) or along_parameter else _breaks(machine, tasks, horizon)
     trials = [
         (level, mesh.with_nodes_at(breaks))
         for level, mesh in _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
     ]
 
     def run(clear: Clear | None) -> Solution:
-        def declare(level: Literal["position", "acceleration"]) -> Problem:
-            return standing_problem(machine, tasks, start_joints, horizon, tip_level=level, clear=clear, **asked)
+        def declare(level: Level | None) -> Problem:
+            held = level or "position"
+            return standing_problem(machine, tasks, start_joints, horizon, tip_level=held, clear=clear, **asked)
 
         return _first_that_holds(declare, trials, settings, judge)
 
     return keeping_clear(clear, run)
 
 
+@interruptible
+def plan_steps(
+    steps: Steps,
+    start_joints: Any,
+    *,
+    method: Collocation | None = None,
+    options: Mapping[str, Any] | None = None,
+    tolerances: Mapping[str, float] | None = None,
+    **asked: Unpack[AskedOfSteps],
+) -> Solution:
+    """Solve `steps_problem` and audit the plan; tightened and on finer meshes as `plan_standing` does.
+
+    Args:
+        steps, start_joints, asked: As for steps_problem.
+        method: The first mesh, of each phase; 12 intervals of degree 3 if None.
+        options, tolerances: As for plan_standing.
+
+    Raises:
+        SolveError: No attempt leads to a plan that passes; says what became of each.
+        ProblemError: As steps_problem.
+    """
+    if method is not None:
+        checked_instance("method", method, Collocation)
+    settings = {**IPOPT, **checked_mapping("options", options)}
+    trials: list[Formulation] = [(None, method or STEPS)]
+    judge = _Judge(tolerances, lambda _: None)
+    return _first_that_holds(lambda _: steps_problem(steps, start_joints, **asked), trials, settings, judge)
+
+
 def _first_that_holds(
-    declare: Callable[[Literal["position", "acceleration"]], Problem],
+    declare: Callable[[Level | None], Problem],
     trials: Sequence[Formulation],
     settings: Mapping[str, Any],
     judge: _Judge,
@@ -148,7 +195,7 @@ def _first_that_holds(
             problem = declare(level)
         except ProblemError as error:  # one formulation may leave freedom where the other has none
             refused.append(error)
-            reasons.append(f"tip {level}: {error}")
+            reasons.append(f"{_tip(level)}{error}")
             if len(refused) == len(trials):
                 raise refused[0] from None
             continue
@@ -186,7 +233,7 @@ def _formulations(control: str, free_time: bool, method: Collocation | None) -> 
 
 def _attempts(
     problem: Problem,
-    level: str,
+    level: Level | None,
     mesh: Collocation | MultipleShooting,
     settings: Mapping[str, Any],
     judge: _Judge,
@@ -200,7 +247,7 @@ def _attempts(
     """
     guess: Solution | None = None
     for _ in range(MESHES):
-        name = f"tip {level}, {mesh.intervals} intervals"
+        name = f"{_tip(level)}{mesh.intervals} intervals"
         first = diagnosed and guess is None
         attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
         yield attempt
@@ -213,14 +260,21 @@ def _attempts(
         mesh = mesh.halved()
 
 
+def _tip(level: Level | None) -> str:
+    return "" if level is None else f"tip {level}, "
+
+
 @dataclass(frozen=True)
 class _Judge:
-    """Solves, and says what became of it."""
+    """Solves, and says what became of it.
 
-    machine: Standing
-    tasks: TipTask | Sequence[TipTask]
+    Attributes:
+        tolerances: Of the audit.
+        stray: What is wrong with a plan that passes its audit, None where nothing is.
+    """
+
     tolerances: Mapping[str, float] | None
-    along_parameter: bool
+    stray: Callable[[Audit], SolveError | None]
 
     def __call__(self, name: str, problem: Problem, run: Callable[[], Solution]) -> Attempt:
         try:
@@ -239,16 +293,21 @@ class _Judge:
             details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
             failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
             return Attempt(name, solution, failure, exceeded, touching_error(audit, solution))
-        progress = audit.states["path"][:, 0] if self.along_parameter else audit.t
-        errors = np.abs(task_errors(self.machine, self.tasks, progress, None, audit.states["joints"])).max(axis=0)
-        parts = bind(self.machine, self.tasks).bound
-        gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
-        if (errors > np.maximum(gaps, STRAY)).any():
-            strays = SolveError(
-                f"a tip strays from its task by {errors.max():.2g} (m or rad)", name="tip", value=errors.max()
-            )
-            return Attempt(name, solution, strays)
-        return Attempt(name, solution)
+        return Attempt(name, solution, self.stray(audit))
+
+
+def _stray(
+    machine: Standing, tasks: TipTask | Sequence[TipTask], along_parameter: bool, audit: Audit
+) -> SolveError | None:
+    """That a tip strays from its task in the re-integrated motion, where it does."""
+    progress = audit.states["path"][:, 0] if along_parameter else audit.t
+    errors = np.abs(task_errors(machine, tasks, progress, None, audit.states["joints"])).max(axis=0)
+    parts = bind(machine, tasks).bound
+    gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
+    if (errors > np.maximum(gaps, STRAY)).any():
+        words = f"a tip strays from its task by {errors.max():.2g} (m or rad)"
+        return SolveError(words, name="tip", value=errors.max())
+    return None
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
+from models.machines.machine import Machine
 from models.machines.standing import External, Standing
 from models.paths import rest_to_rest
 from models.robot.dynamics import Wrench
@@ -39,7 +40,7 @@ GUESS_STEPS = 400
 RACING = 100.0  # rad/s or m/s, of a local motion near a singularity
 
 
-def inside_limits(machine: Standing, joints: Array, lower: Array, upper: Array) -> Array:
+def inside_limits(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
     """The start, moved onto the limits where rounding has it beyond them. Shape (n,).
 
     Raises:

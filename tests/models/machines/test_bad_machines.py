@@ -10,12 +10,15 @@ import pytest
 from models import (
     CollisionShape,
     FixedBase,
+    Foot,
+    Foothold,
     FreeFloating,
     Link,
     Moving,
     Path,
     Scara,
     Sphere,
+    Stance,
     Standing,
     Support,
     Surroundings,
@@ -38,6 +41,7 @@ from tests.bad_values import (
     INF,
     INSTANCE,
     LIMIT,
+    MAPPING,
     NAME,
     NONNEGATIVE,
     NOTHING,
@@ -307,7 +311,53 @@ SCARA_CASES = [
         {"scara": INSTANCE, "path": INSTANCE, "elbow": CHOICE, "clearance": NONNEGATIVE | NOTHING},
     ),
 ]
-CASES = [*BOLTED_CASES, *FLOATING_CASES, *ACTUATOR_CASES, *STANDING_CASES, *SCARA_CASES]
+ON_FEET: dict[str, Any] = {
+    "robot": FOOTED,
+    "feet": {"only": Foot("foot", SUPPORT)},
+    "footholds": {"only": Foothold((0, 0, 0))},
+}
+
+
+def stance() -> Stance:
+    return Stance.on(**ON_FEET)
+
+
+STANCE_CASES = [
+    Case(
+        "Foot",
+        Foot,
+        {"link": "foot"},
+        {"link": NAME, "sole": but(INSTANCE, "None"), "translation": array(3), "rotation": rotation()},
+    ),
+    Case("Foot.of", Foot.of, {"robot": FOOTED, "link": "foot"}, {"robot": INSTANCE, "link": UNKNOWN}),
+    Case("Foothold", Foothold, {"position": (0.0, 0.0, 0.0)}, {"position": array(3) | NOTHING, "rotation": rotation()}),
+    Case(
+        "Foothold.level",
+        Foothold.level,
+        {"x": 0.0, "y": 0.0},
+        dict.fromkeys(("x", "y", "heading", "height"), FINITE | NOTHING),
+    ),
+    Case(
+        "Stance.on",
+        Stance.on,
+        ON_FEET,
+        {
+            "robot": INSTANCE,
+            "feet": MAPPING | {"none": {}, "of words": {"only": "foot"}},
+            "footholds": MAPPING
+            | {"none": {}, "of words": {"only": "here"}, "unknown": {"other": Foothold((0, 0, 0))}},
+            "gravity": POSITIVE | NOTHING,
+        },
+    ),
+    method(stance, "sole_frame", {"name": "only", "q": [0.0]}, name=UNKNOWN, q=array(1)),
+    method(stance, "sole_corners", {"name": "only", "q": [0.0]}, name=UNKNOWN, q=array(1)),
+    method(stance, "center_of_mass", {"q": [0.0]}, q=array(1)),
+    *[
+        method(stance, name, {"q": [0.0], "qd": [0.0], "qdd": [0.0], "others": {}}, q=array(1), others=MAPPING)
+        for name in ("loads", "joint_torques")
+    ],
+]
+CASES = [*BOLTED_CASES, *FLOATING_CASES, *ACTUATOR_CASES, *STANDING_CASES, *STANCE_CASES, *SCARA_CASES]
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))

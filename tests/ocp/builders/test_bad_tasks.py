@@ -10,6 +10,8 @@ import pytest
 
 from models import (
     FixedBase,
+    Foot,
+    Foothold,
     FreeFloating,
     Link,
     Standing,
@@ -33,6 +35,9 @@ from ocp import (
     Limits,
     Pinned,
     Stabiliser,
+    StancePhase,
+    Steps,
+    StepWeights,
     TipTask,
     Weights,
     dynamics_phases,
@@ -43,11 +48,17 @@ from ocp import (
     plan_dynamics,
     plan_minimum_velocity,
     plan_standing,
+    plan_steps,
     resolve,
     resolve_accelerations,
     roll_problem,
+    solve,
     spline_targets,
+    standing_posture,
     standing_problem,
+    steps_motion,
+    steps_problem,
+    walk,
 )
 from ocp.tasks.tracks import along, pose_line
 from tests.bad_values import (
@@ -504,8 +515,82 @@ DYNAMICS = [
         {"machine": INSTANCE | {"standing": STANDING}},
     ),
 ]
-CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS]
-LONG = ("along", "plan_minimum_velocity", "plan_standing")
+FEET = {"base": Foot("base", rectangle((-1.0, 1.0), (-1.0, 1.0)))}
+HERE = {"base": Foothold((0.0, 0.0, 0.0))}
+ARM_ON_FOOT = planar_chain([0.4, 0.4, 0.3], [2.0, 1.5, 1.0])
+STEPPING = Steps(ARM_ON_FOOT, FEET, [StancePhase(HERE, 1.0)])
+STEPPED: dict[str, Any] = {"steps": STEPPING, "start_joints": [0.3, 0.4, 0.5]}
+STEP_OPTIONS: dict[str, Bad] = {
+    "steps": INSTANCE,
+    "start_joints": array(3) | NOTHING,
+    "balance": CHOICE,
+    "margin": NONNEGATIVE | NOTHING | {"wide": 9.0},
+    "clearance": NONNEGATIVE | NOTHING,
+    "weights": but(INSTANCE, "None"),
+    "limits": but(INSTANCE, "None") | {"jerk": Limits(jerk=1.0), "of two": Limits(velocity=[1.0, 2.0])},
+}
+STEPS = [
+    Case(
+        "StepWeights",
+        StepWeights,
+        {},
+        dict.fromkeys(("acceleration", "velocity", "torque", "joint_limits", "load", "time"), NONNEGATIVE | NOTHING),
+    ),
+    Case(
+        "StancePhase",
+        StancePhase,
+        {"footholds": HERE, "duration": 1.0},
+        {"footholds": MAPPING | NOTHING | {"none": {}, "of words": {"base": "here"}}, "duration": HORIZON},
+    ),
+    Case(
+        "Steps",
+        Steps,
+        {"robot": ARM_ON_FOOT, "feet": FEET, "phases": [StancePhase(HERE, 1.0)]},
+        {
+            "robot": INSTANCE,
+            "feet": MAPPING | NOTHING | {"none": {}, "of words": {"base": "base"}, "lost": {"base": Foot("nobody")}},
+            "phases": SEQUENCE | NOTHING | {"none": []},
+            "gravity": POSITIVE | NOTHING,
+        },
+    ),
+    Case(
+        "walk",
+        walk,
+        {"start": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
+        {
+            "start": MAPPING | {"none": {}, "of words": {"base": "here"}},
+            "steps": SEQUENCE | NOTHING | {"unknown": [("foot", HERE["base"])], "of words": [("base", "here")]},
+            "shift": HORIZON,
+            "swing": HORIZON,
+        },
+    ),
+    Case("steps_problem", steps_problem, STEPPED, STEP_OPTIONS),
+    Case(
+        "plan_steps",
+        plan_steps,
+        STEPPED,
+        {
+            **STEP_OPTIONS,
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "options": MAPPING,
+            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
+        },
+    ),
+    Case(
+        "standing_posture",
+        standing_posture,
+        {"stance": STEPPING.stances[0], "near": [0.3, 0.4, 0.5]},
+        {"stance": INSTANCE, "near": array(3) | NOTHING, "over": array(2)},
+    ),
+    Case(
+        "steps_motion",
+        steps_motion,
+        {"steps": STEPPING, "solution": solve(steps_problem(**STEPPED), Collocation(2)), "samples": 5},
+        {"steps": INSTANCE, "solution": INSTANCE, "samples": COUNT | NOTHING | {"one": 1}},
+    ),
+]
+CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS, *STEPS]
+LONG = ("along", "plan_minimum_velocity", "plan_standing", "plan_steps")
 
 
 @pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))

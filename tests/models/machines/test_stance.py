@@ -1,0 +1,183 @@
+"""Stances: whatever link a robot is rooted at it moves the same, and its feet bear what Newton and Euler say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, rerooted
+from models.robot.dynamics import base_reaction
+from models.robot.motion import link_motions
+from tests.models.robot.pinocchio_robots import urdf_file
+from tests.models.robot.trees import Array, numeric, numeric_poses, random_frame, random_robot
+from tests.ocp.builders.bipeds import HELD, SIDES, TALOS, planar_biped, planar_feet, talos_steps
+
+few = settings(max_examples=8, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds, st.integers(2, 8))
+@few
+def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: int) -> None:
+    """Fastened at one link, and rooted at another that moves as it does: same torques, and nothing to hold there."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, size)
+    root = robot.links[int(rng.integers(len(robot.links)))].name
+    turned = rerooted(robot, root)
+    order = [robot.joint_names.index(name) for name in turned.joint_names]
+    q, qd, qdd = rng.normal(size=(3, robot.dof))
+    place = random_frame(rng)
+    torques = numeric(inverse_dynamics(robot, q, qd, qdd, world_from_base=place)).ravel()
+    held = numeric(base_reaction(robot, q, qd, qdd, world_from_base=place)).ravel()
+    motion = link_motions(robot, q, qd, qdd, place)[root]
+    frame = numeric_poses(robot, q, place)[root]
+    spin, change = numeric(motion.angular_velocity).ravel(), numeric(motion.angular_acceleration).ravel()
+    arm = frame[1] - numeric(motion.center).ravel()
+    velocity = numeric(motion.velocity).ravel() + np.cross(spin, arm)
+    acceleration = numeric(motion.acceleration).ravel() + np.cross(change, arm) + np.cross(spin, np.cross(spin, arm))
+    at_old = Wrench(robot.root, held[3:], held[:3] - np.cross(place[1], held[3:]))
+    moving: dict[str, Any] = {
+        "world_from_base": frame,
+        "base_twist": np.concatenate([spin, velocity]),
+        "base_acceleration": np.concatenate([change, acceleration]),
+    }
+    scale = max(1.0, np.abs(held).max(), np.abs(torques).max())
+    again = numeric(inverse_dynamics(turned, q[order], qd[order], qdd[order], [at_old], **moving)).ravel()
+    np.testing.assert_allclose(again, torques[order], rtol=0, atol=1e-9 * scale)
+    left = numeric(base_reaction(turned, q[order], qd[order], qdd[order], [at_old], **moving)).ravel()
+    np.testing.assert_allclose(left, 0, rtol=0, atol=1e-9 * scale)
+
+
+def random_loads(rng: np.random.Generator, stance: Stance) -> dict[str, Array]:
+    return {
+        name: numeric(stance.full_load(name, rng.normal(size=len(stance.held_rows[name])))) for name in stance.others
+    }
+
+
+@pytest.mark.parametrize("held", [("left",), ("right",), ("left", "right"), ("right", "left")])
+def test_the_feet_bear_the_rate_of_momentum_that_pinocchio_finds(held: tuple[str, ...]) -> None:
+    """TALOS from its file, floating, against the robot rooted at a foot: the pelvis moves as the stance moves it."""
+    rng = np.random.default_rng(len(held[0]) + len(held))
+    steps = talos_steps(1, 1.0, 1.0)
+    footholds = {name: Foothold.level(rng.normal(), rng.normal(), rng.normal()) for name in held}
+    stance = Stance.on(steps.robot, steps.feet, footholds)
+    model = pinocchio.buildModelFromUrdf(str(urdf_file(*TALOS)), pinocchio.JointModelFreeFlyer())
+    data = model.createData()
+    for _ in range(3):
+        q, qd, qdd = rng.normal(size=(3, stance.joint_size))
+        loads = stance.loads(q, qd, qdd, random_loads(rng, stance))
+        turn, position = numeric_poses(stance.robot, q, stance.world_from_base())[steps.robot.root]
+        motion = link_motions(stance.robot, q, qd, qdd, stance.world_from_base())[steps.robot.root]
+        spin, change = (numeric(part).ravel() for part in (motion.angular_velocity, motion.angular_acceleration))
+        arm = position - numeric(motion.center).ravel()
+        speed = turn.T @ (numeric(motion.velocity).ravel() + np.cross(spin, arm))
+        push = numeric(motion.acceleration).ravel() + np.cross(change, arm) + np.cross(spin, np.cross(spin, arm))
+        configuration, v, a = pinocchio.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        configuration[:3] = position
+        configuration[3:7] = pinocchio.Quaternion(turn).coeffs()
+        v[:6] = np.concatenate([speed, turn.T @ spin])
+        a[:6] = np.concatenate([turn.T @ push - np.cross(turn.T @ spin, speed), turn.T @ change])
+        whole = {joint.name: joint for joint in steps.robot.joints}
+        for name in model.names[2:]:
+            index = model.joints[model.getJointId(name)]
+            if whole[name].moves:
+                at = stance.robot.joint_names.index(name)
+                configuration[index.idx_q], v[index.idx_v], a[index.idx_v] = q[at], qd[at], qdd[at]
+            else:
+                configuration[index.idx_q] = HELD.get(name, 0.0)
+        pinocchio.computeCentroidalMomentumTimeVariation(model, data, configuration, v, a)
+        center = data.com[0]
+        force, moment = np.zeros(3), np.zeros(3)
+        for name, load in loads.items():
+            twisting, pushing = np.split(numeric(load).ravel(), 2)
+            place = numeric(stance.sole_frame(name, q).position).ravel()
+            force, moment = force + pushing, moment + twisting + np.cross(place - center, pushing)
+        scale = stance.weight + np.abs(np.array(data.dhg.linear)).max()
+        np.testing.assert_allclose(force - [0, 0, stance.weight], data.dhg.linear, rtol=0, atol=1e-8 * scale)
+        np.testing.assert_allclose(moment, data.dhg.angular, rtol=0, atol=1e-8 * scale)
+
+
+def test_one_foot_is_a_standing_machine() -> None:
+    """On one sole: same zero moment point, torques and margin as a Standing machine of the same robot and sole."""
+    rng = np.random.default_rng(0)
+    robot, feet = planar_biped(), planar_feet()
+    stance = Stance.on(robot, feet, {"left": Foothold.level(0.3, 0.0)})
+    assert isinstance(feet["left"].sole, Support)
+    sole = rectangle((0.22, 0.44), (-0.05, 0.05))
+    standing = Standing(stance.robot, support=sole, translation=stance.translation, rotation=stance.rotation)
+    q, qd, qdd = rng.normal(size=(3, 6))
+    loads = stance.loads(q, qd, qdd, {})
+    np.testing.assert_allclose(
+        numeric(stance.zero_moment_point(loads)), numeric(standing.zero_moment_point(q, qd, qdd)), atol=1e-10
+    )
+    torques = numeric(standing.joint_torques(q, qd, qdd))
+    np.testing.assert_allclose(numeric(stance.joint_torques(q, qd, qdd, {})), torques, atol=1e-9)
+    pressed = float(stance.pressure("left", loads["left"]))
+    rows = numeric(stance.inside("left", loads["left"])).ravel() / pressed
+    assert len(rows) == 2  # no motion brings it nearer to the sides
+    distances = numeric(sole.distances(standing.zero_moment_point(q, qd, qdd))).ravel()
+    np.testing.assert_allclose(sorted(rows), sorted(distances[np.abs(sole.normals[:, 0]) > 0.5]), atol=1e-9)
+
+
+def test_at_rest_the_center_of_pressure_is_under_the_center_of_mass() -> None:
+    rng = np.random.default_rng(1)
+    steps = talos_steps(1, 1.0, 1.0)
+    rest = np.zeros(12)
+    for name in SIDES:
+        stance = Stance.on(steps.robot, steps.feet, {name: Foothold.level(0.4, -0.2, heading=0.7, height=0.1)})
+        for _ in range(2):
+            q = rng.normal(size=12)
+            loads = stance.loads(q, rest, rest, {})
+            under = numeric(stance.center_of_mass(q)).ravel()[:2]
+            np.testing.assert_allclose(numeric(stance.zero_moment_point(loads)).ravel(), under, rtol=0, atol=1e-9)
+            assert stance.support is not None
+            inside = numeric(stance.inside(name, loads[name])).ravel() / stance.weight
+            np.testing.assert_allclose(inside.min(), float(stance.support.margin(under)), atol=1e-9)
+            assert float(stance.grip(name, loads[name], 0.5)) == pytest.approx((0.5 * stance.weight) ** 2)
+
+
+def test_the_hull_of_the_soles_holds_exactly_what_they_can_share() -> None:
+    """A vertical load anywhere in the hull is shared by points of the soles; outside of it by none."""
+    feet = planar_feet()
+    footholds = {"left": Foothold.level(0.0, 0.0), "right": Foothold.level(0.5, 0.0)}
+    stance = Stance.on(planar_biped(), feet, footholds)
+    assert stance.support is not None
+    np.testing.assert_allclose(np.asarray(stance.support.vertices).min(axis=0), [-0.08, -0.05])
+    np.testing.assert_allclose(np.asarray(stance.support.vertices).max(axis=0), [0.64, 0.05])
+    for at, expected in ((-0.09, False), (-0.07, True), (0.3, True), (0.63, True), (0.65, False)):
+        shares = ca.SX.sym("shares", 2)  # load of the right foot: moment about y and force
+        right = stance.full_load("right", ca.vertcat(shares[0], 0, shares[1]))
+        left = ca.vertcat(0, -at, 0, 0, 0, 1) - ca.vertcat(0, shares[0] - 0.5 * shares[1], 0, 0, 0, shares[1])
+        rows = [part for name, load in (("left", left), ("right", right)) for part in (stance.inside(name, load),)]
+        values = ca.vertcat(*rows, left[5], right[5])
+        problem = {"h": ca.Sparsity(2, 2), "a": ca.jacobian(values, shares).sparsity()}
+        solver = ca.conic("share", "highs", problem, {"error_on_fail": False, "highs": {"output_flag": False}})
+        constant = ca.Function("at", [shares], [values])([0, 0])
+        solver(a=ca.evalf(ca.jacobian(values, shares)), lba=-constant, lbx=-10, ubx=10)
+        assert solver.stats()["success"] is expected
+
+
+def test_what_nothing_stands_on_is_refused_by_name() -> None:
+    robot, feet = planar_biped(), planar_feet()
+    with pytest.raises(ModelError, match="no footholds"):
+        Stance.on(robot, feet, {})
+    with pytest.raises(ModelError, match="'lefd' does not exist; did you mean 'left'"):
+        Stance.on(robot, feet, {"lefd": Foothold.level(0, 0)})
+    with pytest.raises(ModelError, match="is two feet"):
+        Stance.on(robot, {**feet, "again": feet["left"]}, {"left": Foothold.level(0, 0)})
+    both = Stance.on(robot, feet, {name: Foothold.level(0, 0) for name in SIDES})
+    with pytest.raises(ModelError, match=r"loads of the feet \['right'\] are needed"):
+        both.loads(np.zeros(6), np.zeros(6), np.zeros(6), {})
+    aside = {name: Foot(f"{name}_foot", rectangle((-0.1, 0.1), (0.1, 0.2)), (0, 0, -0.08)) for name in SIDES}
+    stance = Stance.on(robot, aside, {"left": Foothold.level(0, 0)})
+    with pytest.raises(ModelError, match="beyond an edge of the sole"):
+        stance.inside("left", ca.DM([0, 0, 0, 0, 0, 1]))
+    askew = Stance.on(robot, feet, {name: Foothold.level(0, 0, heading=0.5) for name in SIDES})
+    with pytest.raises(ModelError, match="not along axes of the world"):
+        _ = askew.held_rows

@@ -1,0 +1,209 @@
+"""Steps: the feet stay where they are held, bear what they can, and the machine stands in the contact simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
+from ocp import Collocation, Limits, ProblemError, Solution, solve
+from ocp.builders.standing import StancePhase, Steps, StepsMotion, plan_steps, steps_motion, steps_problem, walk
+from tests.models.robot.trees import numeric, numeric_poses
+from tests.ocp.builders.bipeds import FRICTION, bent, mirrored, planar_biped, planar_feet, planar_steps, talos_steps
+from tests.ocp.builders.steps_replay import replay
+from tests.ocp.problem.test_phases import failed, moved
+
+MARGIN = 0.01
+GROUND: dict[str, Any] = {"margin": MARGIN, "limits": Limits(friction=FRICTION)}
+
+
+def planned(steps: Steps, **asked: Any) -> tuple[Solution, StepsMotion]:
+    plan = plan_steps(steps, bent(steps), **{**GROUND, **asked})
+    return plan, steps_motion(steps, plan)
+
+
+def assert_stands(motion: StepsMotion, planar: bool, slip: float = 3e-3, lean: float = 0.03) -> None:
+    """In the contact simulation it does not fall, feet that are held stay flat and where they are."""
+    found = replay(motion, FRICTION, planar)
+    assert not found.fell
+    assert found.lean.max() < lean
+    assert found.slip < slip
+    assert found.lifted < slip + 2e-3
+
+
+def assert_feet_hold(steps: Steps, motion: StepsMotion, margin: float = MARGIN) -> None:
+    """Held soles stay on their footholds, press, do not slip, their center of pressure inside; others are clear."""
+    for name, foot in steps.feet.items():
+        assert foot.sole is not None
+        held = motion.held(name)
+        for k, phase in enumerate(steps.phases):
+            inside = motion.phase == k
+            if name in phase.footholds:
+                gap = motion.sole_position[name][inside] - np.asarray(phase.footholds[name].position)
+                assert np.abs(gap).max() < 1e-5
+        assert motion.loads[name][held, 5].min() > -1e-3 * steps.stances[0].weight
+        assert np.nanmax(motion.friction(name)) < FRICTION * 1.01
+        share = motion.loads[name][held, 5] / steps.stances[0].weight
+        points = motion.center_of_pressure(name)[held]
+        distances = (points @ foot.sole.normals.T - (foot.sole.normals * foot.sole.vertices).sum(axis=1)).min(axis=1)
+        assert ((distances - margin) * share).min() > -1e-3
+        assert motion.sole_position[name][:, 2].min() > -5e-4
+    assert motion.margin.min() > margin - 1e-3
+
+
+@pytest.fixture(scope="module")
+def step() -> tuple[Steps, Solution, StepsMotion]:
+    """One dynamic step of the planar biped."""
+    steps = planar_steps(1, 0.6, 0.7)
+    return steps, *planned(steps, method=Collocation(8, degree=3, scheme="legendre"))
+
+
+def test_a_dynamic_step_holds_between_the_nodes_and_stands(step: tuple[Steps, Solution, StepsMotion]) -> None:
+    steps, plan, motion = step
+    audit = plan.audit()
+    assert audit.feasible, str(audit)
+    assert_feet_hold(steps, motion)
+    assert motion.summary()["peak_joint_torque"] <= 200.0
+    assert_stands(motion, planar=True)
+
+
+def test_joints_torques_and_bodies_are_those_of_the_robot(step: tuple[Steps, Solution, StepsMotion]) -> None:
+    """Joints and rates go on through the phases, and the root link carries the feet where the plan has them."""
+    steps, _, motion = step
+    joins = np.flatnonzero(np.diff(motion.phase))
+    assert len(joins) == 2
+    for part in (motion.joints, motion.joint_velocities, motion.root_position, motion.center_of_mass):
+        np.testing.assert_allclose(part[joins], part[joins + 1], rtol=0, atol=1e-8)
+    for k in np.linspace(0, len(motion.t) - 1, 7).astype(int):
+        poses = numeric_poses(steps.robot, motion.joints[k], (motion.root_rotation[k], motion.root_position[k]))
+        for name, foot in steps.feet.items():
+            turn, position = poses[foot.link]
+            np.testing.assert_allclose(position + turn @ foot.translation, motion.sole_position[name][k], atol=1e-9)
+    total = motion.loads["left"] + motion.loads["right"]
+    first = motion.phase == 0
+    push = np.gradient(np.gradient(motion.center_of_mass[first, 2], motion.t[first]), motion.t[first])
+    np.testing.assert_allclose(total[first, 5][5:-5], steps.robot.total_mass * (9.81 + push[5:-5]), rtol=2e-2)
+
+
+def test_planted_faults_of_steps_are_found(step: tuple[Steps, Solution, StepsMotion]) -> None:
+    _, plan, _ = step
+    first, second, third = plan.phases
+    loose, stricter = copy(plan.problem), copy(plan.problem)
+    del loose.declared.path[f"{third}.feet"]
+    slipped = failed(solve(loose, Collocation(3, degree=3, scheme="legendre")).audit(plan.problem))
+    assert {f"{third}.feet", f"{third}.feet position"} <= slipped
+    gap = failed(moved(plan, f"{second}.joints", lambda x, s: x + 0.01 * (1 - s)).audit())
+    assert f"{first} to {second}: joints" in gap
+    tipping, slipping = f"{second}.left center of pressure", f"{second}.left friction"
+    for name, room in ((tipping, 0.04), (slipping, FRICTION**2)):
+        stricter.path(name, stricter.declared.path.pop(name).expression, lower=room)
+    outside = failed(plan.audit(stricter))
+    assert {tipping, slipping} <= outside
+
+
+@pytest.mark.long
+def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
+    """Other links are roots, other joints come first: the same costs, and the same motion by the other legs."""
+    coarse = Collocation(4, degree=3, scheme="legendre")
+    plans = []
+    for steps in (planar_steps(1, 0.8, 0.8), mirrored(planar_steps(1, 0.8, 0.8))):
+        plan = solve(steps_problem(steps, bent(steps), **GROUND), coarse)
+        plans.append((plan.cost, steps_motion(steps, plan, 11)))
+    (cost, right), (again, left) = plans
+    assert again == pytest.approx(cost, rel=1e-7)
+    np.testing.assert_allclose(left.joints[:, [3, 4, 5, 0, 1, 2]], right.joints, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(left.loads["left"], right.loads["right"], rtol=0, atol=1e-3)
+
+
+def docking_arm() -> tuple[Robot, dict[str, Foot]]:
+    """Four joints in the plane y = 0 on a loose base; its hand is a grip."""
+    links = [Link("base", 10.0, (0.0, 0.0, 0.05), 0.1 * np.eye(3))]
+    joints = []
+    for k in range(4):
+        links.append(Link(f"link{k}", 3.0, (0.0, 0.0, 0.15), np.diag([0.025, 0.025, 0.002])))
+        limits: dict[str, Any] = {"lower": -2.5, "upper": 2.5, "velocity": 3.0, "effort": 100.0}
+        place = (0.0, 0.0, 0.1 if k == 0 else 0.3)
+        joints.append(Joint(f"joint{k}", "revolute", links[-2].name, f"link{k}", place, axis=(0, 1, 0), **limits))
+    feet = {"base": Foot("base", rectangle((-0.15, 0.15), (-0.1, 0.1))), "hand": Foot("link3", None, (0.0, 0.0, 0.3))}
+    return Robot(tuple(links), tuple(joints), tip="link3"), feet
+
+
+def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
+    """It reaches out on its base, docks at a wall, and leans further than its base alone would bear."""
+    robot, feet = docking_arm()
+    start = np.array([-0.3, 0.9, 0.6, 0.3])
+    stance = Stance.on(robot, feet, {"base": Foothold.level(0, 0)})
+    target = stance.sole_frame("hand", np.array([0.35, 0.9, 0.2, 0.1]))
+    dock = Foothold(numeric(target.position).ravel(), numeric(target.rotation))
+    base = Foothold.level(0.0, 0.0)
+    phases = [StancePhase({"base": base}, 1.5), StancePhase({"base": base, "hand": dock}, 1.0)]
+    steps = Steps(robot, feet, phases)
+    mesh = Collocation(5, degree=3, scheme="legendre")
+    plan = plan_steps(steps, start, method=mesh, margin=0.01, limits=Limits(friction=FRICTION))
+    motion = steps_motion(steps, plan)
+    assert plan.audit().feasible
+    docked = motion.phase == 1
+    assert np.abs(motion.sole_position["hand"][docked] - np.asarray(dock.position)).max() < 1e-6
+    assert np.isnan(motion.margin[docked]).all()
+    assert np.abs(motion.loads["hand"][docked]).max() > 1.0
+    assert not motion.loads["hand"][~docked].any()
+
+
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_steps_that_cannot_be_are_refused_by_name(step: tuple[Steps, Solution, StepsMotion]) -> None:
+    steps, plan, _ = step
+    start = bent(steps)
+    robot, feet = planar_biped(), planar_feet()
+    here, there = Foothold.level(0, 0), Foothold.level(0.2, 0)
+    refusals: list[tuple[Callable[[], Any], str]] = [
+        (lambda: steps_problem(steps, start + 0.1 * np.eye(6)[3]), "away from its foothold"),
+        (lambda: steps_problem(planar_steps(1, 0.5, 0.6, length=3.0), start), "no posture within the joint limits"),
+        (lambda: steps_problem(steps, start, margin=0.2), "center of mass is .* outside the support"),
+        (lambda: steps_problem(steps, start, limits=Limits(jerk=1.0)), "know no jerk"),
+        (lambda: Steps(robot, feet, []), "no phases"),
+        (lambda: Steps(robot, feet, [StancePhase({"lefd": here}, 1.0)]), "lefd"),
+        (
+            lambda: Steps(robot, feet, [StancePhase({"left": here}, 1.0), StancePhase({"right": here}, 1.0)]),
+            "the machine would leap",
+        ),
+        (
+            lambda: Steps(robot, feet, [StancePhase({"left": here}, 1.0), StancePhase({"left": there}, 1.0)]),
+            "but its foothold moves",
+        ),
+        (lambda: walk({"left": here}, [("right", there)], shift=1.0, swing=1.0), "right"),
+        (lambda: steps_motion(planar_steps(2, 0.5, 0.6), plan), "the plan has the phases"),
+    ]
+    for call, words in refusals:
+        with pytest.raises(ProblemError, match=words):
+            call()
+
+
+# ---- two steps -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("balance", "shift", "swing"), [("dynamic", 0.5, 0.6), ("static", 1.5, 1.5)])
+def test_two_steps_of_the_planar_biped_stand(balance: str, shift: float, swing: float) -> None:
+    steps = planar_steps(2, shift, swing)
+    plan, motion = planned(steps, balance=balance)
+    assert plan.audit().feasible
+    assert_feet_hold(steps, motion)
+    assert (motion.balance.min() > MARGIN - 1e-3) == (balance == "static")
+    assert_stands(motion, planar=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("balance", "shift", "swing"), [("dynamic", 0.8, 0.8), ("static", 2.0, 2.0)])
+def test_two_steps_of_talos_stand(balance: str, shift: float, swing: float) -> None:
+    steps = talos_steps(2, shift, swing)
+    plan, motion = planned(steps, balance=balance, clearance=0.04)
+    assert plan.audit().feasible
+    assert_feet_hold(steps, motion)
+    assert (motion.balance.min() > MARGIN - 1e-3) == (balance == "static")
+    assert_stands(motion, planar=False)
