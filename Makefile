@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages faults browser check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -76,6 +76,9 @@ faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batche
 
 browser: $(VENV)/test.stamp ## open pages of the viewer, and of the site, in a real browser (ARGS=--if-there: where there is one)
 	$(BIN)/python -W ignore -m tests.browser $(ARGS)
+
+installed: $(VENV)/run.stamp ## install the wheel with its extras elsewhere and use it as a new user would
+	$(BIN)/python -m tests.installed $(ARGS)
 
 check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
 	$(BIN)/ruff check .

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,8 @@ STYLE: Any = {
 
 TITLE_SIZE = 10.0
 TITLE_CHARACTERS_PER_INCH = 13.0
+ASSUMING = "What the paper does not print is assumed; the caption beside this file says how"
+"""First sentence of the notes of papers' figures."""
 NOTE_SIZE = 7.0
 NOTE_CHARACTERS_PER_INCH = 19.0  # of the note's font
 
@@ -135,7 +137,43 @@ def add_note(figure: Figure, note: str) -> None:
     if note:
         line = f"{note.rstrip('.')}. ".split(". ")[0]
         text = textwrap.fill(f"{line}.", int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
+        if any(getattr(one, "_outside_loc", None) == "lower" for one in figure.legends):
+            text = f"\n\n{text}"  # room for the legend, which the layout does not leave
         figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
+
+
+def posture(ax: Any, arm: Any, color: Any, width: float = 4.0) -> None:
+    """An arm in a plane: links as bars, joints as white dots, the tip as a dot of its colour.
+
+    Args:
+        arm: Points from the first joint to the tip. Shape (n + 1, 2).
+        color: Of the bars. width: Of them, points.
+    """
+    ax.plot(*arm.T, color="white", lw=width + 1.2, solid_capstyle="round", solid_joinstyle="round")
+    ax.plot(*arm.T, color=color, lw=width, solid_capstyle="round", solid_joinstyle="round")
+    ax.plot(*arm[:-1].T, "o", color="white", ms=0.5 * width, ls="none")
+    ax.plot(*arm[-1], "o", color=color, ms=1.5 * width, mec="white", mew=0.8)
+
+
+def legend_below(figure: Figure, handles: Any, ncols: int) -> None:
+    """A legend under all axes, above the note's line."""
+    line = 0.2 / figure.get_figheight()
+    place = (0.0, line, 1.0, 1.0 - line)
+    figure.legend(handles=handles, loc="outside lower center", ncols=ncols, fontsize=7.5, bbox_to_anchor=place)
+
+
+def dots(ax: Any, values: Sequence[float], names: Sequence[str], colors: Sequence[str]) -> None:
+    """Numbers by name on a logarithmic axis, the first at the bottom: dots, since bars there have no length to compare.
+
+    Args:
+        colors: Of each, names of COLORS.
+    """
+    places = range(len(values))
+    ax.set_xscale("log")
+    ax.scatter(values, places, s=34, color=[COLORS[color] for color in colors], zorder=3)
+    ax.set_yticks(places, names, fontsize=7)
+    ax.set_ylim(-0.7, len(values) - 0.3)
+    ax.grid(visible=True, axis="y", ls=DASHES[3])
 
 
 def time_bar(figure: Figure, axes: Any, horizon: float, *, fraction: float = 0.03, pad: float = 0.01) -> None:
@@ -166,6 +204,7 @@ def gif(
     pictures: list[Image.Image] = []
     canvas: Any = None
     still: Any = None
+    palette: Image.Image | None = None
     with matplotlib.rc_context(STYLE):
         for figure in frames:
             if moving and canvas is not None:
@@ -179,10 +218,22 @@ def gif(
             for artist in moving:
                 figure.draw_artist(artist)
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-            palette = pictures[0] if pictures else None
+            if palette is None:
+                palette = _with_house_colors(picture).quantize(colors)
             pictures.append(picture.quantize(colors, palette=palette, dither=Image.Dither.NONE))
     durations = [round(1000 * seconds)] * len(pictures)
     durations[-1] += round(1000 * hold)
     settings: Any = {"append_images": pictures[1:], "duration": durations, "loop": 0, "optimize": True}
     with written(path) as temporary:
         pictures[0].save(temporary, format="GIF", save_all=True, **settings)
+
+
+def _with_house_colors(picture: Image.Image) -> Image.Image:
+    """A picture above a strip of COLORS, so that a palette made of it has them, however little of each is drawn."""
+    width, height = picture.size
+    made = Image.new("RGB", (width, height + height // 8), "white")
+    made.paste(picture, (0, 0))
+    step = width // len(COLORS)
+    for k, color in enumerate(COLORS.values()):
+        made.paste(Image.new("RGB", (step, height // 8), color), (k * step, height))
+    return made

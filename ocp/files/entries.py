@@ -19,6 +19,8 @@ __all__ = ["Entries", "read_entries"]
 TABLE = re.compile(r"^\s*(\[\[?)\s*([^\[\]#]+?)\s*\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""^\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 AT_LINE = re.compile(r"\(at line (\d+)")
+NEARLY = 0.5
+"""How alike two names are of which the one is taken for the other, 1 if they are equal."""
 Place = tuple[Any, ...]
 
 
@@ -48,7 +50,10 @@ class Entries:
         return error
 
     def missing(self, name: str, expected: str) -> ProblemError:
-        """The error of an entry that is not there."""
+        """The error of an entry that is not there; of one that nobody asks for, where its name is nearly this one."""
+        strange = [one for one in self._values if one not in self._asked]
+        if near := get_close_matches(name, strange, n=1, cutoff=NEARLY):
+            return self.wrong(near[0], f"{near[0]} means nothing here; did you mean {name}? It is {expected}")
         table = ".".join(str(part) for part in self.place if isinstance(part, str))
         where = f"in [{table}]" if table else "at the top"
         return (
@@ -161,6 +166,15 @@ class Entries:
         return [
             Entries(self.file, self._texts, self._lines, (*self.place, name, k), one) for k, one in enumerate(found)
         ]
+
+    def only(self, *names: str) -> None:
+        """Refuse entries of other names than these, before any is read.
+
+        Raises:
+            ProblemError: By line, with what may stand there.
+        """
+        self._asked.extend(names)
+        self.done()
 
     def done(self) -> None:
         """Refuse entries that nobody asked for.

@@ -102,6 +102,7 @@ def read_task(file: FileName) -> Task:
         ProblemError: By line, what is wrong and what was expected.
     """
     root = read_entries(file)
+    root.only("robot", "path", "limits", "cost", "search", "surroundings", "obstacle", "output")
     folder = Path(file).parent
     robot = root.table("robot", "a table [robot] with urdf and tip", REQUIRED)
     assert robot is not None

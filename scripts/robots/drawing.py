@@ -28,7 +28,7 @@ from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]
 DPI = 100
-PALETTE = 256
+PALETTE = 128
 VIEW = (22.0, -58.0)  # elevation, azimuth, deg
 SHARPER = 1.4
 """Pixels of a rendered picture for each of the figure that it stands in."""
@@ -36,7 +36,7 @@ LINE = 0.0028
 """Radius of a line, of the size of the scene."""
 GHOSTS = (0.16, 0.34)
 """Opacity of the first and of the last of the earlier postures."""
-FILM = 30_000
+FILM = 80_000
 """Faces of a robot in an animation."""
 LOOKS = 9
 """Times at which a scene is measured."""

@@ -129,4 +129,4 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         right.legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
     example.save(folder / "panda.npz")
     if animation:
-        animate(folder / "panda.gif", scenes, frames=8 * laps, seconds=0.14, note=note)
+        animate(folder / "panda.gif", scenes, frames=6 * laps, seconds=0.18, note=note)

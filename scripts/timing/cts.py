@@ -175,24 +175,27 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
     rows = [row for row in summary["rows"] if row["targets"] == "random" or "Table" in row["method"]]
     rows = sorted(rows, key=lambda row: -row["ns_per_target"])
     note = (
-        "200 random targets within the joint limits (Tables 3 and 4: the paper's sweep), one core, least of several "
-        "runs of one run, mean over the targets; bars: the slowest target. Compiled: cc " + " ".join(summary["flags"])
+        "Blue: compiled; light: not compiled; whiskers: the slowest target. 200 random targets within the joint limits "
+        "(Tables 3 and 4: the paper's sweep), one core, least of several runs of one run, mean over the targets. "
+        "Compiled: cc " + " ".join(summary["flags"])
     )
-    with drawing.sheet(path, (1, 1), (8.2, 4.8), note) as (_, axes):
+    best = min(rows, key=lambda row: (row["solved"] < 1, row["ns_per_target"]))
+    title = f"The rig's inverse kinematics takes {best['ns_per_target']:.0f} ns a target where all are solved"
+    with drawing.sheet(path, (1, 1), (8.2, 5.0), note, title=title) as (_, axes):
         ax = axes[0, 0]
+        shades = ["blue" if "compiled" in row["method"] else "sky" for row in rows]
+        drawing.dots(ax, [row["ns_per_target"] for row in rows], [row["method"] for row in rows], shades)
         plain = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
         for k, row in enumerate(rows):
-            ax.barh(k, row["ns_per_target"], color=drawing.COLORS["blue" if "compiled" in row["method"] else "sky"])
             right = row["ns_per_target"]
             if row["slowest_ns"] is not None:
                 ax.plot([right, row["slowest_ns"]], [k, k], "-|", color=drawing.COLORS["black"], lw=1)
                 right = max(right, row["slowest_ns"])
             solved = "" if row["solved"] == 1 else f", {100 * row['solved']:.3g} % solved"
-            ax.text(right * 1.15, k, f"{row['ns_per_target']:,.0f} ns{solved}", va="center", fontsize=7, bbox=plain)
-        ax.set_yticks(range(len(rows)), [row["method"] for row in rows], fontsize=7)
+            ax.text(right * 1.35, k, f"{row['ns_per_target']:,.0f} ns{solved}", va="center", fontsize=7, bbox=plain)
         ax.set_xlim(100, 100 * max(row["ns_per_target"] for row in rows))
         ax.axvline(
             1e9 * PAPER_TIMES["combined"] / 200, color=drawing.COLORS["orange"], ls="--", label="paper, combined"
         )
-        ax.set(xscale="log", xlabel="ns a target", title="Inverse kinematics of the captive trajectory rig")
+        ax.set(xlabel="ns a target")
         ax.legend(loc="upper right")

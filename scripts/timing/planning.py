@@ -107,10 +107,13 @@ def report(numbers: dict[str, Any]) -> str:
 def plot(path: Path, numbers: dict[str, Any]) -> None:
     """Times of every case, with the goals."""
     note = (
-        "plan(...) with its checks of reach, search, solves and audits; the robots are read before. Least of three "
-        "runs on one machine; bars are seconds, ticks the goals."
+        "plan(...) with its checks of reach, search, solves and audits; black ticks: the goals. Least of three runs on "
+        "one machine; the robots are read before."
     )
-    with drawing.sheet(path, (1, 1), (7.0, 3.2), note) as (_, axes):
+    met = sum(1 for row in numbers["rows"] if row["goal_s"] and row["plan_s"] <= row["goal_s"])
+    asked = sum(1 for row in numbers["rows"] if row["goal_s"])
+    title = f"From a task to an audited plan in seconds; {met} of {asked} goals are met"
+    with drawing.sheet(path, (1, 1), (7.6, 3.6), note, title=title) as (_, axes):
         axis = np.ravel(axes)[0]
         names = list(CASES)
         for shift, search, color in ((-0.2, "start", "blue"), (0.2, "postures", "green")):
@@ -123,4 +126,4 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
                     axis.plot([row["goal_s"]] * 2, [place - 0.2, place + 0.2], color="black", lw=1)
         axis.set(yticks=range(len(names)), yticklabels=names, xlabel="time, s")
         axis.invert_yaxis()
-        axis.legend()
+        axis.legend(loc="lower right")

@@ -16,6 +16,8 @@ from PIL import Image
 from scripts.drawing import gif, sheet
 from scripts.papers.run import Table, text_table, write, written
 
+RESULTS = Path(__file__).resolve().parents[2] / "results"
+
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
@@ -75,12 +77,23 @@ def test_text_columns_line_up() -> None:
 
 def test_a_figure_has_the_size_asked_for_and_nothing_of_the_time_it_was_made(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
-        with sheet(tmp_path / name, (1, 2), (4.0, 2.0), "assumed " * 30) as (_, axes):
+        with sheet(tmp_path / name, (1, 2), (4.0, 2.0), "assumed. " * 30, title="It is found") as (_, axes):
             assert axes.shape == (1, 2)
             axes[0, 0].plot([0, 1], [0, 1])
     with Image.open(tmp_path / "one.png") as picture:
         assert picture.size == (600, 300)
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    for ending in ("png", "svg", "caption.txt"):
+        assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes()
+    told = (tmp_path / "one.caption.txt").read_text(encoding="utf-8")
+    assert told.startswith("It is found\n")
+    assert told.split().count("assumed.") == 30  # the whole, of which the figure shows the first sentence
+
+
+def test_committed_pictures_are_small() -> None:
+    pictures = [path for ending in ("png", "svg", "gif") for path in RESULTS.rglob(f"*.{ending}")]
+    assert len(pictures) > 50
+    for path in pictures:
+        assert path.stat().st_size < 1.5e6, path
 
 
 def test_a_figure_that_fails_is_not_written(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from models import SmoothPath
 from models.arrays import Array
 from models.paths.blends import BlendKind, polynomial
 from ocp.schedule import joint_motion
-from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
+from scripts.drawing import ASSUMING, COLORS, DASHES, add_note, caption, gif, legend_below, sheet
 from scripts.papers.blend.example import (
     ARM,
     CENTRIPETAL,
@@ -62,7 +62,8 @@ def _legs(ax: Any, degrees: float, length: float) -> None:
 
 def _shapes(folder: Path) -> None:
     sizes = (30, 25, 20, 15)
-    with sheet(folder / "fig03_06_shapes.png", (1, 3), (8.2, 3.4)) as (_, axes):
+    title = "Figures 3, 5 and 6: the shape factor, the remaining length and the angle make the curve"
+    with sheet(folder / "fig03_06_shapes.png", (1, 3), (8.2, 3.7), title=title) as (_, axes):
         cases = (
             ("α = 30 mm, 90° (figure 3)", 90.0, 30.0),
             ("λ = 1, 90° (figure 5)", 90.0, None),
@@ -77,7 +78,8 @@ def _shapes(folder: Path) -> None:
             ax.set_title(title)
         axes[0, 0].set_ylabel("y, mm")
         axes[0, 0].legend(loc="upper left")
-    with sheet(folder / "fig04_07_similarity.png", (1, 2), (7.4, 3.6)) as (_, axes):
+    title = "Figures 4 and 7: equal shape factors make similar curves; the greater the factor, the closer to the corner"
+    with sheet(folder / "fig04_07_similarity.png", (1, 2), (7.8, 4.0), title=title) as (_, axes):
         left, right = axes[0]
         _legs(left, 90, 33)
         for size, dash in ((30, DASHES[0]), (15, DASHES[1])):
@@ -99,8 +101,10 @@ def _differences(folder: Path) -> None:
     note = (
         "90° corner, Lr = 30 mm, sampled at every mm along the path: V = first, A = second difference of the position."
     )
+    title = "Figures 8 and 9: with λ = 1 the curvature jumps where a blend begins and ends, with λ = 3 it does not"
     titles = ("λ = 1 (figure 8)", "λ = 3 (figure 9)", "quintic, λ = 1.5")
-    with sheet(folder / "fig08_09_differences.png", (2, 3), (8.2, 4.4), note, sharey="row", sharex=True) as (_, axes):
+    told: dict[str, Any] = {"title": title, "sharey": "row", "sharex": True}
+    with sheet(folder / "fig08_09_differences.png", (2, 3), (8.2, 4.7), note, **told) as (_, axes):
         for column, (shape, kind), title in zip(axes.T, SHAPES, titles, strict=True):
             path = corner(90, 30 * MM, shape, kind)
             count = int(path.length / MM)
@@ -121,25 +125,35 @@ def _differences(folder: Path) -> None:
 
 
 def _path(folder: Path, results: Results) -> None:
-    task = results.cubic.path
-    grey = {"color": COLORS["grey"], "lw": 0.9, "ls": DASHES[3]}
-    note = "Heights are drawn four times as large as the other lengths."
-    kind = {"projection": "3d"}
-    with sheet(folder / "fig13_path.png", (1, 1), (6.0, 4.2), note, subplot_kw=kind) as (_, axes):
-        ax = axes[0, 0]
+    """The path from above and its height, and how far its blends stay from the corners."""
+    task, path = results.cubic.path, results.cubic
+    s = np.linspace(0, path.length, 2000)
+    smooth = path.at(s).position / MM
+    off = [float(np.linalg.norm(smooth - point / MM, axis=1).min()) for point in POINTS]
+    told: dict[str, Any] = {
+        "title": f"Figure 13: two cubic blends round the path's corners, {off[1]:.0f} and {off[2]:.0f} mm inside them",
+        "width_ratios": (1.25, 1),
+    }
+    grey = {"color": COLORS["grey"], "lw": 1.1, "ls": DASHES[3]}
+    note = "Cubic blends with λ = 3, Lr = 150 mm; thick: the blends"
+    with sheet(folder / "fig13_path.png", (1, 2), (8.4, 3.9), note, **told) as (_, axes):
+        above, height = axes[0]
+        done = 0.0
         for i, length in enumerate(task.lengths):
-            s = np.linspace(0, length, 60)
-            ax.plot(*(task.at(np.full(60, i), s)[0].T / MM), **grey, label="task" if i == 0 else None)
-        smooth = results.cubic.at(np.linspace(0, results.cubic.length, 800)).position / MM
-        ax.plot(*smooth.T, color=COLORS["blue"], label="cubic blends, λ = 3, $L_r$ = 150 mm")
-        ax.plot(*(POINTS.T / MM), "o", ms=3.5, color=COLORS["orange"], label="given points")
-        ax.set(xlabel="x, mm", ylabel="y, mm", title="Global path (figure 13)")
-        ax.set_zlabel("z, mm")
-        spans = [np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())]
-        ax.set_box_aspect((spans[0], spans[1], 4 * spans[2]), zoom=1.1)
-        ax.set_zticks([0, 20, 40, 60])
-        ax.view_init(32, -62)
-        ax.legend(loc="upper left")
+            own = np.linspace(0, length, 60)
+            places = task.at(np.full(60, i), own)[0].T / MM
+            above.plot(*places[:2], **grey, label="task" if i == 0 else None)
+            done += length
+        above.plot(*smooth[:, :2].T, color=COLORS["blue"], lw=1.4, label="path")
+        height.plot(s / MM, smooth[:, 2], color=COLORS["blue"], lw=1.4)
+        for begin, end in zip(path.bounds[1:5:2], path.bounds[2:5:2], strict=True):
+            inside = (s >= begin) & (s <= end)
+            above.plot(*smooth[inside, :2].T, color=COLORS["blue"], lw=4.0, alpha=0.6)
+            height.plot(s[inside] / MM, smooth[inside, 2], color=COLORS["blue"], lw=4.0, alpha=0.6)
+        above.plot(*(POINTS[:, :2].T / MM), "o", ms=4.5, color=COLORS["orange"], label="given points")
+        above.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title="from above")
+        above.legend(loc="best")
+        height.set(xlabel="distance along the path, mm", ylabel="z, mm", title="height")
 
 
 def _mark(ax: Any, edges: Array) -> None:
@@ -157,14 +171,16 @@ def _tool(folder: Path, results: Results) -> None:
     acceleration = place.curvature * motion.speed[:, None] ** 2 + place.tangent * motion.acceleration[:, None]
     paper = ", ".join(f"{time:.3f}" for time in PAPER_TIMES)
     ours = ", ".join(f"{time:.4f}" for time in edges)
-    note = f"Shaded: the blends, which begin and end at {ours} s; printed: {paper} s."
-    with sheet(folder / "fig14_position.png", (1, 1), (6.3, 3.4), note) as (_, axes):
+    note = f"Shaded: the blends. They begin and end at {ours} s; printed: {paper} s."
+    title = "Figure 14: the tool's position"
+    with sheet(folder / "fig14_position.png", (1, 1), (6.3, 3.6), note, title=title) as (_, axes):
         for i, dash in zip(range(3), DASHES, strict=False):
             axes[0, 0].plot(t, place.position[:, i] / MM, ls=dash, label="xyz"[i])
         _mark(axes[0, 0], edges)
-        axes[0, 0].set(xlabel=TIME, ylabel="position, mm", title="Tool position (figure 14)")
+        axes[0, 0].set(xlabel=TIME, ylabel="position, mm")
         axes[0, 0].legend()
-    with sheet(folder / "fig15_velocity.png", (1, 2), (8.2, 3.4), note) as (_, axes):
+    title = "Figure 15: the tool's velocity and acceleration"
+    with sheet(folder / "fig15_velocity.png", (1, 2), (8.2, 3.7), note, title=title) as (_, axes):
         for ax, values, label in zip(
             axes[0], (velocity, acceleration), ("velocity, mm/s", "acceleration, m/s²"), strict=True
         ):
@@ -173,8 +189,8 @@ def _tool(folder: Path, results: Results) -> None:
                 ax.plot(t, values[:, i] / scale, ls=dash, label="xyz"[i])
             _mark(ax, edges)
             ax.set(xlabel=TIME, ylabel=label)
-        axes[0, 0].set_title("Tool velocity (figure 15)")
-        axes[0, 1].set_title("Tool acceleration (figure 15)")
+        axes[0, 0].set_title("velocity")
+        axes[0, 1].set_title("acceleration")
         axes[0, 0].legend()
 
 
@@ -184,10 +200,16 @@ def _joints(folder: Path, results: Results) -> None:
     position, velocity, acceleration, _ = joint_motion(results.joints, plan.at(t))
     edges = plan.time_at(results.cubic.bounds[1:5])
     kinds: tuple[tuple[str, str, tuple[Array, ...], tuple[str, ...], tuple[str, ...]], ...] = (
-        ("fig16_joint_angles.png", "Joint angles (figure 16)", (position,), ("angle, deg",), ("quill, mm",)),
+        (
+            "fig16_joint_angles.png",
+            "Figure 16: the joints follow the blended path smoothly",
+            (position,),
+            ("angle, deg",),
+            ("quill, mm",),
+        ),
         (
             "fig17_joint_rates.png",
-            "Joint rates (figure 17)",
+            "Figure 17: joint rates are smooth, their derivatives bend where blends begin and end",
             (velocity, acceleration),
             ("velocity, deg/s", "acceleration, deg/s²"),
             ("quill, mm/s", "quill, mm/s²"),
@@ -195,7 +217,8 @@ def _joints(folder: Path, results: Results) -> None:
     )
     for file, title, values, labels, quills in kinds:
         shape, size = (len(values), 2), (8.2, 2.9 * len(values))
-        with sheet(folder / file, shape, size, NOTE, sharex=True, xlabel=TIME) as (_, axes):
+        told: dict[str, Any] = {"title": title, "sharex": True, "xlabel": TIME}
+        with sheet(folder / file, shape, (size[0], size[1] + 0.3), f"{ASSUMING}. {NOTE}", **told) as (_, axes):
             for row, value, label, quill in zip(axes, values, labels, quills, strict=True):
                 for joint, dash in zip((0, 1, 3), DASHES, strict=False):
                     row[0].plot(t, np.degrees(value[:, joint]), ls=dash, label=JOINTS[joint])
@@ -204,8 +227,8 @@ def _joints(folder: Path, results: Results) -> None:
                 row[1].set_ylabel(quill)
                 for ax in row:
                     _mark(ax, edges)
-            axes[0, 0].set_title(title)
-            axes[0, 1].set_title("Quill, the vertical axis")
+            axes[0, 0].set_title("shoulder, elbow, wrist")
+            axes[0, 1].set_title("quill, the vertical axis")
             axes[0, 0].legend()
 
 
@@ -219,28 +242,44 @@ def _line_speed(folder: Path, results: Results) -> None:
     acceleration = np.diff(speed) / np.diff(middle)
     edges = plan.time_at(path.bounds[1:5])
     exits = exit_steps(results)
+    mapped, ours = (float(np.abs(_within(results, edges, mapping)).max()) for mapping in MAPPINGS)
+    told: dict[str, Any] = {
+        "title": f"Figure 18: on the blends the line speed stays within {ours:.2g} mm/s of 1000 mm/s, by the paper's "
+        f"mapping within {mapped:.2g} mm/s"
+    }
     note = (
-        "Differences of positions 2 ms apart. Shaded: the blends. Right: speed less the planned one; the default "
+        "Differences of positions 2 ms apart; shaded: the blends. Right: speed less the planned one; the default "
         "mapping leaves the chord against the arc alone, the paper's drifts, which shows as one step of "
         f"{exits[0]:+.1f} and {exits[1]:+.1f} mm/s (beyond the axis) where its blends end."
     )
-    with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.4), note) as (_, axes):
+    with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.8), note, **told) as (_, axes):
         left, centre, right = axes[0]
         left.plot(middle, speed / MM)
-        left.set(xlabel=TIME, ylabel="line speed, mm/s", title="Line speed (figure 18)")
+        left.set(xlabel=TIME, ylabel="line speed, mm/s", title="line speed")
         centre.plot(motion.t[1:-1], acceleration)
-        centre.set(xlabel=TIME, ylabel="line acceleration, m/s²", title="Line acceleration (figure 18)")
+        centre.set(xlabel=TIME, ylabel="line acceleration, m/s²", title="line acceleration")
         for (mapping, name), color, dash in zip(MAPPINGS.items(), ("orange", "blue"), DASHES, strict=False):
             right.plot(results.speed_error_times, results.speed_errors[mapping], COLORS[color], ls=dash, label=name)
-        right.set(xlabel=TIME, ylabel="line speed error, mm/s", ylim=(-0.75, 0.2), title="Speed error, enlarged")
+        right.set(xlabel=TIME, ylabel="line speed error, mm/s", ylim=(-0.95, 0.2), title="speed less the planned one")
         right.legend(loc="lower left")
         for ax in axes[0]:
             _mark(ax, edges)
 
 
+def _within(results: Results, edges: Array, mapping: str) -> Array:
+    """Errors of the line speed by a mapping inside the blends, but for the steps at their ends, mm/s."""
+    t, errors = np.asarray(results.speed_error_times), np.asarray(results.speed_errors[mapping])
+    inside = np.zeros(len(t), dtype=bool)
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        inside |= (t > begin + 2 * PERIOD) & (t < end - 2 * PERIOD)
+    return np.asarray(errors[inside])
+
+
 def _mapping(folder: Path, results: Results) -> None:
     note = "90° corner at 1000 mm/s; cubic with λ = 3, quintic with λ = 1.5. Below 1e-9 the curves show rounding."
-    with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 5.8), note, sharex=True, sharey="row") as (figure, axes):
+    title = "The paper's mapping drifts the more the smaller the blend; Gauss-Legendre and Newton hardly do"
+    told: dict[str, Any] = {"title": title, "sharex": True, "sharey": "row"}
+    with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 6.1), note, **told) as (figure, axes):
         for row, key, label in (
             (axes[0], "drift_um", "|drift| at the blend's end, µm"),
             (axes[1], "true_speed_error_mm_s", "worst |speed error|, mm/s"),
@@ -260,17 +299,18 @@ def _mapping(folder: Path, results: Results) -> None:
             ax.minorticks_off()
         axes[0, 0].set_title("Cubic blend")
         axes[0, 1].set_title("Quintic blend")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        legend_below(figure, axes[0, 0].get_legend_handles_labels()[0], 2)
 
 
 def _curvature(folder: Path, results: Results) -> None:
-    with sheet(folder / "curvature.png", (1, 1), (6.6, 3.4)) as (_, axes):
+    title = "The cubic's curvature jumps where a blend meets the arc, the quintic's does not"
+    with sheet(folder / "curvature.png", (1, 1), (6.6, 3.6), title=title) as (_, axes):
         ax = axes[0, 0]
         kinds = ((results.cubic, "orange", DASHES[0]), (results.quintic, "blue", DASHES[1]))
         for (path, color, dash), name in zip(kinds, ("cubic, λ = 3", "quintic, λ = 1.5"), strict=True):
             s = np.unique(np.concatenate([np.linspace(0, path.length, 6001), path.bounds, path.bounds[1:-1] - 1e-9]))
             ax.plot(s / MM, path.curvature(s) * MM * REMAINING / MM, color=COLORS[color], ls=dash, label=name)
-        ax.set(xlabel="distance, mm", ylabel="curvature × $L_r$", title="Curvature along the example")
+        ax.set(xlabel="distance, mm", ylabel="curvature × $L_r$")
         ax.legend(loc="upper left")
         jump = results.cubic.curvature_jumps()
         at = int(jump.argmax())
@@ -286,12 +326,13 @@ def _curvature(folder: Path, results: Results) -> None:
 
 def _limits(folder: Path, results: Results) -> None:
     note = (
-        "Thick: the schedule; thin: by optimal control, its jerk held over intervals, which costs up to 1 %. "
+        "Thick: the schedule; thin: by optimal control. Its jerk is held over intervals, which costs up to 1 %. "
         f"Centripetal acceleration at most "
         f"{CENTRIPETAL:g} m/s². Joint limits (chosen) of shoulder, elbow, quill, wrist: {joint_limits()}. "
         "The cubic's curvature jumps, so that it can keep no joint jerk limit."
     )
-    with sheet(folder / "limits.png", (2, 2), (9.0, 5.6), note, sharey="row") as (_, axes):
+    title = "Which limits are kept decides the time: blends are slowed down where curvature or joints ask for it"
+    with sheet(folder / "limits.png", (2, 2), (9.0, 5.9), note, title=title, sharey="row") as (_, axes):
         for (upper, lower), kind in zip(axes.T, ("cubic", "quintic"), strict=True):
             mine = {name: plan for name, plan in results.plans.items() if name.startswith(kind)}
             for (name, plan), color, dash in zip(mine.items(), ("grey", "blue", "green"), DASHES, strict=False):
@@ -337,8 +378,8 @@ def _animation(folder: Path, results: Results) -> None:
             ax.remove()
         ax = figure.add_subplot(axes[0, 0].get_gridspec()[:, 0])
         ax.plot(whole[:, 0], whole[:, 1], color=COLORS["grey"], lw=0.8, ls=DASHES[3], label="path")
-        (drawn,) = ax.plot([], [], color=COLORS["blue"], lw=2, label="drawn")
-        (arm,) = ax.plot([], [], "o-", color=COLORS["orange"], lw=4, ms=7, label="arm")
+        (drawn,) = ax.plot([], [], color=COLORS["green"], lw=2, label="drawn")
+        (arm,) = ax.plot([], [], "o-", color=COLORS["blue"], lw=5, ms=8, mfc="white", alpha=0.8, label="arm")
         ax.set_aspect("equal")
         ax.set(xlim=(-480, 860), ylim=(-60, 800), xlabel="x, mm", ylabel="y, mm")
         ax.legend(loc="upper right")
@@ -352,7 +393,7 @@ def _animation(folder: Path, results: Results) -> None:
             moving.append((right.plot([], [], "o", color=COLORS["blue"], ms=5)[0], values))
         axes[1, 1].set_xlabel(TIME)
         axes[0, 1].set_title("Shaded: the blends")
-        add_note(figure, "Seen from above; link lengths 400 mm each and the side of the elbow are assumed.")
+        add_note(figure, "Seen from above; link lengths 400 mm each and the side of the elbow are assumed")
 
     def frames() -> Iterator[Figure]:
         for time, q in zip(times, joints, strict=True):
@@ -368,3 +409,4 @@ def _animation(folder: Path, results: Results) -> None:
 
     artists = [drawn, arm, *(dot for dot, _ in moving), title]
     gif(folder / "motion.gif", frames(), seconds=FRAME, moving=artists)
+    caption(folder / "motion.gif", "A SCARA runs the path with its two blends, in real time", f"{ASSUMING}. {NOTE}")

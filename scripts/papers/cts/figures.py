@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from models import Rig
 from models.arrays import Array
 from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH
-from scripts.drawing import COLORS, DASHES, gif, sheet
+from ocp.app.appearance import Part, part_of, rod
+from ocp.app.rendering import Camera, Layer, render, tube
+from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, gif, legend_below, posture, sheet
 from scripts.papers.cts.plan import draw_plan
 from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, surroundings
 
 UNITS = ("in", *["deg"] * 5)
 ITERATIONS = (("combined", 0.0, "combined"), *(("jacobian", gain, f"Jacobian, gain {gain:g}") for gain in GAINS))
 METHOD_COLORS = ("orange", "green", "purple")
+METHOD_MARKS = "os^"
 
 
 def skeleton(rig: Rig, joints: Array) -> Array:
@@ -47,37 +51,50 @@ def draw(results: Results, folder: Path) -> None:
 
 
 def _joints(folder: Path, results: Results) -> None:
+    """Joints over the sweep: the closed form as a line, the iterations as marks at different targets on it."""
     z = results.targets[:, 2] / INCH
     for number, name in ((7, "i1"), (9, "i2")):
         closed = shown(results.optimal[name].joints)
-        title = f"Figure {number}: joints over the sweep, index {'$I_1$' if name == 'i1' else '$I_2$'}"
         path = folder / f"fig0{number}_joints_{name}.png"
-        with sheet(path, (2, 3), (9.0, 5.0), NOTE, sharex=True, xlabel="target z, in") as (figure, axes):
+        bounds = [f"{results.stability[name, gain]:.3g} with gain {gain:g}" for gain in GAINS]
+        note = (
+            f"{ASSUMING}. {NOTE} The null-space step is stable while the largest gain n6² I'' is below 2: it is "
+            f"{' and '.join(bounds)}."
+        )
+        lost = [gain for gain in GAINS if not results.runs[name, "jacobian", gain].converged.all()]
+        title = f"Figure {number}: with index I{name[1]} " + (
+            f"the Jacobian iteration of gain {' and '.join(f'{gain:g}' for gain in lost)} does not converge "
+            "everywhere; the others reach the global optimum"
+            if lost
+            else "all iterations reach the global optimum, which the closed form gives at once"
+        )
+        told: dict[str, Any] = {"title": title, "sharex": True, "xlabel": "target z, in"}
+        with sheet(path, (2, 3), (9.0, 5.4), note, **told) as (figure, axes):
             for k, ax in enumerate(axes.flat):
-                ax.plot(z, closed[:, k], color=COLORS["blue"], lw=2.5, alpha=0.4, label="global optimum")
-                for (method, gain, label), color, dash in zip(ITERATIONS, METHOD_COLORS, DASHES, strict=False):
-                    joints = shown(results.runs[name, method, gain].joints)
-                    ax.plot(z, joints[:, k], ls=dash, color=COLORS[color], lw=1.2, label=label)
+                ax.plot(z, closed[:, k], color=COLORS["blue"], lw=2.2, label="closed form: the global optimum")
+                for i, ((method, gain, label), mark) in enumerate(zip(ITERATIONS, METHOD_MARKS, strict=True)):
+                    run = results.runs[name, method, gain]
+                    joints = np.where(run.converged[:, None], shown(run.joints), np.nan)
+                    part = slice(5 * i, None, max(len(z) // 13, 1))
+                    style: dict[str, Any] = {"ms": 5, "mfc": "none", "mew": 1.1, "color": COLORS["orange"]}
+                    ax.plot(z[part], joints[part, k], mark, label=label, **style)
                 low, high = closed[:, k].min(), closed[:, k].max()
-                ax.set_ylim(low - 0.5 * (high - low) - 1, high + 0.5 * (high - low) + 1)
+                ax.set_ylim(low - 0.15 * (high - low), high + 0.15 * (high - low))
                 ax.set_ylabel(f"$q_{k + 1}$, {UNITS[k]}")
-            handles, labels = axes[0, 0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside right upper")
-            bounds = [f"gain {gain:g}: {results.stability[name, gain]:.3g}" for gain in GAINS]
-            stable = "largest gain $n_6^2 I''$, stable below 2: " + ", ".join(bounds)
-            figure.suptitle(f"{title}\n{stable}", fontsize=10)
+            legend_below(figure, axes[0, 0].get_legend_handles_labels()[0], 4)
 
 
 def _iterations(path: Path, results: Results) -> None:
     z = results.targets[:, 2] / INCH
-    note = NOTE + " The closed form has no iterations."
-    with sheet(path, (1, 2), (8.2, 3.6), note, sharey=True, xlabel="target z, in") as (_, axes):
+    note = f"The closed form has no iterations. {ASSUMING}. {NOTE}"
+    title = "Figure 8: iterations that a target takes, of each law"
+    with sheet(path, (1, 2), (8.2, 3.9), note, title=title, sharey=True, xlabel="target z, in") as (_, axes):
         for ax, name in zip(axes[0], ("i1", "i2"), strict=True):
             for (method, gain, label), color, dash in zip(ITERATIONS, METHOD_COLORS, DASHES, strict=False):
                 run = results.runs[name, method, gain]
                 text = f"{label}: {int(run.converged.sum())} of {len(z)} converge"
                 ax.plot(z, run.iterations, color=COLORS[color], ls=dash, label=text)
-            ax.set(title=f"Figure 8: iterations, index $I_{name[1]}$", yscale="log", ylim=(0.8, 900))
+            ax.set(title=f"index $I_{name[1]}$", yscale="log", ylim=(0.8, 900))
             ax.legend(loc="upper left")
         axes[0, 0].set_ylabel("iterations to a target")
 
@@ -87,86 +104,127 @@ def _rig(path: Path, results: Results) -> None:
     places = corners(results, table) / INCH
     rows = np.linspace(0, len(places) - 1, 5).astype(int)
     lines = skeleton(results.rig, table.joints[rows])
-    with sheet(path, (1, 2), (9.0, 3.8), NOTE) as (_, axes):
+    turn = float(np.degrees(np.ptp(table.joints[:, 5])))
+    told: dict[str, Any] = {
+        "title": f"Figure 6: over the sweep the roll turns by {turn:.0f}°, and the goose-neck goes round the middle",
+        "width_ratios": (5.5, 1),
+        "sharey": True,
+    }
+    with sheet(path, (1, 2), (9.6, 3.2), f"{ASSUMING}. {NOTE}", **told) as (_, axes):
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
-            for line, row, color in zip(lines, rows, ("blue", "sky", "green", "yellow", "orange"), strict=True):
-                label = f"z = {results.targets[row, 2] / INCH:.1f} in"
-                ax.plot(line[:, i], line[:, k], "-o", ms=3, color=COLORS[color], label=label)
-            ax.plot(places[:, i], places[:, k], color=COLORS["black"], ls=DASHES[3], label="path of $P_G$")
+            for number, (line, row) in enumerate(zip(lines, rows, strict=True)):
+                color = TIME_COLORS(number / (len(rows) - 1))
+                posture(ax, line[:, [i, k]], color, 3.6)
+                ax.plot([], [], color=color, lw=3.6, label=f"z = {results.targets[row, 2] / INCH:.1f} in")
+            ax.plot(places[:, i], places[:, k], color=COLORS["green"], lw=1.6, zorder=5, label="path of $P_G$")
             center = results.tunnel.center / INCH
-            ax.plot(center[i], center[k], "+", ms=10, color=COLORS["black"], label="$P_C$")
-            ax.set(xlabel=f"{'xyz'[i]}, in", ylabel="z, in", aspect="equal")
-        axes[0, 0].set_title("Figure 6: the rig over the sweep, from the side")
+            style: dict[str, Any] = {"ms": 11, "mew": 2, "color": COLORS["black"], "zorder": 6}
+            ax.plot(center[i], center[k], "+", label="$P_C$, the middle", **style)
+            ax.set(xlabel=f"{'xyz'[i]}, in", aspect="equal")
+        axes[0, 0].set(title="from the side", ylabel="z, in")
         axes[0, 1].set_title("from the front")
         axes[0, 1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _release(folder: Path, results: Results) -> None:
-    """The store release: curves, and the rig in motion."""
+    """The store release: the rig as it follows, curves, and an animation."""
     found = results.release
-    note = f"Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. " + NOTE
-    with sheet(folder / "release.png", (2, 2), (8.2, 5.0), note, sharex=True, xlabel="time at full size, s") as (
-        _,
-        axes,
-    ):
+    around, closest = _Scene(results), int(found.clearance.argmin())
+    note = (
+        "The rig and the wing as capsules and a box; earlier postures pale; green: the path of the goose-neck's end. "
+        f"Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. {NOTE}"
+    )
+    title = (
+        f"The rig takes the store along its free fall and comes no nearer to the wing or a wall than "
+        f"{found.clearance[closest] / INCH:.1f} in"
+    )
+    with sheet(folder / "release.png", (2, 4), (9.6, 5.4), note, title=title) as (figure, axes):
+        grid = axes[0, 0].get_gridspec()
+        for ax in axes[:, :2].flat:
+            ax.remove()
+        big = figure.add_subplot(grid[:, :2])
+        big.imshow(around.picture((0, len(found.t) // 2, len(found.t) - 1), (1000, 1000)), interpolation="antialiased")
+        big.set_axis_off()
+        first, second, third, fourth = axes[0, 2], axes[0, 3], axes[1, 2], axes[1, 3]
         move = found.table.targets[:, :3] - found.table.targets[0, :3]
         for k, (label, dash) in enumerate(zip("xyz", DASHES, strict=False)):
-            axes[0, 0].plot(found.t, move[:, k] / INCH, ls=dash, label=label)
+            first.plot(found.t, move[:, k] / INCH, ls=dash, label=label)
         for k, (label, dash) in enumerate(zip(("yaw", "pitch, nose down"), DASHES, strict=False)):
-            axes[0, 1].plot(found.t, np.degrees(found.table.targets[:, 3 + k]), ls=dash, label=label)
-        axes[1, 0].plot(found.t, np.degrees(found.table.joints[:, 5]), label="roll")
-        axes[1, 1].plot(found.t, found.clearance / INCH, label=f"least: {found.nearest[0]} to {found.nearest[1]}")
-        labels = ("displacement in the tunnel, in", "attitude, deg", "roll $q_6$, deg", "clearance of the rig, in")
-        for ax, label in zip(axes.flat, labels, strict=True):
+            second.plot(found.t, np.degrees(found.table.targets[:, 3 + k]), ls=dash, label=label)
+        third.plot(found.t, np.degrees(found.table.joints[:, 5]))
+        fourth.plot(found.t, found.clearance / INCH)
+        fourth.annotate(
+            f"{found.nearest[0]} to {found.nearest[1]}", (0.04, 0.05), xycoords="axes fraction", fontsize=7.5
+        )
+        labels = ("displacement, in", "attitude, deg", "roll $q_6$, deg", "clearance of the rig, in")
+        for ax, label in zip((first, second, third, fourth), labels, strict=True):
             ax.set_ylabel(label)
-            ax.legend(loc="best")
-        axes[1, 1].set_ylim(0, None)
-    _animate(folder / "release.gif", results)
+        for ax in (third, fourth):
+            ax.set_xlabel("time at full size, s")
+        first.legend(loc="lower left")
+        second.legend(loc="upper left", fontsize=7)
+        low, high = second.get_ylim()
+        second.set_ylim(low, high + 0.35 * (high - low))
+        fourth.set_ylim(0, None)
+    _animate(folder / "release.gif", results, around)
 
 
-def _animate(path: Path, results: Results) -> None:
-    found = results.release
-    lines = skeleton(results.rig, found.table.joints)
-    places = corners(results, found.table) / INCH
-    around = surroundings()
-    assert around.walls is not None
-    wing = around.solids[0]
-    with sheet(None, (1, 2), (8.0, 3.6)) as (figure, axes):
-        drawn: list[tuple[Any, Any, Any, Any, int, int]] = []
-        for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
-            half = around.walls.size / (2 * INCH)
-            for side in (-1, 1):
-                ax.axhline(side * half[2], color=COLORS["grey"], lw=2)
-                if i == 1:
-                    ax.axvline(side * half[1], color=COLORS["grey"], lw=2)
-            c, h = wing.position / INCH, wing.size / (2 * INCH)
-            ax.fill_between([c[i] - h[i], c[i] + h[i]], c[k] - h[k], c[k] + h[k], color=COLORS["sky"])
-            (rig,) = ax.plot([], [], "-o", color=COLORS["black"], ms=3.5)
-            (store,) = ax.plot([], [], "-", color=COLORS["orange"], lw=6, solid_capstyle="round")
-            (trail,) = ax.plot([], [], ls=DASHES[3], color=COLORS["blue"])
-            (spot,) = ax.plot([], [], "o", color=COLORS["blue"], ms=5)
-            ax.set(xlabel=f"{'xyz'[i]}, in", ylabel="z, in", aspect="equal", ylim=(-32, 32))
-            ax.set_xlim(*((0, 125) if i == 0 else (-38, 38)))
-            drawn.append((rig, store, trail, spot, i, k))
-        axes[0, 0].set_title("store release, from the side (blue: $P_G$)")
-        axes[0, 1].set_title("from the front")
-        chosen = "Store, ejectors, air, walls, wing and link lengths chosen."
-        title = figure.suptitle(" ", fontsize=9)  # room for the time
-        figure.supxlabel(chosen, x=0.01, ha="left", fontsize=6, color=COLORS["grey"])
+class _Scene:
+    """The rig, the store and the wing as solids, at every sample of the release; in inches."""
+
+    def __init__(self, results: Results) -> None:
+        found = results.release
+        self.lines = skeleton(results.rig, found.table.joints)
+        self.places = corners(results, found.table) / INCH
+        q = ca.SX.sym("q", 6)
+        self.radii = [link.radius / INCH for link in rig_capsules(results.rig, q).values()]
         yaw, pitch = found.table.targets[:, 3:].T
         axis = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         length = SCALE * 2.2 / INCH
-        ends = np.stack([lines[:, -1] - 0.2 * length * axis, lines[:, -1] + 0.8 * length * axis], axis=1)
+        self.stores = np.stack([self.lines[:, -1] - 0.2 * length * axis, self.lines[:, -1] + 0.8 * length * axis], 1)
+        wing = surroundings().solids[0]
+        center, half = wing.position / INCH, wing.size / (2 * INCH)
+        corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + center
+        quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+        faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+        self.still = [
+            part_of("", corner, faces, (*to_rgb(COLORS["grey"]), 1.0)),
+            tube(self.places, 0.35, to_rgb(COLORS["green"])),
+        ]
+        self.points = np.vstack([self.lines.reshape(-1, 3), self.stores.reshape(-1, 3), corner])
+
+    def at(self, row: int) -> list[Part]:
+        """The rig, blue, and the store, dark."""
+        found = []
+        for start, end, radius in zip(self.lines[row, :-1], self.lines[row, 1:], self.radii, strict=True):
+            if np.linalg.norm(end - start) > 1e-6:
+                bar = rod(start, end, radius)
+                found.append(part_of("", bar.vertices, bar.faces, (*to_rgb(COLORS["blue"]), 1.0)))
+        store = rod(self.stores[row, 0], self.stores[row, 1], 0.07 * SCALE * 2.2 / INCH)
+        return [*found, part_of("", store.vertices, store.faces, (0.2, 0.2, 0.22, 1.0))]
+
+    def picture(self, rows: Sequence[int], size: tuple[int, int]) -> Any:
+        """At the last of some samples solid, at those before pale."""
+        layers = [Layer(self.at(rows[-1])), Layer(self.still)]
+        layers += [Layer(self.at(row), 0.25, to_rgb(COLORS["blue"])) for row in rows[:-1]]
+        return render(layers, Camera.around(self.points, size, 14.0, -112.0))
+
+
+def _animate(path: Path, results: Results, around: _Scene) -> None:
+    found = results.release
+    with sheet(None, (1, 1), (5.2, 4.6)) as (figure, axes):
+        figure.set_dpi(100)
+        ax = axes[0, 0]
+        ax.set_axis_off()
+        image = ax.imshow(around.picture((0,), (500, 400)))
+        ax.set_title("The rig takes the store along its fall from the wing")
+        title = figure.suptitle(" ", fontsize=9)  # room for the time
+        add_note(figure, "Store, ejectors, air, walls, wing and link lengths chosen")
 
         def frames() -> Iterator[Figure]:
             for row, time in enumerate(found.t):
-                for rig, store, trail, spot, i, k in drawn:
-                    rig.set_data(lines[row, :, i], lines[row, :, k])
-                    store.set_data(ends[row, :, i], ends[row, :, k])
-                    trail.set_data(places[: row + 1, i], places[: row + 1, k])
-                    spot.set_data(places[row : row + 1, i], places[row : row + 1, k])
+                image.set_data(around.picture((row,), (500, 400)))
                 title.set_text(f"{time:.2f} s, slowed down")
                 yield figure
 
-        artists = [artist for rig, store, trail, spot, *_ in drawn for artist in (rig, store, trail, spot)]
-        gif(path, frames(), seconds=0.08, moving=[*artists, title])
+        gif(path, frames(), seconds=0.08, colors=128, moving=[image, title])

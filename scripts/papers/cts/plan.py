@@ -15,7 +15,7 @@ from models.cts.clearance import Surroundings, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
 from ocp import Collocation, roll_problem, solve
-from scripts.drawing import COLORS, DASHES, sheet
+from scripts.drawing import ASSUMING, COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep
 RATE_LIMIT, ACCELERATION_LIMIT = 0.37, 0.4  # rad/s, rad/s^2
@@ -123,13 +123,16 @@ def plan_summary(found: RollPlan) -> dict[str, Any]:
 def draw_plan(path: Path, found: RollPlan) -> None:
     """Roll, roll rate, I1 and clearance of the plan and of each target by itself."""
     note = (
-        f"Least integral of $I_1$ + {RATE_WEIGHT:g} rate$^2$ + {ACCELERATION_WEIGHT:g} acceleration$^2$ over the "
-        f"paper's sweep; rate at most {RATE_LIMIT:g} rad/s, acceleration {ACCELERATION_LIMIT:g} rad/s$^2$. Limits, "
+        f"{ASSUMING}. Least integral of I1 + {RATE_WEIGHT:g} rate² + {ACCELERATION_WEIGHT:g} acceleration² over "
+        f"the paper's sweep; rate at most {RATE_LIMIT:g} rad/s, acceleration {ACCELERATION_LIMIT:g} rad/s². Limits, "
         "weights and the obstacle, a block beside the goose-neck, are chosen; so are the link lengths."
     )
     names = ("roll", "rate", "index", "clearance")
     labels = ("roll $q_6$, rad", "roll rate, rad/s", "index $I_1$", "clearance of the rig, m")
-    with sheet(path, (2, 2), (8.2, 5.0), note, sharex=True, xlabel="time, s") as (_, axes):
+    title = (
+        "Planned as a whole the roll keeps its rate within the limit and the rig clear; each target by itself does not"
+    )
+    with sheet(path, (2, 2), (8.2, 5.3), note, title=title, sharex=True, xlabel="time, s") as (_, axes):
         for ax, name, label in zip(axes.flat, names, labels, strict=True):
             ax.plot(found.t, getattr(found.single, name), ls=DASHES[1], color=COLORS["orange"], label="each by itself")
             ax.plot(found.t, getattr(found.plan, name), color=COLORS["blue"], label="whole trajectory")

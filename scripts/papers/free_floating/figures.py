@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from models import FreeFloating
 from models.arrays import Array
-from scripts.drawing import COLORS, DASHES, TIME_COLORS, add_note, gif, sheet, time_bar
+from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, caption, gif, posture, sheet, time_bar
 from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL, Search
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE, HORIZON, Trial
 from scripts.papers.free_floating.motion import Motion, outline
@@ -28,7 +28,7 @@ Quantity: TypeAlias = tuple[str, Sequence[str], Callable[[Motion], Array]]
 """Label, names of the columns, and the columns of a motion."""
 
 PLATE = 2.0  # side of the base, m; printed
-STROBE = 0.5  # s between two pictures of the arm
+STROBE = 1.0  # s between two pictures of the arm
 NAMES = ("pseudo-inverse", "optimum")
 FRAME = 0.05  # s between two frames of the animation
 PARTS = (("base", ("x", "y", "angle")), ("joints", ("joint 1", "joint 2", "joint 3")))
@@ -52,17 +52,25 @@ def draw(results: Results, folder: Path) -> None:
 
 def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion) -> None:
     """The figures of both motions, the paper's two of a kind side by side on equal axes."""
-    motions = (local, optimal)
-    with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.2), NOTE, xlabel="x, m", sharey=True) as (figure, axes):
+    motions, note = (local, optimal), f"{ASSUMING}. {NOTE}"
+    costs = [float(np.trapezoid((m.joint_rates**2).sum(axis=1) / 2, m.t)) for m in motions]
+    title = (
+        f"On the same line the optimum needs {100 * costs[1] / costs[0]:.0f} % of the pseudo-inverse's integral of "
+        "half the squared joint rates"
+    )
+    told: dict[str, Any] = {"title": title, "xlabel": "x, m", "sharey": True}
+    with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.6), note, **told) as (figure, axes):
         for ax, motion, name, number in zip(axes[0], motions, NAMES, (3, 8), strict=True):
             _strobe(ax, machine, motion)
             ax.set_title(f"{name} (figure {number})")
         axes[0, 0].set_ylabel("y, m")
         axes[0, 0].legend(loc="lower right")
         time_bar(figure, axes, local.t[-1], fraction=0.04, pad=0.02)
-    with sheet(folder / "optimal_motion.png", (1, 1), (4.6, 5.4), NOTE) as (figure, axes):
+    turn = np.degrees(np.ptp(optimal.base[:, 2]))
+    title = f"The tip runs its line while the free base turns by {turn:.0f}°: the optimum"
+    with sheet(folder / "optimal_motion.png", (1, 1), (5.4, 5.8), note, title=title) as (figure, axes):
         _strobe(axes[0, 0], machine, optimal)
-        axes[0, 0].set(xlabel="x, m", ylabel="y, m", title="Optimal motion on a free-floating base")
+        axes[0, 0].set(xlabel="x, m", ylabel="y, m")
         axes[0, 0].legend(loc="lower right")
         time_bar(figure, axes, optimal.t[-1], fraction=0.04, pad=0.02)
 
@@ -77,15 +85,23 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
     ]
     angles: Quantity = ("joint angle, deg", joints, lambda m: np.degrees(m.joints))
     rates: Quantity = ("joint velocity, deg/s", joints, lambda m: np.degrees(m.joint_rates))
-    _pair(folder / "fig04_09_base_pose.png", motions, (4, 9), 4.6, pose)
-    _pair(folder / "fig06_11_base_velocity.png", motions, (6, 11), 4.6, velocity)
-    _pair(folder / "fig05_10_joint_angles.png", motions, (5, 10), 3.3, [angles])
-    _pair(folder / "fig07_12_joint_velocity.png", motions, (7, 12), 3.3, [rates])
-    with sheet(folder / "fig13_manipulability.png", (1, 1), (6.3, 3.4), NOTE) as (_, axes):
+    turns, peaks = (
+        [float(np.degrees(np.abs(of(m)).max())) for m in motions] for of in (_turn, lambda m: m.joint_rates)
+    )
+    title = f"The base turns by up to {turns[0]:.0f}° by the pseudo-inverse, by up to {turns[1]:.0f}° in the optimum"
+    _pair(folder / "fig04_09_base_pose.png", motions, (4, 9), 4.8, pose, title)
+    title = "The base is jerked where the pseudo-inverse comes near a singularity; the optimum moves it gently"
+    _pair(folder / "fig06_11_base_velocity.png", motions, (6, 11), 4.8, velocity, title)
+    title = "The joints turn fast by the pseudo-inverse near its singularity, evenly in the optimum"
+    _pair(folder / "fig05_10_joint_angles.png", motions, (5, 10), 3.5, [angles], title)
+    title = f"The fastest joint: {peaks[0]:.0f} deg/s by the pseudo-inverse, {peaks[1]:.0f} deg/s in the optimum"
+    _pair(folder / "fig07_12_joint_velocity.png", motions, (7, 12), 3.5, [rates], title)
+    least = int(local.manipulability.argmin())
+    title = f"The pseudo-inverse nearly comes to a singularity at {local.t[least]:.2f} s; the optimum keeps away"
+    with sheet(folder / "fig13_manipulability.png", (1, 1), (6.3, 3.6), note, title=title) as (_, axes):
         ax = axes[0, 0]
         for motion, name, color, dash in zip(motions, NAMES, ("orange", "blue"), DASHES[1::-1], strict=True):
             ax.plot(motion.t, motion.manipulability, color=COLORS[color], ls=dash, label=name)
-        least = int(local.manipulability.argmin())
         where = (local.t[least], local.manipulability[least])
         ax.plot(*where, "o", color=COLORS["orange"], ms=4)
         text = f"{where[1]:.3f} at {where[0]:.3f} s"
@@ -96,9 +112,14 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
         ax.legend(loc="best")
 
 
+def _turn(motion: Motion) -> Array:
+    return np.asarray(motion.base[:, 2] - motion.base[0, 2])
+
+
 def _convergence(folder: Path, rows: Sequence[Row]) -> None:
     """Distance of the cost from the reference against the number of intervals, one curve a method."""
-    with sheet(folder / "convergence.png", (1, 1), (8.2, 3.8), NOTE) as (_, axes):
+    title, note = "The cost converges with the order of each method", f"{ASSUMING}. {NOTE}"
+    with sheet(folder / "convergence.png", (1, 1), (8.2, 4.0), note, title=title) as (_, axes):
         ax = axes[0, 0]
         direct = [row for row in rows if row["intervals"] and row["order"]]
         colors = ("blue", "green", "orange", "purple")
@@ -111,16 +132,17 @@ def _convergence(folder: Path, rows: Sequence[Row]) -> None:
             ax.loglog(intervals, errors, marker=marker, ms=4.5, color=COLORS[color], ls=dash, label=label)
         ax.set_xticks([25, 50, 100, 200], ["25", "50", "100", "200"])
         ax.set_xticks([], minor=True)
-        ax.set(xlabel="intervals", ylabel="|J − J$_{ref}$|, rad$^2$/s", title="Convergence of the cost, horizon 5 s")
+        ax.set(xlabel="intervals", ylabel="|J − J$_{ref}$|, rad$^2$/s", title="horizon 5 s")
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
     """Cost and largest jump of every plan that the solver calls optimal, and what such a jump looks like."""
-    note = f"{ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
+    note = f"{ASSUMING}. {ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
     passed = [t for t in trials if t.audit]
     false = sorted((t for t in trials if t.verdict == FALSE), key=lambda t: t.cost)
-    with sheet(folder / "false_optima.png", (1, 2), (8.2, 3.7), note) as (_, axes):
+    title = f"Of {len(trials)} plans that the solver calls optimal {len(false)} are none: the audit finds their jumps"
+    with sheet(folder / "false_optima.png", (1, 2), (8.2, 4.0), note, title=title) as (_, axes):
         left, right = axes[0]
         kinds = {
             "passes its audit": (passed, "o", "blue"),
@@ -139,7 +161,7 @@ def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
         text = "\n".join(f"J = {cost}: {count} times" for cost, count in sorted(reached.items()))
         left.text(0.3, 0.03, text, transform=left.transAxes, fontsize=8, color=COLORS["blue"])
         left.set(xlabel="largest jump of a joint velocity, deg/s", ylabel="cost J, rad$^2$/s")
-        left.set_title(f"{len(trials)} plans that the solver calls optimal")
+        left.set_title("every plan")
         left.legend(loc="upper left")
         if false:
             shown = false[len(false) // 2]
@@ -158,12 +180,9 @@ def _costates(folder: Path, found: Agreement) -> None:
     solved, reported = costates(indirect, fine), costates(direct)
     off = np.abs(costate_difference(direct, indirect))
     settings: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
-    with sheet(folder / "costates.png", (2, 2), (8.2, 5.4), NOTE, **settings) as (figure, axes):
-        figure.suptitle(
-            "Costates: lines minimum principle, markers direct (Legendre 3, 100 intervals).\n"
-            f"Largest difference, relative to the largest costate: {off.max():.1e}",
-            fontsize=9.5,
-        )
+    note = f"Lines: minimum principle; markers: direct (Legendre 3, 100 intervals). {ASSUMING}. {NOTE}"
+    title = f"The direct plan's costates are those of the minimum principle to {off.max():.1e} of the largest"
+    with sheet(folder / "costates.png", (2, 2), (8.2, 5.6), note, title=title, **settings) as (_, axes):
         for part, (above, below, (title, names)) in enumerate(zip(*axes, PARTS, strict=True)):
             for i, (name, color, dash) in enumerate(zip(names, PALETTE, DASHES, strict=False)):
                 entry, shade = 3 * part + i, COLORS[color]
@@ -187,7 +206,8 @@ def _costates(folder: Path, found: Agreement) -> None:
 def _hamiltonian(folder: Path, found: Agreement) -> None:
     """How far H strays from its mean along the solution of every method."""
     colors = ("black", "purple", "blue", "green", "yellow", "orange", "sky")
-    with sheet(folder / "hamiltonian.png", (1, 1), (8.2, 4.4), NOTE) as (figure, axes):
+    title, note = "Every method keeps the Hamiltonian constant, as far as its order allows", f"{ASSUMING}. {NOTE}"
+    with sheet(folder / "hamiltonian.png", (1, 1), (8.2, 4.6), note, title=title) as (figure, axes):
         ax = axes[0, 0]
         for k, ((name, (t, value)), color) in enumerate(zip(hamiltonians(found).items(), colors, strict=True)):
             mean = value.mean()
@@ -197,17 +217,17 @@ def _hamiltonian(folder: Path, found: Agreement) -> None:
         ax.set(xlabel="time, s", ylim=(1e-14, 1e-3), xlim=(0, found.plan.horizon))
         width = found.plan.horizon / BINS
         ax.set_ylabel(f"|H − its mean|, rad$^2$/s$^2$, largest in every {width:g} s")
-        ax.set_title("The Hamiltonian is constant")
         figure.legend(loc="outside right center", fontsize=7)
 
 
 def _extremals(folder: Path, searches: Sequence[Search]) -> None:
     """Cost of every extremal against the horizon, above the joint velocities of the best of each."""
-    note = f"{ASSUMED}; horizons chosen, not printed. {NOT_GLOBAL}."
+    note = f"{ASSUMING}. {ASSUMED}; horizons chosen, not printed. {NOT_GLOBAL}."
+    title = "Each horizon has several extremals: the best found is not the only minimum"
     settings: dict[str, Any] = {"sharey": "row", "height_ratios": (5, 4)}
     columns = len(searches)
     path = folder / "extremals.png"
-    with sheet(path, (2, columns), (8.2, 5.8), note, **settings) as (figure, axes):
+    with sheet(path, (2, columns), (8.2, 6.0), note, title=title, **settings) as (figure, axes):
         grid = axes[0, 0].get_gridspec()
         for ax in axes[0]:
             ax.remove()
@@ -271,7 +291,7 @@ def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Moti
         names = [f"joint {i + 1}" for i in range(len(curves))]
         axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
-        add_note(figure, NOTE)  # now, not when the block ends: the frames are drawn before
+        add_note(figure, f"{ASSUMING}. {NOTE}")  # now, not when the block ends: the frames are drawn before
         figure.canvas.draw()
         figure.set_layout_engine("none")  # as laid out now: nothing that moves changes it, and it takes half the time
 
@@ -284,14 +304,16 @@ def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Moti
 
         artists = [artist for mine, _ in moving for artist in mine]
         gif(folder / "motion.gif", frames(), seconds=FRAME, moving=[*artists, title])
+    caption(folder / "motion.gif", "The pseudo-inverse and the optimum in real time", f"{ASSUMING}. {NOTE}")
 
 
 def _pair(
-    path: Path, motions: Sequence[Motion], numbers: Sequence[int], height: float, rows: Sequence[Quantity]
+    path: Path, motions: Sequence[Motion], numbers: Sequence[int], height: float, rows: Sequence[Quantity], title: str
 ) -> None:
     """Quantities of both motions over time, a row of axes each."""
     size = (8.2, height)
-    with sheet(path, (len(rows), 2), size, NOTE, xlabel="time, s", sharex=True, sharey="row") as (_, axes):
+    told: dict[str, Any] = {"xlabel": "time, s", "sharex": True, "sharey": "row", "title": title}
+    with sheet(path, (len(rows), 2), size, f"{ASSUMING}. {NOTE}", **told) as (_, axes):
         for line, (label, names, of) in zip(axes, rows, strict=True):
             for ax, motion in zip(line, motions, strict=True):
                 _curves(ax, motion.t, of(motion), names)
@@ -316,9 +338,8 @@ def _strobe(ax: Any, machine: FreeFloating, motion: Motion) -> None:
         color = TIME_COLORS(time / horizon)
         square, arm = shape(motion.base[k], motion.joints[k])
         ends = time in (0.0, horizon)  # the base hardly moves: only its first and last place stand out
-        ax.fill(*square.T, facecolor="none", edgecolor=color, lw=1.4 if ends else 0.7, alpha=1.0 if ends else 0.45)
-        ax.plot(*arm.T, "-o", color=color, lw=1.6, ms=3, solid_capstyle="round")
-        ax.plot(*arm[-1], "o", color=color, ms=5, markeredgecolor="white", markeredgewidth=0.6, zorder=5)
+        ax.fill(*square.T, facecolor=(*color[:3], 0.13 if ends else 0.0), edgecolor=color, lw=1.4 if ends else 0.6)
+        posture(ax, arm, color, 4.5)
     ax.set_aspect("equal")
 
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from models import link_frames
 from models.machines.standing_motion import StandingMotion
-from scripts.drawing import COLORS, DASHES, TIME_COLORS
+from scripts.drawing import COLORS, DASHES, TIME_COLORS, posture
 from scripts.papers.standing.cases import Array, Local, machine
 from scripts.papers.standing.plans import Plan
 
 Quantity: TypeAlias = tuple[str, Callable[[StandingMotion], Array], tuple[float, float] | None]
 """Label, the quantity of a motion at its times, and the ends of the axis."""
 
-POSES = 9
+POSES = 5
 FRAME = ((-0.5, 0.86), (-0.3, 1.4))  # y and z of the pictures, m
 
 
@@ -122,8 +122,7 @@ def strobe(ax: Any, motion: StandingMotion, until: float, horizon: float) -> Non
         k = nearest(motion.t, time)
         color = TIME_COLORS(time / horizon)
         arm = arm_points(motion.joints[k])
-        ax.plot(*arm.T, "-o", color=color, lw=1.4, ms=2.5, solid_capstyle="round")
-        ax.plot(*arm[-1], "o", color=color, ms=4.5, mec="white", mew=0.5, zorder=5)
+        posture(ax, arm, color, 3.4)
         ax.plot(motion.center_of_mass[k, 1], motion.center_of_mass[k, 2], "+", color=color, ms=6, mew=1.2, zorder=6)
         ax.plot(motion.zero_moment_point[k, 1], 0.0, "D", color=color, ms=3.6, mec="white", mew=0.4, zorder=7)
     axes_frame(ax)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from models.machines.standing_motion import StandingMotion
-from scripts.drawing import COLORS, sheet, time_bar
+from scripts.drawing import ASSUMING, COLORS, legend_below, sheet, time_bar
 from scripts.papers.run import Row
 from scripts.papers.standing.animation import draw_animations
 from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS, HORIZON, STIFFNESS, Local, machine, start_tip
@@ -17,7 +17,7 @@ from scripts.papers.standing.drawing import Curve, Quantity, curve_of, curves, d
 from scripts.papers.standing.plans import LIFT_LIMITS, LIFT_SETTINGS, SETTINGS, Plan
 from scripts.papers.standing.results import Results
 
-SYMBOLS = "○ tip, + centre of mass, ◆ zero moment point, grey bar: the foot, | in it: most stable point"
+SYMBOLS = "Dot: tip, + centre of mass, ◆ zero moment point, grey bar: the foot, | in it: most stable point"
 MARKS = "▼ lifts off, ✖ a joint passes 20 rad/s; past the ▼ the law is shown as if the foot were fastened"
 INDEX: Quantity = ("stability index", lambda m: m.index[:, 1], (-5.7, 1.6))
 NEAR: Quantity = ("stability index", lambda m: m.index[:, 1], (0.2, 1.1))
@@ -28,7 +28,7 @@ MANIPULABILITY: Quantity = ("manipulability p2, m²", lambda m: m.manipulability
 
 ZMP: Quantity = ("zero moment point y, m", lambda m: m.zero_moment_point[:, 1], None)
 STYLES = {
-    "no ZMP rule": ("sky", 1),
+    "no ZMP rule": ("orange", 1),
     "in the foot less 0.02 m": ("blue", 0),
     "index ≥ 0.5": ("green", 2),
     "index ≥ 0.9": ("purple", 1),
@@ -45,12 +45,12 @@ def draw(results: Results, folder: Path) -> None:
     plain = curve_of(one["augmented"], "yellow", 0)
     _compared(
         folder / "fig04_zmp_index.png",
-        "figure 4",
+        "Figure 4: the pseudo-inverse and the law that pins the zero moment point fall; the plan stands",
         [
             curve_of(one["pseudo_inverse"], "orange", 1),
             plain,
             curve_of(one["as_printed"], "purple", 2),
-            curve_of(one["stabilised"], "green", 0),
+            curve_of(one["stabilised"], "green", 1),
             pinned,
             in_range,
         ],
@@ -60,14 +60,14 @@ def draw(results: Results, folder: Path) -> None:
     )
     _compared(
         folder / "fig05_joint_limits.png",
-        "figure 5",
+        "Figure 5: keeping from the joints' limits, the pinned law falls even sooner; the plan keeps from both",
         [plain, curve_of(one["joint_limits"], "orange", 1), pinned, in_range],
         (NEAR, LIMIT_INDEX),
         f"{ASSUMED}. {CHOSEN}; others in layers.csv fall as well. {SETTINGS}.",
     )
     _compared(
         folder / "fig06_all_layers.png",
-        "figure 6",
+        "Figure 6: with all layers the pinned law falls soonest; the plan has them all and stands",
         [plain, curve_of(one["all_layers"], "orange", 1), pinned, in_range],
         (NEAR, LIMIT_INDEX, MANIPULABILITY),
         f"{ASSUMED}. {CHOSEN}; others in layers.csv fall as well. {SETTINGS}.",
@@ -83,17 +83,19 @@ def _compared(path: Path, title: str, shown: Sequence[Curve], quantities: Sequen
     """Quantities in rows, the first moments beside the whole motion."""
     last = max(one.diverges or 0.0 for one in shown)
     size = (8.4, 2.1 + 1.75 * len(quantities))
-    with sheet(path, (len(quantities), 2), size, f"{note} {MARKS}.", sharey="row", xlabel="time, s") as (fig, axes):
+    told: dict[str, Any] = {"title": title, "sharey": "row", "xlabel": "time, s"}
+    with sheet(path, (len(quantities), 2), size, f"{MARKS}. {note}", **told) as (fig, axes):
         for column, end in zip(axes.T, (1.1 * last, HORIZON), strict=True):
             lines = diagrams(column, shown, quantities, end)
         for ax in axes[:, 1]:
             ax.set_ylabel("")
         for row, quantity in zip(axes, quantities, strict=True):
             for ax in row if quantity is FORCE else ():
-                ax.axhspan(ax.get_ylim()[0], 0.0, color=COLORS["orange"], alpha=0.12, lw=0)
-        axes[0, 0].set_title(f"{title}: as the local laws fail")
+                ax.axhspan(ax.get_ylim()[0], 0.0, color=COLORS["grey"], alpha=0.18, lw=0)
+                ax.text(0.02, 0.06, "lifts off", transform=ax.transAxes, fontsize=7.5)
+        axes[0, 0].set_title("as the local laws fail")
         axes[0, 1].set_title("the whole motion")
-        fig.legend(handles=lines, loc="outside upper left", ncols=2)
+        legend_below(fig, lines, 2)
 
 
 def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Plan]) -> None:
@@ -113,7 +115,10 @@ def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Pla
     for name, head in (("optimal_pinned_points", "optimal, pinned at 0"), ("optimal_range", "optimal, in the foot")):
         pictures.append((head, "stands to the end", best[name].motion, HORIZON))
     note = f"{SYMBOLS}. Only joint limits keep the arm out of the ground. {ASSUMED}. {CHOSEN}. {GAINS}. {SETTINGS}."
-    with sheet(folder / "fig07_motions.png", (2, 4), (9.4, 6.9), note, sharey=True, xlabel="y, m") as (fig, axes):
+    fallen = sum(one[name].diverges is not None or one[name].reason == "tips" for name in heads)
+    title = f"Figure 7: {fallen} of the {len(heads)} local laws fall, the two plans stand to the end"
+    told: dict[str, Any] = {"title": title, "sharey": True, "xlabel": "y, m"}
+    with sheet(folder / "fig07_motions.png", (2, 4), (9.4, 7.0), note, **told) as (fig, axes):
         for ax, (head, verdict, motion, until) in zip(axes.flat, pictures, strict=True):
             strobe(ax, motion, until, HORIZON if until == HORIZON else until)
             ax.set_title(f"{head}\n{verdict}", fontsize=8.5)
@@ -121,7 +126,6 @@ def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Pla
             ax.set_ylabel("z, m")
         time_bar(fig, axes, 1.0)
         fig.axes[-1].set_ylabel("share of the time shown: to the end, or until it diverges")
-        fig.suptitle("figure 7: motions of Table 1", fontsize=9.5)
 
 
 def _short(found: Local) -> str:
@@ -133,12 +137,13 @@ def _short(found: Local) -> str:
 def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan]) -> None:
     plan, pinned = best["optimal_spring"], best["optimal_spring_pinned_points"]
     rest = start_tip(2)[1]
-    with sheet(folder / "fig09_spring.png", (1, 2), (8.2, 3.2), f"{ASSUMED}.") as (_, axes):
+    title = f"Figure 9: the spring of {STIFFNESS:g} N/m pulls the tip back in proportion to its way"
+    with sheet(folder / "fig09_spring.png", (1, 2), (8.2, 3.5), f"{ASSUMING}. {ASSUMED}.", title=title) as (_, axes):
         left, right = axes[0]
         motion = plan.motion
         left.plot(motion.tip_in_world[:, 1] - rest, motion.external_force[:, 1], color=COLORS["blue"])
         left.set(xlabel="tip beyond its start, m", ylabel="force on the tip, N")
-        left.set_title(f"figure 9: spring of {STIFFNESS:g} N/m")
+        left.set_title("along the tip's way")
         curves(right, [curve_of(plan, "blue", 0)], lambda m: m.external_force[:, 1])
         right.set(xlabel="time, s", ylabel="force on the tip, N", xlim=(0.0, HORIZON), title="in the task of Table 2")
 
@@ -147,21 +152,26 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         f"{SYMBOLS}. {ASSUMED}. The caption and the text of the figure differ in whether the spring pulls: both shown. "
         "The index falls below 0 at ±0.1 m although the foot reaches 0.2 m."
     )
-    with sheet(folder / "fig10_no_zmp.png", (1, 2), (8.2, 4.4), note) as (fig, axes):
+    title = "Figure 10: without a law for the zero moment point the pseudo-inverse leaves the foot"
+    with sheet(folder / "fig10_no_zmp.png", (1, 2), (8.2, 4.6), note, title=title) as (fig, axes):
         left, right = axes[0]
         strobe(left, free.motion, HORIZON, HORIZON)
-        left.set(xlabel="y, m", ylabel="z, m", title="figure 10: pseudo-inverse, without the ZMP law")
+        left.set(xlabel="y, m", ylabel="z, m", title="pseudo-inverse")
         time_bar(fig, [left], HORIZON)
         curves(right, [curve_of(free, "orange", 0), curve_of(bound, "yellow", 1)], lambda m: m.index[:, 1])
         right.axhline(0.0, color=COLORS["grey"], lw=0.8)
         right.set(xlabel="time, s", ylabel="stability index", xlim=(0.0, HORIZON), ylim=(-8.4, 3.4))
         right.legend(loc="upper left", fontsize=7.5)
 
+    told: dict[str, Any] = {}
     held, upright = two["augmented_spring"], two["stabilised_spring"]
     laws = [curve_of(held, "yellow", 0), curve_of(upright, "green", 1)]
     shown = [*laws, curve_of(pinned, "black", 3), curve_of(plan, "blue", 0)]
     note = f"{SYMBOLS}. {MARKS}. {ASSUMED}. {GAINS}. {SETTINGS}."
-    with sheet(folder / "fig11_spring.png", (2, 3), (9.2, 7.4), note, xlabel="time, s") as (fig, axes):
+    largest = float(np.abs(plan.motion.external_force[:, 1]).max())
+    title = f"Figure 11: pulled by a spring of up to {largest:.0f} N the pinned laws fall; planned, the robot stands"
+    told |= {"title": title, "xlabel": "time, s"}
+    with sheet(folder / "fig11_spring.png", (2, 3), (9.2, 7.4), note, **told) as (fig, axes):
         pictures: tuple[tuple[str, Any, float], ...] = (
             (f"(a) augmented law\n{_short(held)}", held.shown, held.diverges or HORIZON),
             ("optimal, pinned at 0\nstands to the end", pinned.motion, HORIZON),
@@ -177,9 +187,7 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         index: Quantity = ("(b) stability index", *NEAR[1:])
         spring: Quantity = ("(c) force of the spring, N", lambda m: m.external_force[:, 1], None)
         lines = diagrams(axes[1], shown, (index, FORCE, spring), HORIZON)
-        fig.legend(handles=lines, loc="outside upper left", ncols=2)
-        largest = float(np.abs(plan.motion.external_force[:, 1]).max())
-        axes[1, 2].set_title(f"figure 11: at most {largest:.0f} N")
+        legend_below(fig, lines, 2)
 
 
 def _draw_plans(folder: Path, plans: Mapping[str, Mapping[str, Plan]]) -> None:
@@ -198,8 +206,8 @@ def _draw_task(path: Path, title: str, shown: Sequence[Curve]) -> None:
         ("joint-limit index p1", lambda m: m.joint_limit_index, None),
         ("manipulability p2, m²", lambda m: m.manipulability, None),
     )
-    title = f"{title} by optimal control; grey: the foot"
-    _four(path, title, f"{ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
+    title = f"{title} by optimal control: the more room the zero moment point has, the slower the joints need to be"
+    _four(path, title, f"{ASSUMING}. {ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
 
 
 def _four(
@@ -212,12 +220,12 @@ def _four(
     legend_columns: int,
 ) -> None:
     """Four quantities of every motion, the first of them the zero moment point over the foot."""
-    with sheet(path, (2, 2), (8.4, 5.8), note, xlabel="time, s") as (fig, axes):
+    with sheet(path, (2, 2), (8.4, 6.0), note, title=title, xlabel="time, s") as (fig, axes):
         lines = diagrams(axes.flat, shown, kinds, end)
         edges = machine().support.vertices[:, 1]
         axes[0, 0].axhspan(edges.min(), edges.max(), color=COLORS["grey"], alpha=0.15, lw=0, zorder=0)
-        axes[0, 0].set_title(title)
-        fig.legend(handles=lines, loc="outside upper left", ncols=legend_columns)
+        axes[0, 0].text(0.98, 0.04, "grey: the foot", transform=axes[0, 0].transAxes, fontsize=7.5, ha="right")
+        legend_below(fig, lines, legend_columns)
 
 
 def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
@@ -234,9 +242,13 @@ def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
         ("vertical ground force, N", lambda m: m.ground_force[:, 2], None),
     )
     note = f"{ASSUMED}. {LIFT_SETTINGS}. Local optima."
-    _four(folder / "minimum_time.png", "the fastest lift of 0.8 m; grey: the foot", note, shown, kinds, longest, 2)
+    free, *kept = (plan.solution.horizon for plan in lifts.values())
+    slower = " and ".join(f"{100 * (one / free - 1):.0f} %" for one in kept)
+    title = f"To stay on its foot the fastest lift of 0.8 m takes {slower} longer"
+    _four(folder / "minimum_time.png", title, f"{ASSUMING}. {note}", shown, kinds, longest, 3)
     note = f"{SYMBOLS}. {note}"
-    with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.5), note, sharey=True) as (fig, axes):
+    told: dict[str, Any] = {"title": title, "sharey": True}
+    with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.7), note, **told) as (fig, axes):
         for ax, plan in zip(axes[0], lifts.values(), strict=True):
             strobe(ax, plan.motion, plan.solution.horizon, longest)
             ax.set_title(f"{plan.request.title}: {plan.solution.horizon:.4f} s")
@@ -251,10 +263,11 @@ def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
     names = {(row["task"], row["plan"]): None for row in rows}
     colors = ("sky", "green", "black", "blue", "orange", "purple", "yellow")
     note = (
-        "Costs against those of Legendre 3 at 40 intervals; lifts (cost T + 1e-5 ∫|q''|² dt) against linear ones at "
+        "Costs against those of Legendre 3 at 40 intervals. Lifts (cost T + 1e-5 ∫|q''|² dt) against linear ones at "
         "100. Held accelerations converge with about the first order where a constraint of the ground is active."
     )
-    with sheet(folder / "convergence.png", (1, 1), (8.4, 3.9), note) as (_, axes):
+    title = "The cost is right to 1 % from 20 to 80 intervals on, by the method"
+    with sheet(folder / "convergence.png", (1, 1), (8.4, 4.1), note, title=title) as (_, axes):
         ax = axes[0, 0]
         for (task, plan), color in zip(names, colors, strict=False):
             for marker, dash, method in (("o", "-", "held"), ("s", "--", "points"), ("^", ":", "linear")):
@@ -270,5 +283,5 @@ def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
         ax.axhline(1.0, color=COLORS["grey"], lw=0.8)
         ax.set_xticks([10, 20, 40, 80, 160], ["10", "20", "40", "80", "160"])
         ax.set_xticks([], minor=True)
-        ax.set(xlabel="intervals", ylabel="cost off by, %", title="Convergence of the cost; grey line: 1 %")
+        ax.set(xlabel="intervals", ylabel="cost off by, %", title="grey line: 1 %")
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)

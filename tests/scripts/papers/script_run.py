@@ -48,8 +48,9 @@ class Run(Generic[Results]):
 
     @property
     def names(self) -> set[str]:
-        """Of the files that were written."""
-        return {path.name for path in self.folder.iterdir()}
+        """Of the files that were written, but for what lies beside each picture: the SVG and the caption."""
+        beside = (".svg", ".caption.txt")
+        return {path.name for path in self.folder.iterdir() if not path.name.endswith(beside)}
 
 
 def run_script(paper: Paper[Results], out: Path, sample: Sample) -> Run[Results]:

@@ -24,7 +24,8 @@ def test_the_loop_of_constraints_finds_the_optimum_of_the_package(
         assert row["build_ratio"] == pytest.approx(row["opti_build_s"] / row["build_s"])
     assert numbers["build_ratio_at_100"] == numbers["rows"][1]["build_ratio"]
     assert 0 < numbers["import_ocp_s"] < 60
-    assert {path.name for path in tmp_path.iterdir()} == {"build_and_solve.csv", "build_and_solve.png"}
+    endings = ("csv", "png", "svg", "caption.txt")
+    assert {path.name for path in tmp_path.iterdir()} == {f"build_and_solve.{ending}" for ending in endings}
 
 
 def test_costates_are_timed_by_four_ways(monkeypatch: pytest.MonkeyPatch) -> None:
