@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from models import Machine
 from models.arrays import Array
 from ocp.builders.clearance import Clear
+from ocp.builders.dynamics import checked_motors, joint_torques
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
@@ -42,6 +43,8 @@ PIECES = 8
 """Of a stretch at least, as a mesh has intervals."""
 LEAST_GAP = 1e-6
 """m and rad: a pose error at the start that is none."""
+SMOOTH = 1e-3
+"""Share of the horizon over which accelerations that are the control go from limit to limit where nothing else asks."""
 STIFFEST = 4.0
 """Powers of e by which the feedback may lower a pose error over a piece: more only makes the mesh finer."""
 
@@ -149,6 +152,7 @@ def tool_motion_problem(
     weights: Array,
     bounds: JointBounds,
     time_cost: float | None = None,
+    driven: bool = False,
     clear: Clear | None = None,
 ) -> ToolMotion:
     """Do tasks while the integral of half the weighted squared joint rates is least.
@@ -168,12 +172,20 @@ def tool_motion_problem(
             the problem is then that of the tasks, its states over it are "joints", "base" and CLOCK, the time, its
             controls are SLOPES, the derivatives of the joints, and PACE, that of the time, at least 1. None where the
             tasks' own time is kept.
+        driven: Whether accelerations (jerks where these are limited) are the control, within the limits of the drives:
+            states "velocities" (and "accelerations") with the suffix of each stretch take the place of the rates, path
+            constraints "torques" and "power" are added, and the tasks are held by their accelerations. Velocities go
+            on from stretch to stretch, and are free at both ends as the rates are. Accelerations (jerks) have the
+            weight SMOOTH squared times the horizon squared (to the fourth) in the cost: without, they would jump.
 
     Raises:
         ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last; a task
             faster than the rates allow in any posture. Where the time is free: several stretches, a base that drifts.
     """
     if time_cost is not None:
+        if driven:
+            words = "a free horizon knows no drives: give a horizon in s, or limits of velocity alone"
+            raise ProblemError(words, name="horizon")
         return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost, clear)
     horizon = stretches[-1].end
     for stretch in stretches:
@@ -192,15 +204,24 @@ def tool_motion_problem(
         told["terminal"] = start if cyclic and ends and not free else None
         place, joints = _declared_states(problem, machine, bounds, stretch.suffix, base if begins else None, told)
         unit = machine.robot.unit("/s")
-        most = bounds.velocity
-        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, lower=-most, upper=most, unit=unit)
+        told = {"size": machine.joint_size, "lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
+        second: Any = None
+        if driven:
+            rates = problem.state(f"velocities{stretch.suffix}", **told)
+            second, smooth = _declare_drives(problem, machine, bounds, stretch, pace, place, joints, rates)
+            running += smooth * pace * horizon**2
+        else:
+            rates = problem.control(f"rates{stretch.suffix}", **told)
         slack = _closure(problem, stretches, base, reference) if cyclic and ends else 0
         if stretch.equations is not None:
             asked = np.ones(stretch.equations.size, dtype=bool)
             slopes = _slopes(stretch, base, reference)
             if passed is not None:
                 asked = ~_within(slopes, passed)
-            _declare_tasks(problem, stretch, place, joints, rates, pace, slack, free, (base, reference), asked)
+            of_drives = None if second is None else (second, machine.base_rate(place, joints, rates))
+            _declare_tasks(
+                problem, stretch, place, joints, rates, pace, slack, free, (base, reference), asked, of_drives
+            )
             passed = slopes[:, stretch.equations.posed | (_places(stretch.equations) & (begins | ~asked))]
         else:
             passed = None
@@ -211,13 +232,16 @@ def tool_motion_problem(
             _declare_clearance(clear, problem, machine, place, joints, stretch, pace, horizon)
         running += pace * ca.dot(rates, ca.DM(weights) * rates) / 2
         states = [*([place] if machine.base_size else []), joints]
+        if driven:
+            states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
         if moving:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
-            unit = "" if machine.base_size else machine.robot.unit()
+            unit = "" if machine.base_size or driven else machine.robot.unit()
             problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*moving[-1]), 0, 0, unit=unit)
         moving.append(states)
         if cyclic and ends and free:
-            problem.end("cyclic", joints - problem.at_start(moving[0][-1]), 0, 0, unit=machine.robot.unit())
+            first = moving[0][1 if machine.base_size else 0]
+            problem.end("cyclic", joints - problem.at_start(first), 0, 0, unit=machine.robot.unit())
     problem.minimize(running=running)
     inside = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in stretches]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
@@ -233,6 +257,50 @@ def _declared_states(
         place = problem.state(f"base{suffix}", machine.base_size, initial=base, unit=unit)
     told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit(), **ends}
     return place, problem.state(f"joints{suffix}", machine.joint_size, **told)
+
+
+def _declare_drives(
+    problem: Problem,
+    machine: Machine,
+    bounds: JointBounds,
+    stretch: Stretch,
+    pace: float,
+    base: Any,
+    joints: Any,
+    rates: Any,
+) -> tuple[Any, Any]:
+    """Accelerations of the joints within what the drives give; and half their squares, or those of the jerks (s^2).
+
+    In units of squared rates over squared horizons.
+    """
+    robot, n, when = machine.robot, machine.joint_size, stretch.suffix
+    horizon = stretch.duration / pace
+    told: dict[str, Any] = {
+        "size": n,
+        "lower": -bounds.acceleration,
+        "upper": bounds.acceleration,
+        "unit": robot.unit("/s^2"),
+    }
+    if np.isfinite(bounds.jerk).any():
+        second = problem.state(f"accelerations{when}", **told)
+        jerks = problem.control(f"jerks{when}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = SMOOTH**2 * horizon**2 * ca.sumsqr(jerks) / 2
+    else:
+        second = problem.control(f"accelerations{when}", **told)
+        smooth = ca.sumsqr(second) / 2
+    problem.dynamics(rates, pace * second)
+    limited = np.flatnonzero(np.isfinite(bounds.torque) | np.isfinite(bounds.power)).tolist()
+    if limited:
+        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        for name, values, low, high, unit in (
+            ("torques", torques, -bounds.torque, bounds.torque, robot.effort_unit),
+            ("power", torques * rates, np.full(n, -np.inf), bounds.power, "W"),
+        ):
+            rows = np.flatnonzero(np.isfinite(high)).tolist()
+            if rows:
+                problem.path(f"{name}{when}", values[rows], lower=low[rows], upper=high[rows], unit=unit)
+    return second, SMOOTH**2 * smooth
 
 
 def _in_free_time(
@@ -339,17 +407,35 @@ def _declare_tasks(
     free: bool,
     reference: tuple[Array, Array],
     asked: NDArray[np.bool_] | None = None,
+    of_drives: tuple[Any, Any] | None = None,
 ) -> None:
     """The tasks of a stretch, over the time of the problem; `free`: what begins here has to be at its start.
 
-    But for rows that are not `asked`, (size,), because what came before leads there.
+    But for rows that are not `asked`, (size,), because what came before leads there. `of_drives`: accelerations of the
+    joints and rate of the base, where these hold the tasks: what begins here has to begin with its velocity, too.
     """
     equations, when = stretch.equations, stretch.suffix
     assert equations is not None
     targets_at = equations.target_function()
     targets = problem.signal(f"targets{when}", lambda time: targets_at(stretch.begin + pace * time))
     residual = ca.cse(equations.residual(base, joints, rates, targets))
-    if equations.size:
+    begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
+    begins &= True if asked is None else asked
+    if equations.size and of_drives is not None:
+        second, drift = of_drives
+        time = ca.MX.sym("time")
+        change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
+        change = problem.signal(f"target rates{when}", lambda time: change_at(stretch.begin + pace * time))
+        at, moving = [joints, rates, targets], [rates, second, change]
+        if equations.machine.base_size:
+            at, moving = [base, *at], [drift, *moving]
+        gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
+        gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*moving)) + ca.DM(gains) * (residual - closure)
+        problem.path(f"task{when}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
+        if begins.any():
+            rows = np.flatnonzero(begins).tolist()
+            problem.start(f"start velocity{when}", (residual - closure)[rows], 0, 0, unit=equations.unit())
+    elif equations.size:
         problem.path(f"task{when}", residual - closure, lower=0, upper=0, unit=equations.unit())
     most = equations.most_lean
     if most.size:
@@ -360,8 +446,6 @@ def _declare_tasks(
         problem.watch(f"{name}{when}", **{**stray, "way": pace * stray["way"]})
     if not free:
         return
-    begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
-    begins &= True if asked is None else asked
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
     # a velocity says nothing of places: at the start of the motion its tip is where the reference has it
     held = [] if stretch.begin else [equations.holding(base, joints, *reference)]

@@ -17,6 +17,7 @@ speed = 0.05                        # m/s; with acceleration and jerk it starts 
 # tool = "given"                    # the whole orientation as the file has it; or "free": position alone
 [limits]
 velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow = 1.5 }
+# torque = { elbow = 40 }           # N m or N; acceleration, jerk, power (W) likewise
 [cost]
 weights = { elbow = 4 }             # of squared joint rates; 1 of all others
 [search]
@@ -69,6 +70,14 @@ from ocp.tasks.tip_task import TipTask
 __all__ = ["OUTPUTS", "Task", "read_task"]
 
 OUTPUTS = ("plan", "csv", "json", "yaml", "mcap", "urdf", "report")
+LIMITED = {
+    "velocity": "rad/s or m/s",
+    "acceleration": "rad/s^2 or m/s^2",
+    "jerk": "rad/s^3 or m/s^3",
+    "torque": "N m or N",
+    "power": "W",
+}
+"""What of joints is limited."""
 LEAST, MOST = 0.999e-6, 1e6
 """Of what a schedule is asked for, in SI units: what is beyond is no machine's."""
 STRAY = 1e-3
@@ -220,10 +229,13 @@ def _path(entries: Entries, folder: Path) -> SmoothPath:
 
 
 def _limits(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    velocity = _each(entries, "velocity", names, np.inf, "a number above 0, rad/s or m/s, or { joint = number }")
-    positions = entries.flag("positions", True)
-    with _about(entries, "velocity"):
-        return {"limits": Limits(velocity=velocity, joints=positions)}
+    given: dict[str, Any] = {}
+    for what, unit in LIMITED.items():
+        expected = f"a number above 0, {unit}, or {{ joint = number }}"
+        with _about(entries, what):
+            given[what] = _each(entries, what, names, np.inf, expected)
+            Limits(**{what: given[what]})
+    return {"limits": Limits(**given, joints=entries.flag("positions", True))}
 
 
 def _cost(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import numpy as np
 from models import Machine, ModelError, Standing, Surroundings
 from models.arrays import Array
 from ocp.builders.clearance import Clear
+from ocp.builders.dynamics import checked_motors
 from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.errors import (
@@ -34,6 +35,7 @@ from ocp.local.inverse_kinematics import LARGEST_SEED
 from ocp.planning.candidates import TOUCHES, Maker, coarse_motions, fine_motions
 from ocp.planning.cells import CellSearch, follows
 from ocp.planning.dead_end import DeadEnd
+from ocp.planning.driven import driven_plan, limits_drives, without_drives
 from ocp.planning.motion import Candidate, Plan
 from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled, touches_at_the_start
 from ocp.planning.standing import plan_to_stand
@@ -88,7 +90,10 @@ def plan(
         start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
         cyclic: Whether the joints end where they start.
         weights: Of the squared joint rates, shape (n,); all 1 if None.
-        limits: Of the joints' positions and rates; the robot's own if None.
+        limits: Of the joints' positions and rates; the robot's own if None. Where accelerations, jerks, torques or
+            power are given, they hold at all times, and the robot's own torques with them, at the same cost (see
+            `ocp.planning.driven`). Rates are then continuous, but as free at both ends as without: a machine that is to
+            start from rest is asked to by its tasks, and what these leave free may move there.
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
@@ -127,6 +132,19 @@ def plan(
         )
     asked = _checked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
     asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits))
+    maker, made = _planned(asked, search)
+    if limits is None or not limits_drives(limits):
+        return made
+    return driven_plan(asked, maker.start, maker.reference, made, limits)
+
+
+def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
+    """The plan under limits of positions and rates, and what made it.
+
+    Raises:
+        ProblemError, SolveError: As `plan`.
+    """
+    machine = asked.machine
     postures = postures_at_the_start(asked)
     if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
         words = f"start: {touch}; start clear of everything, or name what may touch: ignored=[{touch.bodies}]"
@@ -146,10 +164,10 @@ def plan(
             alone = len(postures) == 1 and not floats
             told.append(maker.solved(joints, maker.motion.guess(followed, 0), thorough=alone))
             if not told[-1].why or alone:
-                return maker.plan(told)
+                return maker, maker.plan(told)
     followed = followed_from(asked, postures)
     if floats and (search == "global" or len(postures) == 1):
-        return maker.plan(told + _through_cells(maker, followed, postures, every=search == "global"))
+        return maker, maker.plan(told + _through_cells(maker, followed, postures, every=search == "global"))
     searched = TaskSearch(asked, followed) if search == "global" else None
     if searched is not None:
         if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
@@ -157,14 +175,14 @@ def plan(
         found = searched.followed()
         told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
         if any(not one.why for one in told):
-            return _bounded(maker.plan(told), searched.bound)
+            return maker, _bounded(maker.plan(told), searched.bound)
         while searched.looked_closer():
             if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
                 raise end
     told += fine_motions(maker, coarse_motions(maker, followed, postures), first=search == "start")
     if all(one.why and not one.why.startswith(TOUCHES) for one in told):  # whatever helps a solver, and what conflicts
         if floats:
-            return maker.plan(told + _through_cells(maker, followed, postures, every=False))
+            return maker, maker.plan(told + _through_cells(maker, followed, postures, every=False))
         told.append(maker.solved(postures[0], maker.motion.guess(followed, 0), thorough=True))
     try:
         made = maker.plan(told)
@@ -172,7 +190,7 @@ def plan(
         if searched is not None and (end := searched.dead_end()) is not None:
             raise end from error
         raise
-    return made if searched is None else _bounded(made, searched.bound)
+    return maker, made if searched is None else _bounded(made, searched.bound)
 
 
 def _through_cells(maker: Maker, followed: list[Followed], postures: Array, every: bool) -> list[Candidate]:
@@ -276,10 +294,12 @@ def _checked(
             words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
-    for what in ("acceleration", "jerk", "torque", "power"):
-        if getattr(told, what) is not None:
-            words = f"limits: least joint velocity knows no {what}; leave it out, and schedule the path under it"
-            raise ProblemError(words, name=what, value=getattr(told, what))
+    if limits_drives(told):
+        checked_motors("plan: limits of drives", machine)
+        told.bounds(machine)
+        if free:
+            words = "a free horizon knows no limits of drives; give it in s, or limit the rates alone"
+            raise ProblemError(words, name="horizon", value=horizon)
     if horizon is None or free:
         ends = [task.end for task in given if task.duration is not None]
         if not ends:
@@ -307,7 +327,7 @@ def _checked(
         joints,
         place,
         heavy,
-        told,
+        without_drives(told),
         cyclic,
         int(seed),
         float(time_cost) if free else None,

@@ -186,6 +186,8 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("size = [0.1, 0.1, 0.1]", "size = [0.1, 0.1, -0.1]", 16, "positive"),
         ("[search]", "[serch]", 11, "did you mean search"),
         ("[search]", "[limits]\nvelocity = { elbow = 0 }\n[search]", 12, "velocity"),
+        ("[search]", "[limits]\ntorque = { elbow = -4 }\n[search]", 12, "torque"),
+        ("[search]", "[limits]\npower = 'much'\n[search]", 12, "W, or { joint = number }"),
         ('plan = "seam.npz"', 'plan = "no/where/seam.npz"', 20, "no folder"),
     ],
 )

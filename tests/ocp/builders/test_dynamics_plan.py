@@ -86,6 +86,7 @@ def test_a_path_that_is_free_is_faster_than_any_that_is_given(fastest: Solution)
     assert fastest.horizon * (1 - 1e-3) < own < fastest.horizon * 1.02  # the passes are of the first order
 
 
+@pytest.mark.long
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
     asked: dict[str, Any] = {"end_joints": END, "limits": Limits(torque=MOST)}
     mixed = plan_dynamics(MACHINE, START, SOON, effort=Effort(torque=1e-3, time=1.0), **asked)

@@ -82,13 +82,7 @@ CASES = [
             "cyclic": FLAG | {"though it ends elsewhere": True},
             "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
             "limits": but(INSTANCE, "None")
-            | {
-                "class": Limits,
-                "acceleration": Limits(acceleration=1.0),
-                "jerk": Limits(jerk=1.0),
-                "torque": Limits(torque=1.0),
-                "too many": Limits(velocity=[1.0, 2.0]),
-            },
+            | {"class": Limits, "torque of two": Limits(torque=[1.0, 2.0]), "too many": Limits(velocity=[1.0, 2.0])},
             "search": CHOICE,
             "seed": WHOLE,
             "time_cost": POSITIVE,
