@@ -15,10 +15,12 @@ from ocp.direct.assembly import Program
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "conditions", "curves_upwards", "held_by", "still_holds"]
+__all__ = ["Conditions", "conditions", "corrected", "curves_upwards", "held_by"]
 
 PUSHES = 1e-8
 """Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
+FLAT = 1e-7
+"""Largest slope, in units of the solver, along what no limit holds; a plan costs the square of it too much."""
 PRICES = (1e3, 1e6)
 """Of what misses the constraints, against the largest curvature, where it is asked whether the rest curves upwards."""
 
@@ -77,25 +79,34 @@ def held_by(
     return sides
 
 
-def still_holds(
+def corrected(
     program: Program,
     outcome: Outcome,
     arguments: dict[str, np.ndarray],
     scales: Scales,
     sides: dict[str, np.ndarray],
     tolerance: float,
-) -> bool:
-    """Whether what was found with some limits held and others let go is right: none is missed, all held ones push."""
+) -> dict[str, np.ndarray] | None:
+    """Which limits to hold next, after some were held and the others let go: those that push, and those missed.
+
+    Where these are the same as before, what was found is right. None where the cost still falls along what is free,
+    as where rounding ended the solve too early. Hintermueller, Ito, Kunisch 2002, The primal-dual
+    active set strategy as a semismooth Newton method.
+    """
     push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
+    if not np.all(np.abs(push["x"][free]) <= FLAT):  # nor where it is no number
+        return None
+    found = {}
     for kind, unit in units.items():
         value, side = values[kind] / unit, sides[kind]
         low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
         room = tolerance * np.maximum(1.0, np.abs(value))
-        idle = (side != 0) & (push[kind] * side <= PUSHES)  # it pulls, or others do its work
-        if np.any(value < low - room) or np.any(value > high + room) or np.any(idle):
-            return False
-    return True
+        kept = np.where(push[kind] * side > PUSHES, side, 0.0)  # the others pull, or more do their work
+        missed = np.where(low < high, 1.0 * (value > high + room) - (value < low - room), 0.0)
+        found[kind] = np.where(missed != 0, missed, kept)
+    return found
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:

@@ -156,6 +156,10 @@ class _Handle:
             before = np.concatenate([[0], np.cumsum(counts[which])])
             position[order] = np.arange(len(order)) - before[stage[order]]
         ng, ni = counts[EQUALITY], counts[INEQUALITY]
+        # fatrop would end the whole process
+        if np.any(ng > tables.nx + tables.nu):
+            crowded = int(np.argmax(ng - tables.nx - tables.nu))
+            raise RuntimeError(f"stage {crowded} has {ng[crowded]} equalities, more than it has variables; use ipopt")
         self.slack = np.concatenate([[0], np.cumsum(ni)])
         self.duals = int(tables.nx[1:].sum() + ng.sum() + ni.sum())
 

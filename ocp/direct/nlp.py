@@ -43,7 +43,7 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-NATIVE = {"tol": 1e-10, "print_level": 0, "max_iter": 300, "linsol_lu_fact_tol": 1e-3}
+NATIVE = {"tol": 1e-10, "print_level": 0, "max_iter": 120, "linsol_lu_fact_tol": 1e-3}
 SLEQP = {"print_level": 0, "max_iter": 1000}
 DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "native": NATIVE, "fatrop": FATROP, "sleqp": SLEQP}
 SOLVERS = tuple(DEFAULTS)

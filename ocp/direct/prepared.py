@@ -24,7 +24,7 @@ from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, names_told
-from ocp.direct.kkt import curves_upwards, held_by, still_holds
+from ocp.direct.kkt import corrected, curves_upwards, held_by
 from ocp.direct.known import Known
 from ocp.direct.native import NativeSolver, why_not
 from ocp.direct.nlp import (
@@ -62,6 +62,7 @@ __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
 COMMON = ("tol", "max_iter", "print_level")  # options that all solvers but sleqp take
 MOST_KEPT = 8  # plans, with what is known of them for solves that begin there
+MOST_HELD = 8  # sets of limits held in turn, near a plan
 MOST_STEPS = 20  # of Newton's, where the limits that push are held to be known
 MOST_ELSEWHERE = 200  # iterations from each other start
 
@@ -269,7 +270,8 @@ class Prepared:
         With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
         and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
         From one of the last plans that ``native`` found here, the limits that pushed there are held first, and the
-        others let go, which takes a few steps; where others push at the new parameters it is solved as ever.
+        others let go, which takes a few steps; then those that come out of it. Where that ends nowhere it is solved
+        as ever.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         """
         with limited(checked_time_limit(time_limit)), self._lock:
@@ -388,27 +390,36 @@ class Prepared:
         self._found.append((found.solution.variables, found.scales, sides))
 
     def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds) -> Solution | None:
-        """The plan where the same limits push as in the guess, one of the last that native found here; None otherwise.
+        """The plan beside the guess, one of the last that native found here; None where it is not near.
 
-        With these limits held and the others let go Newton's steps alone are left, from where the last ones ended.
+        With the limits held that push, and the others let go, Newton's steps alone are left, from where the last ones
+        ended. First those are held that pushed in the guess, then what comes out of it says which.
         """
         kept = [each for each in self._found if isinstance(guess, Solution) and each[0] is guess.variables]
         if not kept or not isinstance(guess, Solution):
             return None
         variables, scales, sides = kept[0]
-        own = dict(arguments)
-        for kind, side in sides.items():
-            low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
-            given = low == high
-            own[f"lb{kind}"] = np.where(given | (side < 0), low, np.where(side > 0, high, -np.inf))
-            own[f"ub{kind}"] = np.where(given | (side > 0), high, np.where(side < 0, low, np.inf))
-        found = self._attempt(GUESS, variables, set(), own, bounds, self._warm, scales)
-        if found.outcome.status != "Solve_Succeeded":
-            return None
-        if not still_holds(self.program, found.outcome, arguments, scales, sides, ROUNDING):
-            return None
-        self._keep(found, sides)
-        return found.with_curvature(guess.regularised).solution
+        tried: list[dict[str, np.ndarray]] = []
+        while len(tried) < MOST_HELD and not any(_same(sides, each) for each in tried):
+            tried.append(sides)
+            own = dict(arguments)
+            for kind, side in sides.items():
+                low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
+                given = low == high
+                own[f"lb{kind}"] = np.where(given | (side < 0), low, np.where(side > 0, high, -np.inf))
+                own[f"ub{kind}"] = np.where(given | (side > 0), high, np.where(side < 0, low, np.inf))
+            found = self._attempt(GUESS, variables, set(), own, bounds, self._warm, scales)
+            if not found.outcome.success:
+                return None
+            after = corrected(self.program, found.outcome, arguments, scales, sides, ROUNDING)
+            if after is None:
+                return None
+            sides = after
+            if _same(sides, tried[-1]):
+                self._keep(found, sides)
+                return found.with_curvature(guess.regularised).solution
+            variables = found.outcome.variables
+        return None
 
     @cached_property
     def _warm(self) -> tuple[Any, Any]:
@@ -613,6 +624,11 @@ def transcribed(form: Formulation, method: DirectMethod, solver: str) -> tuple[s
             why = str(error)
     LOG.info("problem %r is solved by ipopt, not by native: %s", form.name, why)
     return "ipopt", method.transcribe(form)
+
+
+def _same(sides: dict[str, np.ndarray], others: dict[str, np.ndarray]) -> bool:
+    """Whether the same limits are held."""
+    return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

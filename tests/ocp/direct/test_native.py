@@ -202,6 +202,22 @@ def test_a_guess_of_another_make_is_taken_as_a_guess() -> None:
     assert prepared.solve(MOVED, first).cost == pytest.approx(second.cost, rel=1e-10)
 
 
+@pytest.mark.parametrize("method", ["radau", "rk4-held"])
+@pytest.mark.parametrize("change", [{"fastest": 0.7}, {"strength": 0.5}, {"way": 1.2}, {"fastest": 0.8}], ids=str)
+def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(
+    method: str, change: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = built(moved(), FINE[method])
+    near = prepared.solve(MOVED)
+    cold = prepared.solve(MOVED | change)
+    monkeypatch.setattr(prepared, "_solver", None)  # which begins anew, inside all limits
+    warm = prepared.solve(MOVED | change, near)
+    assert warm.cost == pytest.approx(cold.cost, rel=1e-9)
+    assert warm["v"].max() <= (MOVED | change)["fastest"] + 1e-8
+    pushed = {bool(plan["v"].max() > (MOVED | change)["fastest"] - 1e-6) for plan in (warm, cold)}
+    assert len(pushed) == 1
+
+
 # ---- where it cannot ---------------------------------------------------------------------------------------------
 
 
@@ -240,6 +256,19 @@ def test_ipopt_takes_over_by_name_where_the_tolerance_is_missed() -> None:
     plan = solve(problem, Collocation(12), solver="native")
     assert plan.solver == "ipopt"
     assert plan.cost == pytest.approx(4.0, abs=2e-3)
+
+
+def test_more_equalities_in_a_stage_than_variables_are_refused_and_do_not_end_the_process() -> None:
+    problem = Problem("crowded")
+    x, u = problem.state("x", initial=0.0), problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.path("rate", u, 1.0, 1.0)
+    problem.path("twice", 2 * u, 2.0, 2.0)
+    problem.path("place", x - problem.time, 0.0, 0.0)
+    problem.minimize(running=u**2)
+    with pytest.raises(SolveError, match="Not_Enough_Degrees_Of_Freedom"):
+        solve(problem, Collocation(4), solver="native")
 
 
 @pytest.mark.parametrize("method", ["radau", "rk4-held"])
