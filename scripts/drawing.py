@@ -137,8 +137,10 @@ def add_note(figure: Figure, note: str) -> None:
     if note:
         line = f"{note.rstrip('.')}. ".split(". ")[0]
         text = textwrap.fill(f"{line}.", int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
-        if any(getattr(one, "_outside_loc", None) == "lower" for one in figure.legends):
-            text = f"\n\n{text}"  # room for the legend, which the layout does not leave
+        for legend in figure.legends:
+            if getattr(legend, "_outside_loc", None) == "lower":  # the layout leaves no room for both
+                rows = -(-len(legend.get_texts()) // getattr(legend, "_ncols", 1))
+                text = "\n" * (2 * rows) + text
         figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
 
 
