@@ -263,8 +263,9 @@ def _draw_convergence(folder: Path, rows: Sequence[Row]) -> None:
     names = {(row["task"], row["plan"]): None for row in rows}
     colors = ("sky", "green", "black", "blue", "orange", "purple", "yellow")
     note = (
-        "Costs against those of Legendre 3 at 40 intervals; grey line: 1 %. Lifts (cost T + 1e-5 ∫|q''|² dt) "
-        "against linear ones at 100. Held accelerations converge with about the first order where a constraint of the ground is active."
+        "Costs against those of Legendre 3 at 40 intervals; grey line: 1 %. Lifts (cost T + 1e-5 ∫|q''|² dt) against "
+        "linear ones at 100. Held accelerations converge with about the first order where a constraint of the ground "
+        "is active."
     )
     title = "With accelerations free at points the cost is right to 0.1 % at 20 intervals; held ones need more"
     with sheet(folder / "convergence.png", (1, 1), (8.4, 4.1), note, title=title) as (_, axes):
