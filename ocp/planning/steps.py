@@ -136,53 +136,88 @@ class Squares:
 
     def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
         here, there = out.charts, into.charts
-        heavy = there.tangents * self.weights[:, None]
-        turn = heavy.transpose(0, 2, 1) @ here.tangents
-        flat = np.einsum("pnr,pn->pr", heavy, delta)
-        near, on = _nearest(flat, turn, here, there, after, seconds)
-        bends = np.einsum("pnab,pa,pb->pn", into.bends, on, on) - np.einsum("pnab,pa,pb->pn", out.bends, near, near)
-        across = delta - np.einsum("pnr,pr->pn", here.tangents, near) + bends / 2
-        across -= np.einsum("pnr,pr->pn", there.tangents, np.einsum("pnr,pn->pr", heavy, across))
-        pull, size = self.weights * across / seconds, (self.weights * across**2).sum(axis=1) / seconds
-        lost = np.einsum("pcn,pn->pc", out.rest, pull).max(axis=1, initial=0.0)
-        lost -= np.einsum("pcn,pn->pc", into.rest, pull).min(axis=1, initial=0.0)
+        way, weights = _last(delta), self.weights[:, None]
+        ways, heavy = _last(here.tangents), _last(there.tangents) * weights[:, None]
+        slope, curve = _last(after.slope), _last(after.curve)
+        ends = np.stack([_last(there.low), _last(there.high)])
+        own = np.stack([_last(here.low), _last(here.high)])
+        turn = _product(heavy, ways)
+        flat = _back(heavy, way)
+        near, on = _nearest(flat, turn, own, ends, slope, curve, seconds)
+        out_bends, into_bends = _last(out.bends), _last(into.bends)
+        bends = _times(_times(into_bends, on), on) - _times(_times(out_bends, near), near)
+        across = way - _times(ways, near) + bends / 2
+        across -= _times(_last(there.tangents), _back(heavy, across))
+        pull = weights * across / seconds
+        size = _dot(pull, across)
+        lost = _farthest(_last(out.rest), pull) + _farthest(_last(into.rest), -pull)
         # the multiplier of what moves across the charts is the less, the more the set may stray that way
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(size > 0, np.clip(1 - lost / size, 0.0, 1.0), 0.0)
-        pull *= share[:, None]
-        curve, excess = _raised(after.curve + np.einsum("pn,pnab->pab", pull, into.bends), -CONCAVE / seconds)
+        pull *= share
+        curve, excess = _raised(curve + _dot(into_bends, pull[:, None, None]), -CONCAVE / seconds)
         # places along the chart as well move by what the set strays
-        slid = sum(
-            np.abs(np.einsum("pcn,pnr->pcr", one.strays, heavy)).max(axis=1, initial=0.0) for one in (here, there)
-        )
-        low, high = there.low - slid, there.high + slid
-        wide = np.maximum(np.abs(low), np.abs(high))
-        lost = share * lost + excess * (wide**2).sum(axis=1) / 2
-        lost += (slid * (np.abs(after.slope) + np.einsum("pab,pb->pa", np.abs(curve), wide + slid / 2))).sum(axis=1)
-        return SquareSteps(
-            seconds,
-            after.least + (pull * delta).sum(axis=1) - share**2 * size / 2 - lost,
-            -np.einsum("pnr,pn->pr", here.tangents, pull),
-            -np.einsum("pn,pnab->pab", pull, out.bends),
-            flat,
-            turn,
-            after.slope,
-            curve,
-            np.stack([low, high]),
-            np.stack([here.low, here.high]),
-        )
+        slid = _widest(_last(here.strays), heavy) + _widest(_last(there.strays), heavy)
+        within = np.stack([ends[0] - slid, ends[1] + slid])
+        wide = np.abs(within).max(axis=0)
+        lost = share * lost + excess * _dot(wide, wide) / 2
+        lost += _dot(slid, np.abs(slope) + _times(np.abs(curve), wide + slid / 2))
+        level = -_dot(out_bends, pull[:, None, None])
+        least = after.least + _dot(pull, way) - share**2 * size / 2 - lost
+        return SquareSteps(seconds, least, -_back(ways, pull), level, flat, turn, slope, curve, within, own)
+
+
+def _last(rows: Array) -> Array:
+    """The same with what tells the steps last: sums of a few joints and axes then go along all steps at once."""
+    return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    """Products (..., P) of matrices (..., b, P) and vectors (b, P)."""
+    return np.asarray((matrix * vector).sum(axis=-2))
+
+
+def _back(matrix: Array, vector: Array) -> Array:
+    """Products (b, P) of matrices (a, b, P), transposed, and vectors (a, P)."""
+    return np.asarray((matrix * vector[:, None]).sum(axis=0))
+
+
+def _product(one: Array, other: Array) -> Array:
+    """Products (b, c, P) of matrices (a, b, P), transposed, and others (a, c, P)."""
+    return np.asarray((one[:, :, None] * other[:, None]).sum(axis=0))
+
+
+def _dot(one: Array, other: Array) -> Array:
+    return np.asarray((one * other).sum(axis=0))
+
+
+def _farthest(places: Array, way: Array) -> Array:
+    """How far places (c, n, P) lie along a way (n, P), the origin among them. Shape (P,)."""
+    most = np.zeros(way.shape[1])
+    for place in places:
+        np.maximum(most, _dot(place, way), out=most)
+    return most
+
+
+def _widest(places: Array, ways: Array) -> Array:
+    """How far places (c, n, P) lie along ways (n, r, P), either way. Shape (r, P)."""
+    most = np.zeros(ways.shape[1:])
+    for place in places:
+        np.maximum(most, np.abs(_back(ways, place)), out=most)
+    return most
 
 
 def _nearest(
-    flat: Array, turn: Array, here: Charts, there: Charts, after: Values, seconds: float
+    flat: Array, turn: Array, here: Array, there: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Places in boxes from and to which the ways along the charts cost little: flat - turn . one + other."""
-    one = (here.low + here.high) / 2
-    square, back = after.curve + np.eye(flat.shape[1]) / seconds, turn.transpose(0, 2, 1)
+    """Places in boxes (2, r, P) from and to which the ways along the charts cost little: flat - turn . one + other."""
+    one = (here[0] + here[1]) / 2
+    square = curve + np.eye(len(flat))[:, :, None] / seconds
+    square_back = _product(turn, turn)
     for _ in range(NEAREST):
-        start = (flat - np.einsum("pab,pb->pa", turn, one)) / seconds
-        other = least_in_box(start + after.slope, square, there.low, there.high)[1]
-        one = least_in_box(-np.einsum("pab,pb->pa", back, flat + other), back @ turn, here.low, here.high)[1]
+        start = (flat - _times(turn, one)) / seconds
+        other = _least(start + slope, square, *there)[1]
+        one = _least(-_back(turn, flat + other), square_back, *here)[1]
     return one, other
 
 
@@ -190,7 +225,8 @@ def _nearest(
 class SquareSteps:
     """least + slope . t + t . level . t / 2, and the least of v . v / (2 dt) + after . t' + t' . curved . t' / 2.
 
-    There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`.
+    There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`. All arrays have the
+    steps last.
     """
 
     seconds: float
@@ -205,36 +241,40 @@ class SquareSteps:
     out: Array
 
     def of(self, chosen: Any) -> SquareSteps:
-        rows = {
-            name: getattr(self, name)[chosen] for name in ("least", "slope", "level", "flat", "turn", "after", "curved")
-        }
-        return replace(self, **rows, into=self.into[:, chosen], out=self.out[:, chosen])
+        names = ("least", "slope", "level", "flat", "turn", "after", "curved", "into", "out")
+        return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
 
     @property
     def _square(self) -> Array:
-        return np.asarray(self.curved + np.eye(self.curved.shape[1]) / self.seconds)
+        return np.asarray(self.curved + np.eye(len(self.flat))[:, :, None] / self.seconds)
 
     @property
     def curve(self) -> Array:
-        sunk = np.linalg.solve(self._square, self.curved) / self.seconds
-        return np.asarray(self.turn.transpose(0, 2, 1) @ sunk @ self.turn + self.level)
+        sunk = np.linalg.solve(_first(self._square), _first(self.curved)) / self.seconds
+        turn = _first(self.turn)
+        return np.asarray(turn.transpose(0, 2, 1) @ sunk @ turn + _first(self.level))
 
     def _onward(self, places: Array) -> tuple[Array, Array, Array]:
-        start = self.flat - np.einsum("pab,pb->pa", self.turn, places)
-        return start, *least_in_box(start / self.seconds + self.after, self._square, *self.into)
+        start = self.flat - _times(self.turn, places)
+        return start, *_least(start / self.seconds + self.after, self._square, *self.into)
 
     def at(self, places: Array) -> tuple[Array, Array]:
+        places = _last(places)
         start, onward, there = self._onward(places)
-        held = np.einsum("pab,pb->pa", self.level, places)
-        value = self.least + onward + (start**2).sum(axis=1) / (2 * self.seconds)
-        slope = held + self.slope - np.einsum("pab,pa->pb", self.turn, start + there) / self.seconds
-        return value + (places * (held / 2 + self.slope)).sum(axis=1), slope
+        held = _times(self.level, places)
+        value = self.least + onward + _dot(start, start) / (2 * self.seconds)
+        slope = held + self.slope - _back(self.turn, start + there) / self.seconds
+        return value + _dot(places, held / 2 + self.slope), _first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        back = self.turn.transpose(0, 2, 1)
-        pulled = -np.einsum("pab,pb->pa", back, self.flat + self._onward(places)[2]) / self.seconds
-        square = back @ self.turn / self.seconds + self.level - curve
-        return least_in_box(pulled + self.slope - slope, square, *self.out)[1]
+        pulled = -_back(self.turn, self.flat + self._onward(_last(places))[2]) / self.seconds
+        square = _product(self.turn, self.turn) / self.seconds + self.level - _last(curve)
+        return _first(_least(pulled + self.slope - _last(slope), square, *self.out)[1])
+
+
+def _first(columns: Array) -> Array:
+    """The same with what tells the steps first again."""
+    return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,29 +421,40 @@ def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[
 
     Looked at are the corners, where the function is level on a side, and where it is level.
     """
-    r = slope.shape[1]
+    least, place = _least(_last(slope), _last(square), _last(low), _last(high))
+    return least, _first(place)
+
+
+def _least(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """As `least_in_box`, the functions last."""
+    r, count = slope.shape
     if not r:
-        return np.zeros(len(slope)), np.zeros(slope.shape)
-    places = [np.where(side, high, low) for side in product((False, True), repeat=r)]
+        return np.zeros(count), np.zeros(slope.shape)
+    upwards = all(bool((square[axis, axis] > 0).all()) for axis in range(r))  # then sides need no corners
+    places: list[Any] = [] if upwards else [[*side] for side in product(*zip(low, high, strict=True))]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if r == 1:
-            places.append(-slope / square[:, 0])
+            places.append([np.clip(-slope[0] / square[0, 0], low[0], high[0])])
         else:
+            for axis, beside in ((0, 1), (1, 0)):
+                for end in (low[axis], high[axis]):
+                    level = -(slope[beside] + square[0, 1] * end) / square[beside, beside]
+                    level = np.clip(level, low[beside], high[beside])
+                    places.append([end, level] if axis == 0 else [level, end])
+            size = square[0, 0] * square[1, 1] - square[0, 1] ** 2
+            one = (square[0, 1] * slope[1] - square[1, 1] * slope[0]) / size
+            other = (square[0, 1] * slope[0] - square[0, 0] * slope[1]) / size
+            places.append([np.clip(one, low[0], high[0]), np.clip(other, low[1], high[1])])
+        least, found = np.full(count, np.inf), low.copy()
+        for place in places:
+            value = place[0] * (slope[0] + square[0, 0] / 2 * place[0])
+            if r == 2:
+                value += place[1] * (slope[1] + square[1, 1] / 2 * place[1] + square[0, 1] * place[0])
+            better = value < least
+            np.copyto(least, value, where=better)
             for axis in range(r):
-                beside = 1 - axis
-                for end in (low, high):
-                    place = end.copy()
-                    place[:, beside] = -(slope[:, beside] + square[:, 0, 1] * end[:, axis]) / square[:, beside, beside]
-                    places.append(place)
-            size = square[:, 0, 0] * square[:, 1, 1] - square[:, 0, 1] ** 2
-            one = (square[:, 0, 1] * slope[:, 1] - square[:, 1, 1] * slope[:, 0]) / size
-            other = (square[:, 0, 1] * slope[:, 0] - square[:, 0, 0] * slope[:, 1]) / size
-            places.append(np.column_stack([one, other]))
-    looked = np.stack([np.clip(np.nan_to_num(place), low, high) for place in places], axis=1)
-    values = np.einsum("pcr,pr->pc", looked, slope) + np.einsum("pca,pab,pcb->pc", looked, square, looked) / 2
-    best = values.argmin(axis=1)
-    rows = np.arange(len(slope))
-    return values[rows, best], looked[rows, best]
+                np.copyto(found[axis], place[axis], where=better)
+    return least, found
 
 
 def lowest_curvature(square: Array) -> Array:
@@ -415,11 +466,11 @@ def lowest_curvature(square: Array) -> Array:
 
 
 def _raised(square: Array, floor: float) -> tuple[Array, Array]:
-    """Symmetric matrices (P, r, r), their eigenvalues raised to a floor, and the most by which one was. Shape (P,)."""
-    excess = np.maximum(floor - lowest_curvature(square), 0.0)
+    """Symmetric matrices (r, r, P), their eigenvalues raised to a floor, and the most by which one was. Shape (P,)."""
+    excess = np.maximum(floor - lowest_curvature(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:
-        values, ways = np.linalg.eigh(square[rows])
+        values, ways = np.linalg.eigh(np.moveaxis(square[..., rows], -1, 0))
         square = square.copy()
-        square[rows] = (ways * np.maximum(values, floor)[:, None]) @ ways.transpose(0, 2, 1)
+        square[..., rows] = np.moveaxis((ways * np.maximum(values, floor)[:, None]) @ ways.transpose(0, 2, 1), 0, -1)
     return square, excess

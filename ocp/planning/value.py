@@ -32,9 +32,11 @@ LOOKED = 8
 FARTHEST = 1e6
 """rad or m: no step goes farther."""
 PAIRS = 200_000
-"""Steps between two instants that are looked at together: what memory is taken."""
+"""Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
 ROUNDS, LOWER = 4, 3
 """Times that the least of a step in a box is looked at nearer, and places on the way to it at first."""
+RISE = 0.02
+"""Share of what is left to be gained by which that has to raise it, or it is the last time."""
 
 
 class Graph:
@@ -93,7 +95,9 @@ class Graph:
         way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
         way = min(way, FARTHEST)
         tree = self.space.tree(there.centers)
-        share = max(16, PAIRS // len(there))
+        whole = self.space.tree(here.centers)
+        number = whole.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST))
+        share = max(16, len(here) * PAIRS // max(int(number), 1))
         for first in range(0, len(here), share):
             part = np.arange(first, min(first + share, len(here)))
             own = self.space.tree(here.centers[part])
@@ -243,13 +247,15 @@ def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:
         values = np.stack([value - (place * lean).sum(axis=1) for (value, _), place in zip(looked, at, strict=True)])
         found, place = least.copy(), np.stack(at)[values.argmin(axis=0), np.arange(len(which))]
         most = np.repeat(np.minimum.reduceat(values.min(axis=0), first), np.diff(np.append(first, len(which))))
-        rows = np.arange(len(which))
+        rows, before = np.arange(len(which)), np.full(len(which), -np.inf)
         for _ in range(ROUNDS):
-            kept = np.flatnonzero(found[rows] < most[rows])
+            # until it is out of the question, or hardly rises any more
+            kept = np.flatnonzero(found[rows] - before[rows] > RISE * (most[rows] - found[rows]).clip(0.0))
+            kept = kept[found[rows[kept]] < most[rows[kept]]]
             if not kept.size:
                 break
             rows, near, part, box, bend = rows[kept], near[kept], part.of(kept), box.of(kept), bend[kept]
-            best, place = best.of(kept), place[kept]
+            best, place, before[rows] = best.of(kept), place[kept], found[rows]
             for _ in range(LOWER):
                 place = part.lower(place, lean[rows], common[near])
             for looked_at in (place, None):
