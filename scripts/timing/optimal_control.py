@@ -127,10 +127,9 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
     rows = [row for row in summary["rows"] if row["error"] is not None]
     problems = [name for name in STATEMENTS if any(row["problem"] == name for row in rows)]
     note = (
-        f"Meshes of {', '.join(map(str, MESHES))} intervals; time of the processor of one run, imports and compiled "
-        "functions at hand. Filled: posed and solved. Hollow: solved again with another parameter from the plan "
-        "before. Same formulas, guess and degree (Drake: cubic), IPOPT at 1e-9 (Dymos: SLSQP; Drake: SNOPT, else "
-        "IPOPT)."
+        "Filled: posed and solved; hollow: solved again with another parameter from the plan before. Meshes of "
+        f"{', '.join(map(str, MESHES))} intervals; time of the processor of one run, imports and compiled functions at "
+        "hand. Same formulas, guess and degree (Drake: cubic), IPOPT at 1e-9 (Dymos: SLSQP; Drake: SNOPT, else IPOPT)."
     )
     with drawing.sheet(path, (2, 3), (9.0, 6.0), note) as (figure, axes):
         for axis, problem in zip(axes.ravel(), problems, strict=False):
