@@ -23,9 +23,8 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, ArrayInput, checked_array, checked_choice
+from models.arrays import NOT_NUMBERS, Array, ArrayInput, checked_array, checked_choice, checked_instance
 from models.errors import ModelError
-from models.machines.machine import require_joints
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import (
     center_of_mass,
@@ -80,13 +79,13 @@ class FreeFloating:
     instead of the conserved one; `momentum_rate` is its derivative.
 
     Attributes:
-        robot: The kinematic tree.
+        robot: The kinematic tree; a single body without joints moves as its momentum makes it tumble.
         base: "planar" or "spatial".
         conserved_momentum: (Angular about the centre of mass, N m s; linear, N s), world axes, shape (6,);
             (Lz, Px, Py), shape (3,), if planar. Zero if None.
 
     Raises:
-        ModelError: Unknown kind of base, no moving joint, no mass, no rotational inertia, a joint that would move a
+        ModelError: Unknown kind of base, no mass, no rotational inertia, a joint that would move a
             planar machine out of its plane, or a momentum of a wrong size or not finite.
     """
 
@@ -96,7 +95,7 @@ class FreeFloating:
 
     def __post_init__(self) -> None:
         checked_choice(self.base, get_args(BaseKind), "free-floating machine", "base")
-        require_joints(self.robot)
+        checked_instance(self.robot, Robot, "machine", "robot")
         if self.base == "planar":
             _require_planar(self.robot)
         _require_inertia(self.robot, self.twist_rows)

@@ -117,9 +117,12 @@ def inverse_kinematics(
     Raises:
         Unreachable: No start leads to the pose, with the nearest miss; or none to a posture that is clear, with the
             pair that touches least.
-        ProblemError: No pose among the tasks, wrong sizes or numbers.
+        ProblemError: No pose among the tasks, no joint, wrong sizes or numbers.
     """
     equations = bind(machine, task)
+    if not machine.joint_size:
+        words = "inverse_kinematics: the robot has no moving joint, and stands where its base is"
+        raise ProblemError(words, name="machine", value=machine)
     posed = tuple(part for part in equations.bound if part.task.is_pose)
     if not posed:
         words = "inverse kinematics need a pose: task=TipTask(position=..., orientation=... or direction=...)"
