@@ -206,7 +206,7 @@ def _draw_task(path: Path, title: str, shown: Sequence[Curve]) -> None:
         ("joint-limit index p1", lambda m: m.joint_limit_index, None),
         ("manipulability p2, m²", lambda m: m.manipulability, None),
     )
-    title = f"{title} by optimal control: the more room the zero moment point has, the slower the joints need to be"
+    title = f"{title} by optimal control: pinned, the joints turn fastest; without a rule the point leaves the foot"
     _four(path, title, f"{ASSUMING}. {ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
 
 
