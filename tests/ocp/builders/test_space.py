@@ -24,7 +24,6 @@ from ocp import (
     solve,
 )
 from tests.models.machines.test_actuators import satellite, state, wheeled
-from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array
 
 nan = np.nan
@@ -151,14 +150,6 @@ def test_two_arms_work_and_the_base_does_not_turn() -> None:
     null_space(
         FreeFloating(satellite(2)), np.array([0.4, -0.5, 0.9, -0.3, 0.6, -0.8]), [-0.05, 0.1], Collocation(12, 6)
     )
-
-
-@pytest.mark.long
-def test_an_arm_of_seven_joints_works_and_the_base_does_not_turn() -> None:
-    owner, ending, told = ROBOTS["floating manipulator"]
-    machine = FreeFloating(Robot.from_urdf(urdf_file(owner, ending), **told))
-    start = np.array([0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4])
-    null_space(machine, start, [0.1, 0.25, -0.1], Collocation(40, 4))
 
 
 @pytest.mark.long
