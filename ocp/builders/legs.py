@@ -23,7 +23,7 @@ from ocp.builders.clearance import Clear
 from ocp.builders.dynamics import AskedOfDrives, Motors, checked_motors, dynamics_problem
 from ocp.builders.standing.problem import FreeTime
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance
+from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, checked_text
 from ocp.problem.phases import DURATION, Phases
 from ocp.tasks.checks import checked_horizon
 from ocp.tasks.tip_task import TipTask
@@ -116,16 +116,17 @@ def dynamics_phases(
 
 
 def checked_legs(legs: Any) -> tuple[Leg, ...]:
-    """Legs as a tuple, each with its joints as numbers.
+    """Legs as a tuple.
 
     Raises:
-        ProblemError: None, or something else; ends that are neither at rest nor free.
+        ProblemError: None, or something else; ends that are neither at rest nor free, a name that is no text.
     """
     given = checked_each("legs", legs, Leg)
     if not given:
         raise ProblemError("legs: at least one is needed", name="legs", value=legs)
     for leg in given:
         checked_choice("leg: end", leg.end, ("rest", "free"))
+        checked_text("leg: name", leg.name)
     return tuple(given)
 
 

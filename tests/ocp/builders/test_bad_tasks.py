@@ -77,6 +77,7 @@ from tests.bad_values import (
     POSITIVE,
     SEQUENCE,
     STRANGE,
+    TEXT,
     UNKNOWN,
     WHOLE,
     Bad,
@@ -491,6 +492,19 @@ DYNAMICS = [
             "legs": SEQUENCE | {"empty": [], "horizon": [Leg([0.3, 0.2, 0.1], -1.0)]},
             "total": but(HORIZON, "None"),
             "clear": but(INSTANCE, "None"),
+        },
+    ),
+    Case(
+        "Leg of dynamics_phases",
+        lambda **leg: dynamics_phases(ARM, [0.1, 0.2, 0.3], [Leg(**leg)]),
+        {"joints": [0.3, 0.2, 0.1], "horizon": 1.0},
+        {
+            "joints": but(array(3), "nan"),
+            "horizon": POSITIVE,
+            "end": CHOICE,
+            "machine": but(INSTANCE, "None"),
+            "tasks": but(INSTANCE, "None", "list", "dictionary"),
+            "name": TEXT | {"with a dot": "leg.1"},
         },
     ),
     Case(
