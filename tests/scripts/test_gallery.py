@@ -21,7 +21,7 @@ from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.files import read_trajectory
 from scripts import gallery
-from scripts.robots import panda, posture_set, pushing, robots, ur5
+from scripts.robots import panda, posture_set, pushing, robots, steps, ur5
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
@@ -186,6 +186,17 @@ def test_every_plan_can_be_played_from_its_file_alone(coarse: Gallery, name: str
     assert local.names == made.names
     assert (coarse.folder / f"{name}.npz").stat().st_size < 400_000
     with Image.open(coarse.folder / f"{name}.png") as picture:
+        assert min(picture.size) > 500
+
+
+def test_the_biped_walks_in_balance_and_faster_without(tmp_path: Path) -> None:
+    rows, failed = run(["steps"], tmp_path, coarse=True)
+    row = rows["steps"]
+    assert not failed
+    assert row["audit_passed"]
+    assert row["com_margin_optimal_m"] < 0 < row["com_margin_static_m"]
+    assert row["zmp_margin_optimal_m"] > 0.99 * steps.MARGIN
+    with Image.open(tmp_path / "steps.png") as picture:
         assert min(picture.size) > 500
 
 

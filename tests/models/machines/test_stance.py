@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, rerooted
 from models.robot.dynamics import base_reaction
 from models.robot.motion import link_motions
+from scripts.robots.steps import SIDES, planar_biped, planar_feet
 from tests.models.robot.pinocchio_robots import urdf_file
 from tests.models.robot.trees import Array, numeric, numeric_poses, random_frame, random_robot
-from tests.ocp.builders.bipeds import HELD, SIDES, TALOS, planar_biped, planar_feet, talos_steps
+from tests.ocp.builders.bipeds import HELD, TALOS, talos_steps
 
 few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

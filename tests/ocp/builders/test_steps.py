@@ -12,8 +12,9 @@ import pytest
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
 from ocp import Collocation, Limits, ProblemError, Solution, solve
 from ocp.builders.standing import StancePhase, Steps, StepsMotion, plan_steps, steps_motion, steps_problem, walk
+from scripts.robots.steps import bent, planar_biped, planar_feet, planar_steps
 from tests.models.robot.trees import numeric, numeric_poses
-from tests.ocp.builders.bipeds import FRICTION, bent, mirrored, planar_biped, planar_feet, planar_steps, talos_steps
+from tests.ocp.builders.bipeds import FRICTION, mirrored, talos_steps
 from tests.ocp.builders.steps_replay import replay
 from tests.ocp.problem.test_phases import failed, moved
 

@@ -1,0 +1,230 @@
+"""Gallery: a planar biped takes two steps, in balance all the way and dynamically.
+
+53 kg on two legs of hip, knee and ankle; its left foot stays while the right one is set forward, then the other way
+round. In balance, its center of mass never leaves the soles that are held, so that it could stop anywhere. Dynamically,
+only the zero moment point stays there: it falls forward from foot to foot, in a fraction of the time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape, rectangle
+from models.arrays import Array
+from ocp import Audit, Collocation, Limits, Solution
+from ocp.app.frames import frames_along
+from ocp.builders.standing import StancePhase, Steps, StepsMotion, plan_steps, standing_posture, steps_motion, walk
+from scripts.drawing import COLORS
+from scripts.robots.drawing import Scene, animate, page
+
+__all__ = ["SIDES", "alternating", "bent", "draw", "plan", "planar_biped", "planar_feet", "planar_steps"]
+
+SIDES = ("left", "right")
+SOLE = ((-0.08, 0.14), (-0.05, 0.05))  # m, in the frame of an ankle
+HEEL = 0.08  # of the ankle above the ground, m
+LENGTH = 0.25  # of a step, m
+FRICTION = 0.6
+MARGIN = 0.01  # m
+KINDS: dict[str, dict[str, Any]] = {
+    "in balance": {"balance": "static", "margin": 2 * MARGIN, "times": (1.5, 1.5), "color": "orange"},
+    "as a whole": {"balance": "dynamic", "margin": MARGIN, "times": (0.5, 0.6), "color": "blue"},
+}
+"""What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s."""
+METHOD = Collocation(12, degree=3, scheme="legendre")
+COARSE = Collocation(8, degree=3, scheme="legendre")
+VIEW = (9.0, -74.0)  # deg
+METAL, DARK = (0.80, 0.82, 0.86, 1.0), (0.25, 0.27, 0.31, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StepsExample:
+    """Two walks over the same footholds, by their names in KINDS.
+
+    Attributes:
+        plans: Audited. motions: What they take. audits: Of each.
+    """
+
+    plans: dict[str, Solution]
+    motions: dict[str, StepsMotion]
+    audits: dict[str, Audit]
+
+    @property
+    def audit(self) -> Audit:
+        """Of the plan that is not sound, if one is not, else of the dynamic one."""
+        return next((audit for audit in self.audits.values() if not audit.passed), [*self.audits.values()][-1])
+
+    def summary(self) -> dict[str, Any]:
+        """A row of the summary."""
+        careful, whole = (self.motions[name] for name in KINDS)
+        slow, fast = careful.summary(), whole.summary()
+        return {
+            "robot": "planar biped",
+            "dof": whole.steps.robot.dof,
+            "task_rows": None,
+            "duration_s": fast["duration_s"],
+            "duration_static_s": slow["duration_s"],
+            "cost_local": None,
+            "cost_optimal": float(self.plans["as a whole"].cost),
+            "tip_error": None,
+            "joint_return_rad": None,
+            "audit_passed": all(audit.passed for audit in self.audits.values()),
+            "zmp_margin_optimal_m": fast["zmp_margin_min_m"],
+            "com_margin_optimal_m": fast["com_margin_min_m"],
+            "com_margin_static_m": slow["com_margin_min_m"],
+            "friction": fast["friction_max"],
+            "peak_joint_torque": fast["peak_joint_torque"],
+        }
+
+
+def planar_biped() -> Robot:
+    """53 kg in the plane y = 0: trunk, thighs and shanks of 0.4 m, feet; hip, knee and ankle of each leg about y."""
+    trunk = (
+        VisualShape("box", (0.16, 0.24, 0.42), translation=(0.0, 0.0, 0.27), color=METAL),
+        VisualShape("sphere", (0.09,), translation=(0.0, 0.0, 0.60), color=METAL),
+    )
+    links = [Link("trunk", 30.0, (0.0, 0.0, 0.25), np.diag([0.9, 0.8, 0.3]), visuals=trunk)]
+    joints = []
+    strong: dict[str, Any] = {"axis": (0, 1, 0), "velocity": 6.0, "effort": 200.0}
+    for side, aside in zip(SIDES, (0.08, -0.08), strict=True):
+        hip, knee, ankle = (f"{side}_{name}" for name in ("hip", "knee", "ankle"))
+        thigh, shank, foot = (f"{side}_{name}" for name in ("thigh", "shank", "foot"))
+        links += [_limb(thigh, 6.0, 0.4, 0.06, aside), _limb(shank, 4.0, 0.4, 0.045, aside)]
+        shoe = VisualShape("box", (0.22, 0.1, 0.05), translation=(0.03, aside, 0.025 - HEEL), color=DARK)
+        links += [Link(foot, 1.5, (0.03, 0.0, -0.05), np.diag([0.002, 0.006, 0.006]), visuals=(shoe,))]
+        down = (0.0, 0.0, -0.4)
+        joints += [Joint(hip, "revolute", "trunk", thigh, lower=-1.6, upper=0.8, **strong)]
+        joints += [Joint(knee, "revolute", thigh, shank, down, lower=0.0, upper=2.4, **strong)]
+        joints += [Joint(ankle, "revolute", shank, foot, down, lower=-1.2, upper=0.9, **strong)]
+    return Robot(tuple(links), tuple(joints), name="planar biped", tip="trunk")
+
+
+def _limb(name: str, mass: float, length: float, radius: float, aside: float) -> Link:
+    """A rod downwards, 0.1 m thick; drawn beside the plane in which it moves."""
+    side = mass * (length**2 + 0.1**2) / 12
+    middle = (0.0, aside, -length / 2)
+    looks = (
+        VisualShape("capsule", (radius, length), translation=middle, color=METAL),
+        VisualShape("sphere", (1.15 * radius,), translation=(0.0, aside, 0.0), color=DARK),
+    )
+    inertia = np.diag([side, side, mass * 0.1**2 / 6])
+    return Link(name, mass, (0.0, 0.0, -length / 2), inertia, visuals=looks)
+
+
+def planar_feet() -> dict[str, Foot]:
+    """Soles of the planar biped."""
+    return {side: Foot(f"{side}_foot", rectangle(*SOLE), (0.0, 0.0, -HEEL)) for side in SIDES}
+
+
+def planar_steps(count: int, shift: float, swing: float, *, first: str = "right", length: float = LENGTH) -> Steps:
+    """Steps of the planar biped; see `alternating`."""
+    return Steps(planar_biped(), planar_feet(), alternating(count, shift, swing, first=first, length=length))
+
+
+def alternating(
+    count: int, shift: float, swing: float, *, first: str = "right", length: float = LENGTH, wide: float = 0.0
+) -> tuple[StancePhase, ...]:
+    """Steps forward, each foot set a length (m) beyond where the other one stands.
+
+    Args:
+        shift, swing: Durations with both feet held and with one in the air, s.
+        first: Foot of the first step. wide: Of the feet from the middle, m.
+    """
+    sides = dict(zip(SIDES, (wide, -wide), strict=True))
+    order = [first, *(side for side in SIDES if side != first)]
+    steps = [(order[k % 2], Foothold.level((k + 1) * length, sides[order[k % 2]])) for k in range(count)]
+    start = {side: Foothold.level(0.0, sides[side]) for side in reversed(order)}
+    return walk(start, steps, shift=shift, swing=swing)
+
+
+def bent(steps: Steps, knee: float = 0.8) -> Array:
+    """A start on both feet with knees bent (rad), in balance, in the robot's order."""
+    near = np.zeros(steps.robot.dof)
+    pitches = [i for i, joint in enumerate(steps.robot.moving_joints) if abs(joint.axis[1]) > 0.5]
+    near[pitches] = np.tile([-knee / 2, knee, -knee / 2], 2)
+    stance = steps.stances[0]
+    found = standing_posture(stance, near[steps.order(stance)], steps.balanced(0))
+    return np.asarray(steps.in_order(stance, found[None])[0])
+
+
+def plan(coarse: bool = False) -> StepsExample:
+    """Both walks, audited."""
+    plans, motions, audits = {}, {}, {}
+    for name, kind in KINDS.items():
+        steps = planar_steps(2, *kind["times"])
+        plans[name] = plan_steps(
+            steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
+            method=COARSE if coarse else METHOD,
+        )  # fmt: skip
+        motions[name], audits[name] = steps_motion(steps, plans[name]), plans[name].audit()
+    return StepsExample(plans, motions, audits)
+
+
+def scenes_of(example: StepsExample) -> list[Scene]:
+    """Both walks, the soles' places on the ground, the zero moment point marked."""
+    found = []
+    for name, motion in example.motions.items():
+        turn = Rotation.from_matrix(motion.root_rotation).as_quat(scalar_first=True)
+        machine = FreeFloating(motion.steps.robot)
+        frames = frames_along(machine, motion.joints, np.column_stack([motion.root_position, turn]))
+        title = f"{name}: {motion.t[-1]:.1f} s"
+        low, high = SOLE[0][0], SOLE[0][1] + 2 * LENGTH
+        corners = np.array([[low, -0.15], [high, -0.15], [high, 0.15], [low, 0.15]])
+        found.append(
+            Scene(
+                title, motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=VIEW, floor=0.0,
+                footprint=corners, mark=motion.zero_moment_point,
+            )
+        )  # fmt: skip
+    return found
+
+
+def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None:
+    """steps.png and steps.gif."""
+    careful, whole = (example.motions[name] for name in KINDS)
+    out = -whole.summary()["com_margin_min_m"]
+    title = (
+        f"With its center of mass up to {1000 * out:.0f} mm outside its feet the biped walks in {whole.t[-1]:.1f} s "
+        f"what takes {careful.t[-1]:.1f} s in balance"
+    )
+    note = (
+        f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier postures "
+        f"pale, disc: zero moment point. In balance, its center of mass stays {2000 * MARGIN:g} mm inside the soles "
+        f"that are held; as a whole only the zero moment point does, by {1000 * MARGIN:g} mm. Friction at most "
+        f"{FRICTION:g}, torques at most 200 N m, feet land at rest; the durations are given, and both walks are the "
+        "cheapest in theirs by the same weights. Masses and limits are our own; the legs move in one plane and are "
+        "drawn beside each other."
+    )
+    scenes = scenes_of(example)
+    with page(folder / "steps.png", scenes, 6, height=6.0, share=1.15, note=note, title=title) as axes:
+        for ax, name in zip(axes, KINDS, strict=False):
+            _balance(ax, name, example.motions[name])
+        axes[0].legend(loc="upper left", fontsize=6.5)
+        _loads(axes[2], whole)
+    if animation:
+        animate(folder / "steps.gif", scenes, frames=44, seconds=0.1, note=note)
+
+
+def _balance(ax: Any, name: str, motion: StepsMotion) -> None:
+    """Where the support is along the way, over time, and the two points that it is to hold."""
+    low, high = SOLE[0]
+    for k, phase in enumerate(motion.steps.phases):
+        inside = motion.phase == k
+        at = [float(np.asarray(place.position)[0]) for place in phase.footholds.values()]
+        ax.fill_between(motion.t[inside], min(at) + low, max(at) + high, color=COLORS["grey"], alpha=0.22, lw=0)
+    ax.plot(motion.t, motion.zero_moment_point[:, 0], color=COLORS[KINDS[name]["color"]], label="zero moment point")
+    ax.plot(motion.t, motion.center_of_mass[:, 0], color="black", ls="--", lw=1.1, label="center of mass")
+    ax.set(title=name, xlabel="time, s", ylabel="along the way, m; support grey")
+
+
+def _loads(ax: Any, motion: StepsMotion) -> None:
+    """What each foot bears, over the weight."""
+    weight = motion.steps.stances[0].weight
+    for side, dashes in zip(SIDES, ("-", "--"), strict=True):
+        ax.plot(motion.t, motion.loads[side][:, 5] / weight, color=COLORS["blue"], ls=dashes, label=f"{side} foot")
+    ax.set(title="as a whole", xlabel="time, s", ylabel="load of a foot over the weight", ylim=(-0.05, 1.45))
+    ax.legend(loc="upper center", ncols=2, fontsize=6.5)
