@@ -144,7 +144,9 @@ def test_a_broken_mesh_is_named_with_its_link(mesh_robot: Path) -> None:
         assert bodies_of(robot, missing="skip") == ()
 
 
-@pytest.mark.parametrize("name", ["panda", "ur5", "tiago", "anymal-kinova"])
+@pytest.mark.parametrize(
+    "name", ["panda", "ur5", *(pytest.param(name, marks=pytest.mark.long) for name in ("tiago", "anymal-kinova"))]
+)
 def test_real_robots_are_covered(name: str) -> None:
     package, ending, options = ROBOTS[name]
     with warnings.catch_warnings():

@@ -13,6 +13,7 @@ from tests.ocp.batch import functions
 from tests.ocp.batch.drivers import check_killed_cluster, cluster
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # of Dask's own, at its end
 def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

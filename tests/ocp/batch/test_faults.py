@@ -18,6 +18,7 @@ from tests.ocp.batch import functions
 from tests.ocp.batch.drivers import check_disturbed, count, driver, kill, stored, until
 
 
+@pytest.mark.long
 def test_workers_and_drivers_are_killed_and_nothing_is_lost_or_done_twice(tmp_path: Path) -> None:
     check_disturbed(tmp_path / "b", 60, 0.05, 1.0)
 

@@ -69,6 +69,7 @@ def planned(machine: Standing, task: TipTask, zmp: ZmpRule, **settings: Any) -> 
     return solve(problem, Collocation(10, degree=3, scheme="legendre"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [0.0, 35.0, 90.0, 210.0])
 def test_motion_moves_the_zero_moment_point_along_the_plane_alone(degrees: float) -> None:
     machine = turned(degrees)[0]

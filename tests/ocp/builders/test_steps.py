@@ -120,6 +120,7 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     np.testing.assert_allclose(left.loads["left"], right.loads["right"], rtol=0, atol=1e-3)
 
 
+@pytest.mark.long
 def docking_arm() -> tuple[Robot, dict[str, Foot]]:
     """Four joints in the plane y = 0 on a loose base; its hand is a grip."""
     links = [Link("base", 10.0, (0.0, 0.0, 0.05), 0.1 * np.eye(3))]

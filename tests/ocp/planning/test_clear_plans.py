@@ -129,6 +129,7 @@ def test_the_search_finds_a_posture_that_is_clear() -> None:
     assert result.cost < planned(POST, clearance=0.02).cost
 
 
+@pytest.mark.long
 def space_arm(panel: bool) -> FreeFloating:
     """An arm on a satellite, with a box on its base in the way."""
     robot = armoured_arm()
@@ -257,6 +258,7 @@ def test_postures_that_touch_are_left_out_or_named() -> None:
     assert caught.value.name == "link6"
 
 
+@pytest.mark.long
 def test_a_local_motion_tells_how_near_it_comes() -> None:
     around = Surroundings(ARM, [POST])
     local = resolve(ARM, task=line(), start_joints=START, horizon=SECONDS, samples=101, surroundings=around)

@@ -35,6 +35,7 @@ def other_postures() -> list[Array]:
     return kept
 
 
+@pytest.mark.long
 def test_no_posture_leads_to_a_cheaper_seam() -> None:
     """By `minimum_velocity_problem`, the start free along its self-motion, on a mesh of its own."""
     what, found = ASKED["seam_ur5"](), cheapest()

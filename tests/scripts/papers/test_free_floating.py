@@ -20,7 +20,7 @@ from scripts.papers.free_floating.results import ROWS, START_JOINTS, TIP_VELOCIT
 from tests.scripts.papers.script_run import Run, assert_whole_picture, column
 
 PAPER = free_floating.PAPER
-pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once
+pytestmark = [pytest.mark.xdist_group("free_floating"), pytest.mark.long]  # one process, so that the script runs once
 GUESSES = ("constant", *["smooth"] * 4, *["rough"] * 4)
 HORIZONS = (3.5, 4.0, 5.0)  # s
 SEEDS = range(1)

@@ -29,7 +29,7 @@ from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
 PAPER = standing.PAPER
 CONVERGING = (("table1", "optimal_range"), ("table2", "optimal_spring"), ("minimum_time", "in_foot"))
 SAMPLE = {(plans, "CONVERGING"): CONVERGING}  # one of every task
-pytestmark = pytest.mark.xdist_group("standing")  # one process, so that the script runs once
+pytestmark = [pytest.mark.xdist_group("standing"), pytest.mark.long]  # one process, so that the script runs once
 
 PICTURES = (
     "fig04_zmp_index.png",

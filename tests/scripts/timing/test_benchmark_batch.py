@@ -12,6 +12,7 @@ from scripts.timing import batch
 from scripts.timing.placing import nothing, placed
 
 
+@pytest.mark.long
 def test_batches_are_measured_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "PLANS", 2)
     monkeypatch.setattr(batch, "placed", nothing)

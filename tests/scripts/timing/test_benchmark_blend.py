@@ -16,7 +16,7 @@ from scripts.papers.run import write
 from scripts.timing import blend as benchmark_blend
 from scripts.timing.measure import has_compiler
 
-pytestmark = pytest.mark.xdist_group("benchmark_blend")
+pytestmark = [pytest.mark.xdist_group("benchmark_blend"), pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

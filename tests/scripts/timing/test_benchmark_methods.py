@@ -13,6 +13,7 @@ from scripts import benchmark
 from scripts.timing import build_and_solve, costate_rate
 
 
+@pytest.mark.long
 def test_the_loop_of_constraints_finds_the_optimum_of_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
