@@ -308,7 +308,8 @@ def dynamics_problem(
     _, home = checked_configuration(machine, known, None if _is_free(start_base) else start_base)
     towards = np.where(np.isnan(last), known, last)
 
-    equations = bind(machine, tasks) if isinstance(tasks, TipTask) or tasks else None
+    given = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    equations = bind(machine, given) if given else None
     resting = np.zeros(n) if equations is None else rates_at_rest(equations, home, towards)
 
     problem = Problem("dynamics", symbols)

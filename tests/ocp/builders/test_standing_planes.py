@@ -69,7 +69,6 @@ def planned(machine: Standing, task: TipTask, zmp: ZmpRule, **settings: Any) -> 
     return solve(problem, Collocation(10, degree=3, scheme="legendre"))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("degrees", [0.0, 35.0, 90.0, 210.0])
 def test_motion_moves_the_zero_moment_point_along_the_plane_alone(degrees: float) -> None:
     machine = turned(degrees)[0]
@@ -80,6 +79,7 @@ def test_motion_moves_the_zero_moment_point_along_the_plane_alone(degrees: float
         assert np.cross([*along, 0.0], [*(point - [0.3, -0.2]), 0.0])[2] == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.long
 def test_plans_and_laws_are_the_same_in_every_vertical_plane() -> None:
     costs, pushes = [], []
     for degrees in (0.0, 35.0, 210.0):

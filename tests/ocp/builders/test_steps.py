@@ -120,7 +120,6 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     np.testing.assert_allclose(left.loads["left"], right.loads["right"], rtol=0, atol=1e-3)
 
 
-@pytest.mark.long
 def docking_arm() -> tuple[Robot, dict[str, Foot]]:
     """Four joints in the plane y = 0 on a loose base; its hand is a grip."""
     links = [Link("base", 10.0, (0.0, 0.0, 0.05), 0.1 * np.eye(3))]
@@ -134,6 +133,7 @@ def docking_arm() -> tuple[Robot, dict[str, Foot]]:
     return Robot(tuple(links), tuple(joints), tip="link3"), feet
 
 
+@pytest.mark.long
 def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
     """It reaches out on its base, docks at a wall, and leans further than its base alone would bear."""
     robot, feet = docking_arm()

@@ -129,7 +129,6 @@ def test_the_search_finds_a_posture_that_is_clear() -> None:
     assert result.cost < planned(POST, clearance=0.02).cost
 
 
-@pytest.mark.long
 def space_arm(panel: bool) -> FreeFloating:
     """An arm on a satellite, with a box on its base in the way."""
     robot = armoured_arm()
@@ -139,6 +138,7 @@ def space_arm(panel: bool) -> FreeFloating:
     return FreeFloating(replace(robot, links=(heavy, *robot.links[1:])))
 
 
+@pytest.mark.long
 def test_a_space_arm_passes_a_box_on_its_base() -> None:
     machine = space_arm(panel=True)
     free = plan(machine, line(), start=START, search="start", clearance=None)
@@ -258,7 +258,6 @@ def test_postures_that_touch_are_left_out_or_named() -> None:
     assert caught.value.name == "link6"
 
 
-@pytest.mark.long
 def test_a_local_motion_tells_how_near_it_comes() -> None:
     around = Surroundings(ARM, [POST])
     local = resolve(ARM, task=line(), start_joints=START, horizon=SECONDS, samples=101, surroundings=around)
@@ -270,6 +269,7 @@ def test_a_local_motion_tells_how_near_it_comes() -> None:
     assert np.isnan(resolve(ARM, task=line(), start_joints=START, horizon=SECONDS, samples=11).clearance).all()
 
 
+@pytest.mark.long
 def test_builders_take_what_to_stay_clear_of() -> None:
     around = Surroundings(ARM, [POST])
     asked: dict[str, Any] = {"task": line(), "start_joints": START, "horizon": SECONDS}

@@ -64,7 +64,7 @@ def effort(found: Plan, time_cost: float) -> float:
 # ---- slow motions ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("slower", [pytest.param(10.0, marks=pytest.mark.long), 1e3, 1e5])
+@pytest.mark.parametrize("slower", [*(pytest.param(each, marks=pytest.mark.long) for each in (10.0, 1e3)), 1e5])
 def test_a_motion_may_be_as_slow_as_one_likes(slower: float) -> None:
     """From 6 s to a week: the same way, its cost divided, on a mesh as coarse."""
     one, other = fixed(0.05), fixed(0.05 / slower)

@@ -42,7 +42,6 @@ def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_publ
     assert faults("panda__1cube", found.joints + 1e-3)  # it finds some
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("machine", "start"), [(panda(), PANDA_START), (ur5(), UR5_START)], ids=["panda", "ur5"])
 def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
     places, turns = poses(machine, start, 21)
@@ -59,6 +58,7 @@ def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Ar
     assert "at least" in str(found)
 
 
+@pytest.mark.long
 def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> None:
     problem, some = problem_of("fetch__square"), slice(0, 60, 2)
     machine, told = problem.machine, (problem.positions[some], problem.quaternions[some])
@@ -72,7 +72,6 @@ def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> N
     assert tips == pytest.approx(told[0], abs=1e-8)
 
 
-@pytest.mark.long
 def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     velocity = panda().robot.velocity
@@ -93,6 +92,7 @@ def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> Non
     assert slow.cost == pytest.approx(4 * found["time"].cost, rel=1e-3)
 
 
+@pytest.mark.long
 def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     free = plan_waypoints(panda(), places, turns)

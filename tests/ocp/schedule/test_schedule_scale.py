@@ -5,6 +5,7 @@ from __future__ import annotations
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from models import Arc, Line, Path, SmoothPath, smooth
 from models.paths import Segment
@@ -43,11 +44,13 @@ def peak_memory(count: int) -> float:
         tracemalloc.stop()
 
 
+@pytest.mark.long
 def test_memory_grows_as_the_number_of_segments() -> None:
     small, large = peak_memory(500), peak_memory(4000)
     assert large < 1.25 * small
 
 
+@pytest.mark.long
 def test_ten_thousand_segments_are_blended_and_scheduled_within_all_limits() -> None:
     path, plan = planned(10_000)
     assert len(path.remaining) == 9999

@@ -28,7 +28,7 @@ from tests.scripts.papers.test_free_floating import HORIZONS, REFERENCE, SAMPLE,
 __all__ = ["SAMPLE"]  # read by the fixture that runs the script
 
 PAPER = free_floating.PAPER
-pytestmark = pytest.mark.xdist_group("free_floating")  # one process, so that the script runs once
+pytestmark = [pytest.mark.xdist_group("free_floating"), pytest.mark.long]  # one process, so that the script runs once
 
 KNOWN = {3.5: (1.23315, 1.32544), 4.0: (1.36393, 1.49337), 5.0: (REFERENCE, 1.7467)}
 """J of extremals at other horizons, by an implementation of its own."""
