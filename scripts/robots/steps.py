@@ -36,7 +36,6 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 """What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s."""
 METHOD = Collocation(12, degree=3, scheme="legendre")
-COARSE = Collocation(8, degree=3, scheme="legendre")
 VIEW = (9.0, -74.0)  # deg
 METAL, DARK = (0.80, 0.82, 0.86, 1.0), (0.25, 0.27, 0.31, 1.0)
 
@@ -152,13 +151,13 @@ def bent(steps: Steps, knee: float = 0.8) -> Array:
 
 
 def plan(coarse: bool = False) -> StepsExample:
-    """Both walks, audited."""
+    """Both walks, audited; on one mesh only, `coarse` or not."""
     plans, motions, audits = {}, {}, {}
     for name, kind in KINDS.items():
         steps = planar_steps(2, *kind["times"])
         plans[name] = plan_steps(
             steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
-            method=COARSE if coarse else METHOD,
+            method=METHOD,
         )  # fmt: skip
         motions[name], audits[name] = steps_motion(steps, plans[name]), plans[name].audit()
     return StepsExample(plans, motions, audits)
