@@ -166,11 +166,7 @@ def nearest_along(problem: Problem, solution: Solution, times: Iterable[float], 
     Raises:
         ProblemError: The plan does not belong to the problem.
     """
-    form = Formulation.of(problem)
-    check_belongs(form, solution)
-    solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
-    moved = [one for one in problem.declared.apart.values() if all(name.endswith(suffix) for name in one.movers)]
-    searches = [_Search(apart, _track_of(form, apart, solution, p)) for apart in moved if len(apart)]
+    searches = [_Search(apart, track) for apart, track in _tracks(problem, solution, suffix)]
     if not searches:
         return []
     return [
@@ -189,11 +185,17 @@ def placements_along(
     Raises:
         ProblemError: The plan does not belong to the problem.
     """
+    fractions = times / solution.horizon
+    return [(apart, track.frames(fractions)) for apart, track in _tracks(problem, solution, suffix)]
+
+
+def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
+    """Of all separations whose movers' names end so, that have pairs."""
     form = Formulation.of(problem)
     check_belongs(form, solution)
     solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
     moved = [one for one in problem.declared.apart.values() if all(name.endswith(suffix) for name in one.movers)]
-    return [(one, _track_of(form, one, solution, p).frames(times / solution.horizon)) for one in moved if len(one)]
+    return [(one, _track_of(form, one, solution, p)) for one in moved if len(one)]
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:

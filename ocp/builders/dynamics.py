@@ -266,8 +266,8 @@ def dynamics_problem(
         horizon: Final time, s, or FreeTime(...).
         end_joints: Shape (n,), nan where free; all free if None.
         tasks: A TipTask, or several that are done at once over the whole motion, of the time, s.
-        start_base: Configuration of the base at the start, nan where it is free in a phase that is joined to another;
-            home if None.
+        start_base: Configuration of the base at the start; home if None, and all nan in a phase that is joined to
+            another, where it is free.
         limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         effort: Weights of the cost; the squared torques if None.
         friction, wrenches, gravity: As of `joint_torques`.
@@ -417,7 +417,7 @@ def checked_motors(what: str, machine: Any) -> Motors:
 def _is_free(given: Any) -> bool:
     """Whether a configuration of the base is told to be free."""
     try:
-        return given is not None and bool(np.isnan(floats(given)).any())
+        return given is not None and bool(np.isnan(floats(given)).all())
     except NOT_NUMBERS:
         return False
 

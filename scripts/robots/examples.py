@@ -26,7 +26,7 @@ EXAMPLES: Mapping[str, str] = {
     "posture_set": UR5.package,
     "mobile_manipulator": "example-robot-data",
     "pushing": "example-robot-data",
-    "steps": "numpy",
+    "steps": "selfmotion",
 }
 """Modules of this folder, each with `plan(coarse)`, which gives what its `draw(example, folder, animation=)` draws and
 has `summary()` and `audit`; and the distributions that the robots come from; that of `steps` is our own."""

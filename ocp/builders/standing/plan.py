@@ -158,13 +158,15 @@ def plan_steps(
 ) -> Solution:
     """Solve `steps_problem` and audit the plan; tightened and on finer meshes as `plan_standing` does.
 
+    The first plan that holds is returned; of one that is not decided to be a minimum its audit says so.
+
     Args:
         steps, start_joints, asked: As for steps_problem.
         method: The first mesh, of each phase; 12 intervals of degree 3 if None.
         options, tolerances: As for plan_standing.
 
     Raises:
-        SolveError: No attempt leads to a plan that passes; says what became of each.
+        SolveError: No attempt leads to a plan that holds; says what became of each.
         ProblemError: As steps_problem.
     """
     if method is not None:
