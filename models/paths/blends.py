@@ -25,6 +25,7 @@ __all__ = [
     "by_arc_length",
     "checked_shape",
     "cubic",
+    "curvature",
     "end_curvature",
     "gamma",
     "middle_curvature",
@@ -176,12 +177,18 @@ def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cu
     low, high, best = 0.0, 1.0, 0.0
     for _ in range(5):
         u = np.linspace(low, high, 2001)
-        first, second = polynomial(curve, u, 1), polynomial(curve, u, 2)
-        bend = np.linalg.norm(np.cross(first, second), axis=1) / np.linalg.norm(first, axis=1) ** 3
+        bend = curvature(curve, u)
         at = int(bend.argmax())
         best = float(bend[at])
         low, high = u[max(at - 2, 0)], u[min(at + 2, len(u) - 1)]
     return best
+
+
+def curvature(coefficients: Array, u: Array) -> Array:
+    """|F' x F''| / |F'|^3 of curves at u. Shapes (..., 6, 3), (...) to (...), 1/m."""
+    first, second = polynomial(coefficients, u, 1), polynomial(coefficients, u, 2)
+    bend = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
 def by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:

@@ -24,7 +24,7 @@ from models.arrays import (
     checked_instance,
 )
 from models.errors import ModelError
-from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, NEWTON_STEPS, speed
+from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, speed
 from models.paths.orientation import orientation_function
 from models.paths.segments import screw_axes
 from models.paths.smooth_path import SmoothPath
@@ -35,6 +35,8 @@ DEGREES = (3, 5)  # of the cubic, of the quintic
 MOST_CORRECTIONS, MOST_NODES = 100, 100  # of a mapping, whose expression grows with them
 QUADRATURE_NODES = (2, 3, 4, 8)
 """Twice the time of the paper's 3 corrections; on a 90 deg corner of 5 mm, at 1 m/s and 2 ms, a drift of 2e-9 mm."""
+NEWTON_STEPS = 3
+"""From the cubic guess of where a blend has an arc length, to rounding."""
 # rows of the table of cells
 SEGMENT = slice(0, 13)  # start; parts along, round and towards the axis of the screw, rate of turning
 CURVE = slice(13, 31)  # coefficients, three a power
@@ -107,7 +109,7 @@ def _in_cell() -> Any:
     x = distance / length
     slope0, slope1 = length / (width * speed0), length / (width * speed1)
     at: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
-    for _ in range(NEWTON_STEPS - 1):
+    for _ in range(NEWTON_STEPS):
         step = at - first_u
         mean = sum(
             float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from models.arrays import Array, ArrayInput, checked_array, checked_count, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
-from models.paths.blends import BlendKind, by_arc_length, quintic
+from models.paths.blends import BlendKind, by_arc_length, curvature, quintic
 from models.paths.orientation import along_piece
 from models.paths.path import Path
 
@@ -156,7 +156,7 @@ class SmoothPath:
 
     def curvature(self, distance: ArrayInput) -> Array:
         """Curvature at distances from the start. Shape (M,), 1/m."""
-        return np.asarray(np.linalg.norm(self.at(distance).curvature, axis=1))
+        return _in_parts(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
         """Tool orientation and its rates at distances from the start. Shape (M,), m.
@@ -248,6 +248,14 @@ class SmoothPath:
             for result, value in zip(results, by_arc_length(self.coefficients[curve], u), strict=True):
                 result[curved] = value
         return results
+
+    def _curvature(self, s: Array) -> tuple[Array]:
+        piece = self._piece(s)
+        found = np.abs(self.path.curvature[self.piece_segment[piece]])
+        curved = np.flatnonzero(self.piece_blend[piece] >= 0)
+        curve, u = self._parameter(s[curved])
+        found[curved] = curvature(self.coefficients[curve], u)
+        return (found[:, None],)
 
     def _turn(self, s: Array) -> tuple[Array, ...]:
         piece, (reference, theta) = self._piece(s), self.charts

@@ -8,7 +8,7 @@ speed, acceleration and jerk; `plan` finds the speeds at their bounds and joins 
 from __future__ import annotations
 
 from collections.abc import MutableMapping
-from math import sqrt
+from math import cbrt, hypot, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -70,13 +70,11 @@ def reach(speed: float, distance: float, acceleration: float, jerk: float) -> fl
 
     The inverse of ramp_distance: the same for slowing down from that speed.
     """
-    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance: Newton from above
-    x = (distance / jerk) ** (1 / 3)
-    for _ in range(50):
-        step = ((jerk * x * x + 2 * speed) * x - distance) / (3 * jerk * x * x + 2 * speed)
-        x -= step
-        if abs(step) <= 1e-15 * x:
-            break
+    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance: Cardano's
+    # difference of two roots, as the quotient that does not cancel
+    half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
+    root = cbrt(half + hypot(half, third**1.5))
+    x = 2 * half / (root * root + third + (third / root) ** 2)
     if jerk * x <= acceleration:
         return float(speed + jerk * x * x)
     # with it: v^2 + v A^2/J = speed^2 - speed A^2/J + 2 A distance
@@ -198,26 +196,35 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
         if ends[i] > ends[i + 1]:
             ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
-    rows: list[tuple[float, ...]] = []  # duration, distance, speed, acceleration at the start and jerk of each phase
-    for i, ((top, most, jerk), length) in enumerate(zip(limits, lengths, strict=True)):
-        first, last = ends[i], ends[i + 1]
+    motions: list[Phases] = []
+    for (top, most, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
         key = (length, first, last, top, most, jerk)
         if first == last == top:
-            phases: Phases = ((length / top, 0.0),)
-        elif key in memory:
-            phases = memory[key]
+            motions.append(((length / top, 0.0),))
         else:
-            phases = memory[key] = fastest(*key)
-        place, speed, rate = float(zones.bounds[i]), first, 0.0
-        for t, j in phases:
-            rows.append((t, place, speed, rate, j))
-            way, speed, rate = advanced(speed, rate, j, t)
-            place, speed, rate = place + way, max(speed, 0.0), rate if abs(rate) > 1e-9 * most else 0.0
-    durations, *starts, jerks = np.array(rows).reshape(-1, 5).T
+            motions.append(memory[key] if key in memory else memory.setdefault(key, fastest(*key)))
+    return _profile(zones, np.array(ends), motions)
+
+
+def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
+    """Motions through the zones, one after the other, from the speeds at the zones' bounds. Shape (Z + 1,), m/s."""
+    counts = np.array([len(phases) for phases in motions])
+    durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
         message = f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5].tolist()}"
         raise ProblemError(message, name="durations", value=durations[:5].tolist())
-    s, v, a = (np.append(start, end) for start, end in zip(starts, (zones.bounds[-1], 0.0, 0.0), strict=True))
+    starts = np.cumsum(counts) - counts
+    s, v, a = (np.zeros(len(durations) + 1) for _ in range(3))
+    place, speed, rate = zones.bounds[:-1].copy(), ends[:-1].copy(), np.zeros(len(motions))
+    for number in range(int(counts.max())):  # of the phase, in all motions that have so many
+        on = np.flatnonzero(counts > number)
+        at = starts[on] + number
+        s[at], v[at], a[at] = place[on], speed[on], rate[on]
+        way, faster, rising = advanced(speed[on], rate[on], jerks[at], durations[at])
+        place[on] += way
+        speed[on] = np.maximum(faster, 0.0)
+        rate[on] = np.where(np.abs(rising) > 1e-9 * zones.acceleration[on], rising, 0.0)
+    s[-1] = zones.bounds[-1]
     return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
 
 

@@ -135,12 +135,17 @@ def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, th
     if thoroughly:
         speed[fast] = most[fast]
         return bool(fast.any())
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], fast.astype(np.int8), [0]])))
-    for first, last in edges.reshape(-1, 2).tolist():
-        inside = most[first:last]
-        least = int(inside.argmin())
-        high = np.flatnonzero(inside > SPREAD * inside[least])
-        left = int(high[high < least].max(initial=-1)) + 1 + first
-        right = int(high[high > least].min(initial=last - first)) + first
-        np.minimum(speed[left:right], inside[least], out=speed[left:right])
-    return bool(fast.any())
+    inside = np.flatnonzero(fast)
+    if not inside.size:
+        return False
+    # one stretch about the slowest place of each run of them, as far as not much more is permitted
+    starts = np.flatnonzero(np.diff(inside, prepend=-2) > 1)
+    run = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(inside)))
+    here = most[inside]
+    least = np.minimum.reduceat(here, starts)
+    slowest = np.minimum.reduceat(np.where(here == least[run], inside, len(most)), starts)
+    apart = np.concatenate([[-1], inside[here > SPREAD * least[run]], [len(most)]])
+    after = np.searchsorted(apart, slowest)
+    near = (inside > apart[after - 1][run]) & (inside < apart[after][run])
+    speed[inside[near]] = np.minimum(speed[inside[near]], least[run[near]])
+    return True
