@@ -22,7 +22,7 @@ from tests.ocp.app.motions import joint, link, write_table
 
 SEED, DOF, POSTURES = 9, 7, 5
 SHARE = 1e-3
-PERIOD = 2e-3
+PERIOD = 1e-3
 """s, between samples."""
 
 
