@@ -165,6 +165,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
             made = PolyCollection(
                 bars, array=share, cmap=COSTS, norm=Normalize(1.0, MOST), linewidths=0.3, edgecolors="face"
             )
+            made.set_rasterized(True)  # thousands of them, 10 MB of SVG
             ax.add_collection(made)
             for (name, joints, color, cost), home in zip(ways, homes, strict=True):
                 if number in home:
