@@ -55,6 +55,7 @@ def test_no_posture_leads_to_a_cheaper_seam() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.long
 def test_every_motion_is_told_with_its_cost_and_why_it_is_not_the_plan() -> None:
     found, one = cheapest(), planned("seam_ur5")
     first, *others = found.candidates

@@ -199,6 +199,7 @@ def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_o
     assert found.cost < plan_bare(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
 
 
+@pytest.mark.long
 def test_a_place_that_what_came_before_does_not_lead_to_is_refused_by_name() -> None:
     _, at = pose(panda(), (), PANDA_START)
     off = TipTask(position=at + np.array([0.1, 0.12, 0.0]), begin=2.0, duration=2.0)

@@ -31,6 +31,7 @@ def poses(machine: FixedBase, joints: Array, count: int) -> tuple[Array, Array]:
     return np.array(ca.DM(pose.position)).ravel() + way, np.tile(turn, (count, 1))
 
 
+@pytest.mark.long
 def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_published() -> None:
     problem = problem_of("panda__1cube")
     found = planned(problem)

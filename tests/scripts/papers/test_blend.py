@@ -44,6 +44,7 @@ PICTURES = (
 )
 
 
+@pytest.mark.long
 def test_gamma_is_that_of_the_page(summary: Summary) -> None:
     expected = [
         (30, 0.530, 0.530, 0.693),
@@ -55,6 +56,7 @@ def test_gamma_is_that_of_the_page(summary: Summary) -> None:
     assert summary["gamma_table"][2][1] == pytest.approx(abs(1 - 1.5 / 4) * np.cos(np.pi / 4), abs=1e-12)
 
 
+@pytest.mark.long
 def test_gamma_measured_on_the_curve_is_the_closed_form(run: Run[Results]) -> None:
     for row in run.table("table2_gamma.csv"):
         for name in ("constant_30_90deg", "shape_1_90deg", "shape_1_45deg"):
@@ -63,6 +65,7 @@ def test_gamma_measured_on_the_curve_is_the_closed_form(run: Run[Results]) -> No
             assert float(row[f"{name}_paper"]) in printed
 
 
+@pytest.mark.long
 def test_lengths(summary: Summary) -> None:
     expected = [250, 270.32146, 351.92024, 269.65284, 526.93047]
     np.testing.assert_allclose(summary["lengths_mm"], expected, rtol=0, atol=1e-5)
@@ -70,6 +73,7 @@ def test_lengths(summary: Summary) -> None:
     assert sum(summary["lengths_mm"]) == pytest.approx(summary["total_length_mm"], abs=1e-9)
 
 
+@pytest.mark.long
 def test_times_in_both_readings(run: Run[Results], summary: Summary) -> None:
     assert summary["duration_s"] == pytest.approx(1.868825, abs=1e-6)
     np.testing.assert_allclose(summary["blend_times_s"], [0.3500, 0.6203, 0.9722, 1.2419], rtol=0, atol=5e-5)
@@ -87,6 +91,7 @@ def test_times_in_both_readings(run: Run[Results], summary: Summary) -> None:
         assert abs(float(row["mean_difference_s"])) < 2.5e-3
 
 
+@pytest.mark.long
 def test_ramps_of_the_mean_reading_have_the_mean_acceleration(run: Run[Results]) -> None:
     profile = run.results.mean.profile
     cruise = np.flatnonzero(np.isclose(profile.speed, SPEED, rtol=1e-12))
@@ -96,6 +101,7 @@ def test_ramps_of_the_mean_reading_have_the_mean_acceleration(run: Run[Results])
     np.testing.assert_allclose(inner, SPEED, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_speed_errors_of_both_mappings(summary: Summary) -> None:
     error = summary["speed_error_mm_s"]
     assert error["predictor_corrector_2ms"] == pytest.approx(-0.4207, abs=2e-4)
@@ -107,6 +113,7 @@ def test_speed_errors_of_both_mappings(summary: Summary) -> None:
     np.testing.assert_allclose(error["predictor_corrector_2ms_blend_ends"], [7.45, 7.6], rtol=0, atol=0.1)
 
 
+@pytest.mark.long
 def test_drift_and_speed_error_by_period(run: Run[Results]) -> None:
     expected = {1: (-3.73, -0.079, -0.105), 2: (-14.9, -0.316, -0.421), 4: (-59.5, -1.25, -1.67)}
     keys = ("drift_um", "true_speed_error_mm_s", "chord_speed_error_mm_s")
@@ -115,6 +122,7 @@ def test_drift_and_speed_error_by_period(run: Run[Results]) -> None:
             assert [float(row[key]) for key in keys] == pytest.approx(expected[int(float(row["period_ms"]))], rel=5e-3)
 
 
+@pytest.mark.long
 def test_drift_of_small_blends(run: Run[Results], summary: Summary) -> None:
     drift = summary["drift_mm"]
     assert abs(drift["gauss_1ms_150mm"]) < 1e-9
@@ -133,6 +141,7 @@ def is_paper_at_1ms(row: dict[str, str]) -> bool:
     return (row["blend"], row["mapping"], float(row["period_ms"])) == ("cubic", "predictor_corrector", 1)
 
 
+@pytest.mark.long
 def test_the_default_mapping_is_the_better_one_everywhere(run: Run[Results]) -> None:
     found: dict[tuple[str, str, str], dict[str, float]] = {}
     for row in run.table("mapping_small_blends.csv"):
@@ -142,6 +151,7 @@ def test_the_default_mapping_is_the_better_one_everywhere(run: Run[Results]) -> 
         assert drifts["gauss_newton"] < drifts["predictor_corrector"], case
 
 
+@pytest.mark.long
 def test_curvature_jumps(run: Run[Results], summary: Summary) -> None:
     np.testing.assert_allclose(summary["curvature_jumps_cubic_per_mm"], [0, 0, 1.62e-4, 3.25e-4], rtol=0, atol=1e-6)
     assert summary["max_curvature_jump_cubic"] == max(summary["curvature_jumps_cubic_per_mm"])
@@ -149,6 +159,7 @@ def test_curvature_jumps(run: Run[Results], summary: Summary) -> None:
     assert summary["max_curvature_jump_quintic"] < 1e-9 * peak
 
 
+@pytest.mark.long
 def test_centripetal_acceleration_that_the_example_asks(summary: Summary) -> None:
     line_line, line_arc = summary["asked_centripetal_mm_s2"]
     assert line_line == pytest.approx(25142, abs=1)
@@ -158,6 +169,7 @@ def test_centripetal_acceleration_that_the_example_asks(summary: Summary) -> Non
     np.testing.assert_allclose(np.square(speeds) * np.array([line_line, line_arc]) / SPEED**2 * MM**2, 5000, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_limits_asked_for_are_kept(run: Run[Results], summary: Summary) -> None:
     rows = {row["case"]: row for row in summary["limited"]}
     assert list(rows) == list(run.results.plans)
@@ -179,6 +191,7 @@ def test_limits_asked_for_are_kept(run: Run[Results], summary: Summary) -> None:
     assert rows["cubic, + centripetal"]["joint_jerk_over_limit"] == "unbounded"
 
 
+@pytest.mark.long
 def test_more_limits_never_make_it_faster(run: Run[Results], summary: Summary) -> None:
     for kind in ("cubic", "quintic"):
         rows = [row for row in summary["limited"] if row["case"].startswith(kind)]
@@ -187,6 +200,7 @@ def test_more_limits_never_make_it_faster(run: Run[Results], summary: Summary) -
             assert values == sorted(values)
 
 
+@pytest.mark.long
 def test_the_trajectory_draws_the_path(run: Run[Results]) -> None:
     trajectory = JointTrajectory.read_csv(run.folder / "trajectory.csv")
     assert trajectory.t[-1] == pytest.approx(1.868825, abs=1e-6)
@@ -202,6 +216,7 @@ def test_the_trajectory_draws_the_path(run: Run[Results]) -> None:
         np.testing.assert_allclose(rest, 0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.long
 def test_velocities_of_the_trajectory_are_those_of_its_positions(run: Run[Results]) -> None:
     plan, joints = run.results.mean, run.results.joints
     middle = np.linspace(0.01, plan.duration - 0.01, 301)
@@ -231,6 +246,7 @@ def test_a_corner_has_the_angle_it_is_given() -> None:
         assert path.remaining[0] == pytest.approx(20 * MM)
 
 
+@pytest.mark.long
 def test_files_are_whole_and_the_script_succeeds(run: Run[Results]) -> None:
     assert run.status == 0
     for name in PICTURES:
@@ -251,6 +267,7 @@ def test_files_are_whole_and_the_script_succeeds(run: Run[Results]) -> None:
     }
 
 
+@pytest.mark.long
 def test_the_tables_say_what_the_summary_says(run: Run[Results], summary: Summary) -> None:
     gamma = run.table("table2_gamma.csv")
     names = ("remaining_mm", "constant_30_90deg", "shape_1_90deg", "shape_1_45deg")
@@ -264,6 +281,7 @@ def test_the_tables_say_what_the_summary_says(run: Run[Results], summary: Summar
         assert float(row["duration_s"]) == pytest.approx(told["duration_s"], rel=1e-9)
 
 
+@pytest.mark.long
 def test_paper_value_ours_and_difference_are_printed(run: Run[Results]) -> None:
     for word in ("paper", "ours", "difference", "misprint", "1668.82501", "1.868825", "1.893825", "25142", "-0.4207"):
         assert word in run.printed

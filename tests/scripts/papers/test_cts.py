@@ -34,10 +34,12 @@ PICTURES = (
 TABLES = ("table6_time.csv", "iterations.csv", "reference_rolls.csv", "sweep.csv")
 
 
+@pytest.mark.long
 def test_reference_rolls(summary: Summary) -> None:
     assert summary["phi_reference"] == pytest.approx([0.331364, 0.682290, math.pi / 2, 2.459303, 2.810229], abs=1e-6)
 
 
+@pytest.mark.long
 def test_iterations_are_those_of_the_reference(summary: Summary) -> None:
     assert summary["i1"]["combined"]["iterations_mean"] == pytest.approx(3.0, abs=0.05)
     assert summary["i1"]["jacobian"]["iterations_mean"] == pytest.approx(11.9, abs=1.0)
@@ -46,6 +48,7 @@ def test_iterations_are_those_of_the_reference(summary: Summary) -> None:
     assert summary["i2"]["jacobian"]["converged"] == 0
 
 
+@pytest.mark.long
 def test_divergence_is_told_by_the_stability_bound(summary: Summary) -> None:
     for index, method, stable in (
         ("i1", "jacobian", True),
@@ -56,11 +59,13 @@ def test_divergence_is_told_by_the_stability_bound(summary: Summary) -> None:
         assert (summary[index][method]["gain_n6_squared_bend_max"] < 2) == stable
 
 
+@pytest.mark.long
 def test_no_global_minimum_is_missed_and_newton_often_ends_in_a_maximum(summary: Summary) -> None:
     assert summary["global_missed"] == 0
     assert 0.5 < summary["newton_maximum_share"] < 0.7
 
 
+@pytest.mark.long
 def test_the_null_space_method_takes_more_iterations(summary: Summary) -> None:
     combined = summary["i1"]["combined"]["iterations_mean"]
     assert summary["i1"]["jacobian"]["iterations_mean"] > 2 * combined
@@ -68,6 +73,7 @@ def test_the_null_space_method_takes_more_iterations(summary: Summary) -> None:
     assert summary["compiled_ns_per_target"] > 0
 
 
+@pytest.mark.long
 def test_the_release_is_tracked_and_keeps_clear(summary: Summary) -> None:
     release = summary["release"]
     assert release["tracking_m"] < 1e-12
@@ -75,6 +81,7 @@ def test_the_release_is_tracked_and_keeps_clear(summary: Summary) -> None:
     assert release["least_clearance_m"] > 0.05
 
 
+@pytest.mark.long
 def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: Summary) -> None:
     found = summary["plan"]
     plan, single = found["plan"], found["each_target_by_itself"]
@@ -84,6 +91,7 @@ def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: Summary)
     assert plan["index_integral_s"] > single["index_integral_s"]
 
 
+@pytest.mark.long
 def test_all_files_are_written_and_the_script_succeeds(run: Run[Results]) -> None:
     assert run.status == 0
     assert run.names == {*PICTURES, *TABLES, "release.gif", "summary.json"}
