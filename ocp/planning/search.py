@@ -333,7 +333,7 @@ class Search:
     def _tight(self, path: Array | None, layers: list[Charts]) -> Array | None:
         """A way drawn tight within charts; as it was where that touches; None if it is too fast."""
         bounds = self.space.lower, self.space.upper
-        steps = self.cost, np.diff(self.times), self.limits
+        steps = self.cost, self.times, self.limits
         if path is None:
             return None
         if self.start is None:

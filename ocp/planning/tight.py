@@ -37,7 +37,7 @@ def drawn_tight(
     path: Array,
     instants: Sequence[Instant],
     cost: StepCost,
-    seconds: Array,
+    times: Array,
     far: Array,
     bounds: tuple[Array, Array],
     around: Surroundings | None,
@@ -48,7 +48,7 @@ def drawn_tight(
     Args:
         path: Joints at the instants, which do the tasks. Shape (K, n).
         instants: All of one free direction, or all of two; of others the way stays.
-        cost, seconds: Of steps, which take so long. Shape (K - 1,).
+        cost: Of steps. times: Of the instants. Shape (K,), s.
         far: Limits of the ways of the joints from instant to instant. Shape (K - 1, n).
         bounds: Of the joints. Shape (n,) each.
         around: What has to be clear.
@@ -73,12 +73,12 @@ def drawn_tight(
             on, fine = sets.corrected(np.repeat(number[those], count), flat.reshape(-1, flat.shape[2]))
             good[those] = fine.reshape(len(those), -1)
             beside[those] = np.where(good[those][:, :, None], on.reshape(flat.shape), flat)
-        wrong = np.where(good, _passed(beside, bounds, around), 1.0)
+        wrong = np.where(good, _passed(beside, times, bounds, around), 1.0)
         value, back = DEAR * wrong[0], []
         for k in range(1, len(joints)):
             way = beside[k][None] - beside[k - 1][:, None]
             over = np.maximum(np.abs(way) - far[k - 1], 0.0).sum(axis=2)
-            steps = value[:, None] + cost.of(way, seconds[k - 1]) + DEAR * over
+            steps = value[:, None] + cost.of(way, times[k] - times[k - 1]) + DEAR * over
             back.append(steps.argmin(axis=0))
             value = steps.min(axis=0) + DEAR * wrong[k]
         seats = [int(value.argmin())]
@@ -93,16 +93,16 @@ def drawn_tight(
     return joints
 
 
-def _passed(beside: Array, bounds: tuple[Array, Array], around: Surroundings | None) -> Array:
-    """By how much postures (K, s, n) about a way pass limits and clearance, rad and m. Shape (K, s)."""
+def _passed(beside: Array, times: Array, bounds: tuple[Array, Array], around: Surroundings | None) -> Array:
+    """By how much postures (K, s, n) about a way pass limits and clearance at times (K,), rad and m. Shape (K, s)."""
     over = np.maximum(np.maximum(beside - bounds[1], bounds[0] - beside), 0.0).sum(axis=2)
     if around is None:
         return np.asarray(over)
     least, middle, none = around.clearance + INSIDE, beside[:, beside.shape[1] // 2], np.zeros(0)
     span = np.abs(beside - middle[:, None]).max(axis=1) @ around.levers.joints.T
-    apart = distances_along(around, none, middle, np.zeros(len(middle)), least + float(span.max(initial=0.0)))
+    apart = distances_along(around, none, middle, times, least + float(span.max(initial=0.0)))
     close = np.flatnonzero((apart - span < least).any(axis=1))  # beside the others nothing comes near
-    each = beside[close].reshape(-1, beside.shape[2])
-    apart = distances_along(around, none, each, np.zeros(len(each)), least)
+    each, then = beside[close].reshape(-1, beside.shape[2]), np.repeat(times[close], beside.shape[1])
+    apart = distances_along(around, none, each, then, least)
     over[close] += np.maximum(least - apart, 0.0).max(axis=1, initial=0.0).reshape(len(close), beside.shape[1])
     return np.asarray(over)

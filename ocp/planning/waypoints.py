@@ -346,10 +346,11 @@ class _Ways:
         Returns:
             Its length, what is wrong with it where it goes through all there are, and its joints.
         """
+        times = np.arange(chosen[0], chosen[-1] + 1.0)
         numbers = [Instant(self.sets, k) for k in range(int(chosen[0]), int(chosen[-1]) + 1)]
         far, bounds = np.repeat(self.step[None], len(numbers) - 1, axis=0), (self.lower, self.upper)
         start = self._through(chosen, path)
-        joints = drawn_tight(start, numbers, self.cost, np.ones(len(far)), far, bounds, self.around, (WIDTH, TIGHT))
+        joints = drawn_tight(start, numbers, self.cost, times, far, bounds, self.around, (WIDTH, TIGHT))
         whole = len(joints) == len(self.places)
         return self._length(joints), self._wrong(joints)[0] if whole else "", joints
 
