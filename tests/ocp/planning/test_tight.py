@@ -51,12 +51,11 @@ def followed() -> Array:
 
 def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     """The way drawn tight, so much later than its task."""
-    robot, around = MACHINE.robot, None
-    if obstacle is not None:
-        around = Surroundings(MACHINE, [obstacle], clearance=CLEARANCE)
-    far = np.full((len(TIMES) - 1, robot.dof), 1.0)
-    bounds = robot.lower, robot.upper
-    return drawn_tight(followed(), INSTANTS, Length(np.ones(robot.dof)), TIMES + later, far, bounds, around, (0.1, 1e-3))
+    robot = MACHINE.robot
+    around = None if obstacle is None else Surroundings(MACHINE, [obstacle], clearance=CLEARANCE)
+    far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
+    cost = Length(np.ones(robot.dof))
+    return drawn_tight(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
 
 
 def length(path: Array) -> float:
