@@ -134,7 +134,7 @@ def tip_pose(robot: Robot, q: Expression, world_from_base: Placement | None = No
 def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
     """Frame of the tip in the world, given the frames of the links."""
     link = frames[robot.tip_link]
-    return Frame(ca.mtimes(link.rotation, _constant(robot.tip_rotation)), link.point(robot.tip_translation))
+    return Frame(ca.mtimes(link.rotation, constant(robot.tip_rotation)), link.point(robot.tip_translation))
 
 
 def centers_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
@@ -220,7 +220,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
-        inertia: Expression = ca.mtimes(turn, _constant(link.inertia))
+        inertia: Expression = ca.mtimes(turn, constant(link.inertia))
         second = [[ca.mtimes(inertia[i, :], turn[j, :].T) for j in range(i + 1)] for i in range(3)]
         own = ca.vertcat(*(ca.horzcat(*row, ca.DM(1, 2 - i)) for i, row in enumerate(second)))
         arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
@@ -251,6 +251,28 @@ def point_jacobian(
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, columns))
 
 
+def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
+    """Frame of each joint's child in that of its parent, by the name of the joint."""
+    positions, found = _positions(robot, q), {}
+    for joint in robot.joints:
+        turn, place = constant(joint.rotation), constant(joint.translation)
+        if joint.kind == "prismatic":
+            place = place + ca.mtimes(turn, constant(joint.axis)) * positions[joint.name]
+        elif joint.moves:
+            turn = ca.mtimes(turn, rotation(constant(joint.axis), positions[joint.name]))
+        found[joint.name] = Frame(turn, place)
+    return found
+
+
+def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
+    """Positions of all joints that move, followers included, by name."""
+    found = each_joint(robot, q)
+    for name, drive in robot.drives.items():
+        if drive.offset:
+            found[name] = found[name] + drive.offset
+    return found
+
+
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
@@ -258,20 +280,17 @@ def frames_and_axes(
 
     A motion vector is (angular velocity, velocity at the world's origin) per unit rate of that joint, world axes.
     """
-    positions = each_joint(robot, q)
-    for name, drive in robot.drives.items():
-        if drive.offset:
-            positions[name] = positions[name] + drive.offset
+    positions = _positions(robot, q)
     frames: dict[str, Frame] = {robot.root: checked_placement(world_from_base)}
     axes: dict[str, tuple[Expression, Expression]] = {}
     turns: dict[str, _Turn] = {}
     for joint in robot.joints:
         parent, turn = frames[joint.parent], turns.get(joint.parent)
-        frame = Frame(ca.mtimes(parent.rotation, _constant(joint.rotation)), parent.point(joint.translation))
+        frame = Frame(ca.mtimes(parent.rotation, constant(joint.rotation)), parent.point(joint.translation))
         if not np.array_equal(joint.rotation, np.eye(3)):
             turn = None
         if joint.kind == "prismatic":
-            axis = ca.mtimes(frame.rotation, _constant(joint.axis))
+            axis = ca.mtimes(frame.rotation, constant(joint.axis))
             axes[joint.name] = (ca.DM(3, 1), axis)
             frame = Frame(frame.rotation, frame.position + positions[joint.name] * axis)
         elif joint.moves:
@@ -280,9 +299,9 @@ def frames_and_axes(
                 turn = turn._replace(angle=turn.angle + positions[joint.name])
             else:
                 turn = _Turn(frame.rotation, joint.axis, positions[joint.name])
-            axis = ca.mtimes(turn.before, _constant(joint.axis))
+            axis = ca.mtimes(turn.before, constant(joint.axis))
             axes[joint.name] = (axis, cross(frame.position, axis))
-            turned = ca.mtimes(turn.before, rotation(_constant(joint.axis), turn.angle))
+            turned = ca.mtimes(turn.before, rotation(constant(joint.axis), turn.angle))
             frame = Frame(turned, frame.position)
         frames[joint.child] = frame
         if turn is not None:
@@ -290,6 +309,6 @@ def frames_and_axes(
     return frames, axes
 
 
-def _constant(array: Array) -> Expression:
-    # What rounding leaves of cos(pi / 2) would hide the structure of the robot: drop it.
+def constant(array: Array) -> Expression:
+    """An array without its zeros, and without what rounding leaves of cos(pi / 2), which would hide them."""
     return ca.sparsify(ca.DM(array), 1e-15 * float(np.abs(array).max(initial=0.0)))

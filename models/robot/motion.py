@@ -116,23 +116,11 @@ def motions_of(
     axes: dict[str, tuple[Expression, Expression]],
     qd: Expression,
     qdd: Expression,
-    base_twist: Expression | None = None,
-    base_acceleration: Expression | None = None,
 ) -> dict[str, LinkMotion]:
-    """Outward recursion over the origins of the link frames, then from these to the centres of mass.
-
-    The root link's frame may move: (angular, of its origin) velocity and acceleration, shape (6, 1), world axes.
-    """
+    """Outward recursion over the origins of the link frames, then from these to the centres of mass."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
-    meaning = "angular, then of the origin of the root link's frame"
-    twist, push = (
-        ca.DM(6, 1) if given is None else checked_vector(given, 6, what, meaning)
-        for given, what in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
-    )
     # of the frame's origin: velocity, acceleration, angular velocity, angular acceleration
-    origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {
-        robot.root: (twist[3:6], push[3:6], twist[0:3], push[0:3])
-    }
+    origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
     for joint in robot.joints:
         velocity, acceleration, spin, turning = origin[joint.parent]
         arm = frames[joint.child].position - frames[joint.parent].position
