@@ -9,8 +9,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Robot, Sphere, inverse_dynamics
+from models import FixedBase, FreeFloating, Robot, Sphere, Standing, inverse_dynamics
+from ocp import Plan
 from ocp.app import Check, Fault, check_trajectory
+from ocp.app.verdict import BaseKind
 from ocp.errors import ProblemError
 from ocp.files import read_trajectory, read_waypoints
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, TURNS, URDF, smooth, write_table
@@ -297,3 +299,26 @@ def test_a_torque(tmp_path: Path, with_rates: int) -> None:
     near(fault, t[np.abs(exact[:, 0]).argmax()])
     assert abs(fault.value or 0.0) == pytest.approx(limit / 0.95, rel=1e-3)
     assert [one.kind for one in found.faults] == ["torque"]
+
+
+# ---- plans of the gallery, exported and read back --------------------------------------------------------------------
+
+
+GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
+BASES: dict[type, BaseKind] = {FixedBase: "fixed", FreeFloating: "floating", Standing: "standing"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(file.stem, marks=pytest.mark.long if file.stem in ("mobile_manipulator", "pushing") else ())
+        for file in sorted(GALLERY.glob("*.npz"))
+    ],
+)
+def test_plans_of_the_gallery_are_not_accused(name: str, tmp_path: Path) -> None:
+    plan = Plan.load(GALLERY / f"{name}.npz")
+    robot, file = plan.machine.robot, tmp_path / "plan.csv"
+    plan.write_csv(file)
+    found = check_trajectory(robot, read_trajectory(file, joints=robot.joint_names), base=BASES[type(plan.machine)])
+    assert found.passed, found
+    assert found.faults == ()
