@@ -2,10 +2,12 @@
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate
+from ocp.builders.capture import capture_problem, chained_capture, plan_capture
 from ocp.builders.clearance import Clear
 from ocp.builders.cts import roll_problem, spline_targets
 from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem, joint_torques
 from ocp.builders.dynamics_plan import plan_dynamics
+from ocp.builders.grasping import Cone, Grasp
 from ocp.builders.joint_spline import joint_path
 from ocp.builders.legs import Leg, dynamics_phases
 from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
@@ -46,11 +48,13 @@ __all__ = [
     "Certificate",
     "Clear",
     "Collocation",
+    "Cone",
     "DeadEnd",
     "Effort",
     "Finding",
     "Following",
     "FreeTime",
+    "Grasp",
     "InFoot",
     "IndexAtLeast",
     "Indirect",
@@ -77,7 +81,9 @@ __all__ = [
     "Unreachable",
     "WaypointPlan",
     "Weights",
+    "capture_problem",
     "certificate",
+    "chained_capture",
     "dynamics_phases",
     "dynamics_problem",
     "inverse_kinematics",
@@ -86,6 +92,7 @@ __all__ = [
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan",
+    "plan_capture",
     "plan_dynamics",
     "plan_minimum_time",
     "plan_minimum_velocity",

@@ -19,7 +19,7 @@ picked up and put down as :class:`~ocp.problem.phases.Phases` of such problems, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict
 
 import casadi as ca
@@ -120,7 +120,8 @@ class Effort:
     Attributes:
         torque: Of the squared torques, one number or one for each joint: losses in the windings, 1/(N m)^2/s.
         energy: Of what the drives give, the sum of max(torque times rate, 0): nothing is won back by braking, 1/J.
-        acceleration: Of the squared accelerations. jerk: Of the squared jerks, where they are the control.
+        acceleration: Of the squared accelerations, one number or one for each joint: light joints at the end of an arm
+            turn by hardly any torque. jerk: Of the squared jerks, where they are the control.
         fuel: Of the thrust of all thrusters, 1/(N s). It is linear: what is best is full on or off but for singular
             arcs, so that thrusters that only switch cost no more than these, as far as the mesh resolves the switching.
         turning: Of the squared angular velocity of a base that floats, 1/(rad/s)^2/s.
@@ -132,16 +133,17 @@ class Effort:
 
     torque: Any = 1.0
     energy: float = 0.0
-    acceleration: float = 0.0
+    acceleration: Any = 0.0
     jerk: float = 0.0
     fuel: float = 0.0
     turning: float = 0.0
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        torque = _nonnegative("effort: torque", self.torque, None)
-        parts = [checked_nonnegative(f"effort: {what}", getattr(self, what)) for what in list(vars(self))[1:]]
-        if not (any(parts) or torque.any()):
+        each = [_nonnegative(f"effort: {what}", getattr(self, what), None) for what in ("torque", "acceleration")]
+        names = ("energy", "jerk", "fuel", "turning", "time")
+        parts = [checked_nonnegative(f"effort: {what}", getattr(self, what)) for what in names]
+        if not (any(parts) or np.concatenate(each).any()):
             raise ProblemError("effort: at least one weight must be above zero", name="effort", value=self, limit=0.0)
 
 
@@ -192,23 +194,52 @@ def joint_torques(
         fall = GRAVITY if gravity is None else gravity
         found = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
     else:
-        fall = (0.0, 0.0, 0.0) if gravity is None else gravity
-        twist = machine.base_twist(base, joints, rates)
-        along = ca.vertcat(_base_rate(machine, base, joints, rates, wrenches, gravity), rates, accelerations)
-        changes = ca.jtimes(twist, ca.vertcat(base, joints, rates), along)
-        spatial = ca.DM.eye(6)[:, machine.twist_rows]
-        found = inverse_dynamics(
-            robot,
-            joints,
-            rates,
-            accelerations,
-            wrenches,
-            fall,
-            machine.world_from_base(base),
-            base_twist=spatial @ twist,
-            base_acceleration=spatial @ changes,
-        )
+        _require_momentum(machine, base, wrenches, gravity)
+        found = _floating_torques(machine, base, joints, rates, accelerations, wrenches, gravity)
     return found if friction is None else found + friction.torques(rates)
+
+
+def _floating_torques(
+    machine: FreeFloating,
+    base: Any,
+    joints: Any,
+    rates: Any,
+    accelerations: Any,
+    wrenches: Sequence[Wrench],
+    gravity: Any,
+) -> Any:
+    """Torques on a floating base, all in its own axes: where it is and how it lies tell the momentum and what acts.
+
+    In these axes the momentum changes by what acts, and as they turn: h' = ... - w x h.
+    """
+    rows, home = machine.twist_rows, ca.DM(machine.base_home())
+    spatial, turn = ca.DM.eye(6)[:, rows], machine.world_from_base(base).rotation.T
+    moves = base.numel() > machine.base_size or np.any(np.asarray(machine.conserved_momentum))
+    pushes = [
+        replace(each, force=ca.mtimes(turn, ca.vertcat(each.force)), moment=ca.mtimes(turn, ca.vertcat(each.moment)))
+        for each in wrenches
+    ]
+    fall = None if gravity is None else ca.mtimes(turn, ca.DM(floats(gravity).ravel()))
+    momentum = type(joints).sym("momentum", len(rows) if moves else 0)
+    there = ca.vertcat(home, momentum)
+    twist = machine.base_twist(there, joints, rates)
+    whole, held = spatial @ twist, spatial @ momentum if moves else ca.DM(6, 1)
+    change = _base_rate(machine, there, joints, rates, pushes, fall)[machine.base_size :]
+    turning = ca.vertcat(cross(whole[0:3], held[0:3]), cross(whole[0:3], held[3:6]))[rows[: momentum.numel()]]
+    along = ca.vertcat(change - turning, rates, accelerations)
+    second = spatial @ ca.jtimes(twist, ca.vertcat(momentum, joints, rates), along)
+    second += ca.vertcat(ca.DM(3, 1), cross(whole[0:3], whole[3:6]))
+    found = inverse_dynamics(
+        machine.robot, joints, rates, accelerations, pushes, (0.0, 0.0, 0.0) if fall is None else fall, None,
+        base_twist=whole, base_acceleration=second,
+    )  # fmt: skip
+    if not moves:
+        return found
+    given = spatial @ (
+        base[machine.base_size :] if base.numel() > machine.base_size else ca.DM(machine.conserved_momentum)
+    )
+    seen = ca.vertcat(ca.mtimes(turn, given[0:3]), ca.mtimes(turn, given[3:6]))
+    return ca.substitute(found, momentum, ca.densify(type(joints)(seen[rows])))
 
 
 def _base_rate(machine: Any, base: Any, joints: Any, rates: Any, wrenches: Sequence[Wrench], gravity: Any) -> Any:
@@ -216,17 +247,22 @@ def _base_rate(machine: Any, base: Any, joints: Any, rates: Any, wrenches: Seque
     pose = machine.base_rate(base, joints, rates)
     if not isinstance(machine, FreeFloating):
         return pose
+    _require_momentum(machine, base, wrenches, gravity)
     if base.numel() == machine.base_size:
-        if wrenches or gravity is not None:
-            words = "what acts on a floating machine changes its momentum: give the base with it, (pose, momentum)"
-            raise ProblemError(words, name="wrenches", value=wrenches)
         return pose
     placement = machine.world_from_base(base)
     outside = external_wrench(machine.robot, joints, wrenches, placement)
     if gravity is not None:
-        weight = machine.robot.total_mass * ca.DM(floats(gravity).ravel())
+        weight = machine.robot.total_mass * ca.vertcat(gravity)
         outside += ca.vertcat(cross(center_of_mass(machine.robot, joints, placement), weight), weight)
     return ca.vertcat(pose, machine.momentum_rate(base, joints, outside))
+
+
+def _require_momentum(machine: FreeFloating, base: Any, wrenches: Sequence[Wrench], gravity: Any) -> None:
+    """Raise where something acts on a floating machine whose momentum is not given with its base."""
+    if base.numel() == machine.base_size and (wrenches or gravity is not None):
+        words = "what acts on a floating machine changes its momentum: give the base with it, (pose, momentum)"
+        raise ProblemError(words, name="wrenches", value=wrenches)
 
 
 @interruptible
@@ -383,7 +419,8 @@ def dynamics_problem(
     if limited:
         most = bounds.torque[limited]
         problem.path("torques", torques[limited], lower=-most, upper=most, unit=robot.effort_unit)
-    running = effort.acceleration * ca.sumsqr(second) + effort.jerk * ca.sumsqr(jerks)
+    running = ca.dot(ca.DM(_nonnegative("effort: acceleration", effort.acceleration, n)), second**2)
+    running += effort.jerk * ca.sumsqr(jerks)
     running += effort.fuel * ca.sum1(thrust)
     if effort.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]

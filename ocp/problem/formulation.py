@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -156,6 +156,9 @@ class Formulation:
         self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
         self.path = self._rows("path", declared.path)
+        if declared.phases and problem.symbols is ca.SX:  # placed one by one, expressions share nothing any more
+            self.f, self.running, rows = ca.cse([self.f, self.running, self.path.expression])
+            self.path = replace(self.path, expression=rows)
         self.start = self._rows("start", declared.start, 0.0)
         self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)

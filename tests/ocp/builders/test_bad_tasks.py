@@ -23,9 +23,11 @@ from models import (
 )
 from ocp import (
     Collocation,
+    Cone,
     Effort,
     Following,
     FreeTime,
+    Grasp,
     IndexAtLeast,
     Indirect,
     InFoot,
@@ -40,11 +42,14 @@ from ocp import (
     StepWeights,
     TipTask,
     Weights,
+    capture_problem,
+    chained_capture,
     dynamics_phases,
     dynamics_problem,
     inverse_kinematics,
     joint_torques,
     minimum_velocity_problem,
+    plan_capture,
     plan_dynamics,
     plan_minimum_velocity,
     plan_standing,
@@ -88,6 +93,7 @@ from tests.bad_values import (
     good_calls,
     panel,
 )
+from tests.ocp.builders.captures import planar_capture
 
 START = [0.3, 0.6, 0.9]
 CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
@@ -98,6 +104,7 @@ FLOATING = FreeFloating(
     planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0], base=Link("hub", 9.0, (0, 0, 0), np.eye(3))), "planar"
 )
 THRUSTER = Thruster("hub", (1, 0, 0), 1.0)
+CAPTURE = planar_capture() | {"approach": 5.0, "detumble": 5.0}
 UP = [1.4, 0.3, 0.3]
 REACHED = np.array(ca.DM(ARM.tip_pose((), START).position)).ravel()
 FORWARD = TipTask(velocity=[0.1, 0.0], rows=(3, 4))
@@ -506,6 +513,45 @@ DYNAMICS = [
             "tasks": but(INSTANCE, "list", "dictionary"),
             "name": TEXT | {"with a dot": "leg.1"},
         },
+    ),
+    Case(
+        "Cone",
+        Cone,
+        {"direction": (-1.0, 0.0, 0.0), "half_angle": 0.4, "length": 0.3},
+        {
+            "direction": array(3) | {"zero": np.zeros(3)},
+            "half_angle": POSITIVE | {"right": np.pi / 2},
+            "length": POSITIVE,
+            "depth": POSITIVE,
+        },
+    ),
+    Case("Grasp", Grasp, {}, {"force": but(POSITIVE, "inf"), "moment": but(POSITIVE, "inf")}),
+    Case(
+        "capture_problem",
+        capture_problem,
+        CAPTURE,
+        {
+            "chaser": INSTANCE | {"fixed": ARM},
+            "target": INSTANCE | {"with joints": FLOATING},
+            "start_joints": array(4),
+            "approach": HORIZON,
+            "detumble": HORIZON,
+            "start_base": but(array(3), "None"),
+            "target_base": but(array(3), "None"),
+            "cone": but(INSTANCE, "None"),
+            "grasp": but(INSTANCE, "None"),
+            "clearance": NONNEGATIVE,
+            "thrusters": SEQUENCE,
+        },
+    ),
+    *(
+        Case(
+            name,
+            function,
+            CAPTURE | {"method": Collocation(5, 4, scheme="legendre")},
+            {"chaser": INSTANCE, "detumble": HORIZON, "method": but(INSTANCE, "None"), "options": MAPPING},
+        )
+        for name, function in (("plan_capture", plan_capture), ("chained_capture", chained_capture))
     ),
     Case(
         "plan_dynamics",

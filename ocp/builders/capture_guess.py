@@ -1,0 +1,224 @@
+"""Where a capture begins to be looked for: motions that obey the dynamics and end in the grasp, or at rest.
+
+The target's motion is known, whatever the chaser does. Towards it the tip goes by the pseudo-inverse of the generalized
+Jacobian, damped, from its own start onto the way of the frame that is grasped, beside it at first, along the axis of
+the approach at last. After the grasp the arm slows down evenly while the wheels take the momentum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from models import FreeFloating, wheels_of
+from models.arrays import Array
+from ocp.builders.dynamics import QUINTIC
+from ocp.problem.problem import Problem
+from ocp.problem.values import constant
+
+__all__ = ["free_motion", "guess_approach", "guess_braking", "guessed"]
+
+Guesses = dict[str, Any]
+"""Functions of the time, by the names of states and controls."""
+STEPS, TRIES = 200, 9
+"""Of a motion; free times that are tried."""
+REACHED = 1e-3
+"""How near the tip has to come, m and rad."""
+MET, LATE = 0.75, 0.5
+"""Fractions of the approach: where the tip begins to move with the target, and where to come nearer to the grasp."""
+DAMPING = 0.05
+"""Of the pseudo-inverse, m and 1."""
+ROUNDS = 4
+"""In which the attitude at the end and the speeds of the wheels that follow from it are found."""
+
+
+def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
+    """Configurations (M, base_size) of a body that nothing acts on, at evenly spaced times (M,), s.
+
+    By Runge and Kutta's rule of order four.
+    """
+    b, step, none = ca.SX.sym("b", target.base_size), times[1] - times[0], ca.DM(0, 1)
+    rate = ca.Function("rate", [b], [target.base_rate(b, none, none)])
+    k1 = rate(b)
+    k2 = rate(b + step / 2 * k1)
+    k3 = rate(b + step / 2 * k2)
+    k4 = rate(b + step * k3)
+    after = ca.Function("after", [b], [b + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    moved = after.mapaccum(len(times) - 1)(base)
+    return np.vstack([base, np.array(moved).T])
+
+
+def guess_approach(
+    problem: Problem, chaser: FreeFloating, target: FreeFloating, joints: Array, rates: Array, base: Array,
+    target_base: Array, out: Array,
+) -> None:  # fmt: skip
+    """Give an approach its guess, and a free time that of some which ends in the grasp, or nearest to it.
+
+    Args:
+        joints, rates, base, target_base: At the start.
+        out: From where the tip comes to the grasp at last, in the frame that is grasped. Shape (3,), m.
+    """
+    horizon = problem.declared.horizon
+    assert horizon is not None
+    first = guessed(problem)
+    tries = [first]
+    if not horizon.fixed:
+        spread = np.geomspace(constant(horizon.lower)[0], constant(horizon.upper)[0], TRIES)
+        tries += sorted(spread, key=lambda duration: abs(np.log(duration / first)))
+    nearest = np.inf
+    walker = _Walker(problem, chaser, rates)
+    for duration in tries:
+        times = np.linspace(0.0, duration, STEPS + 1)
+        bases = free_motion(target, target_base, times)
+        way = _way_of_tip(chaser, target, times, bases, (joints, base), out)
+        gap, guesses = walker.along(times, way, joints, base)
+        if gap < nearest:
+            nearest = gap
+            tell(problem, duration, {**guesses, "target": _curve(times, bases)})
+        if gap < REACHED:
+            return
+
+
+class _Walker:
+    """Takes the tip of a machine along a way, step by step."""
+
+    def __init__(self, problem: Problem, machine: FreeFloating, rates: Array) -> None:
+        n, wheels = machine.joint_size, wheels_of(machine.robot)
+        self.rows = machine.twist_rows
+        self.arm = [k for k, name in enumerate(machine.robot.joint_names) if name not in wheels]
+        self.rates = rates
+        b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, n, n))
+        tip = machine.tip_pose(b, q)
+        jacobian, drift = machine.tip_jacobian(b, q)[self.rows, self.arm], machine.tip_twist(b, q, v)[self.rows]
+        self.look = ca.Function("look", [b, q, v], [tip.position, tip.rotation, jacobian, drift])
+        self.step = _stepper(machine)
+        states = problem.declared.states
+        self.low, self.high = (constant(getattr(states["joints"], side)) for side in ("lower", "upper"))
+        self.fastest = constant(states["velocities"].upper)
+
+    def along(self, times: Array, way: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
+        """How far from the end of the way the tip comes, m and rad, and the guesses; wheels turn as they do."""
+        places, turns = way
+        step = times[1]
+        speed = self.rates.copy()
+        speed[self.arm] = 0.0
+        drifting = speed
+        found, moving = [(joints, base)], []
+        for k in range(STEPS):
+            at, home = found[-1]
+            position, rotation, matrix, drift = (np.array(part) for part in self.look(home, at, drifting))
+            gap = _gap(places[k + 1], turns[k + 1], position, rotation)[self.rows]
+            square = matrix @ matrix.T + DAMPING**2 * np.eye(len(self.rows))
+            speed = drifting.copy()
+            speed[self.arm] = matrix.T @ np.linalg.solve(square, gap / step - drift.ravel())
+            speed = np.clip(speed, -self.fastest, self.fastest)
+            speed = (np.clip(at + step * speed, self.low, self.high) - at) / step
+            moving.append(speed)
+            found.append((at + step * speed, self.step(step, home, at, speed)))
+        at, home = found[-1]
+        position, rotation, *_ = (np.array(part) for part in self.look(home, at, drifting))
+        left = _gap(places[-1], turns[-1], position, rotation)[self.rows]
+        angles, poses = (np.array(part) for part in zip(*found, strict=True))
+        return float(np.abs(left).max()), _motion(times, angles, np.array([self.rates, *moving]), poses)
+
+
+def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
+    """(Turn, way) from one pose to another, world axes. Shape (6,)."""
+    return np.concatenate([Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()])
+
+
+def _way_of_tip(
+    chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
+) -> tuple[Array, Array]:
+    """Places (M, 3) and axes (M, 3, 3) of the tip: from rest where it is onto the frame that is grasped."""
+    b = ca.SX.sym("b", target.base_size)
+    pose = target.tip_pose(b, ca.DM(0, 1))
+    look = ca.Function("look", [b], [pose.position, ca.vec(pose.rotation)])
+
+    def frames(configurations: Array) -> tuple[Array, Rotation]:
+        place, turn = (np.array(part).T for part in look.map(len(configurations))(configurations.T))
+        return place, Rotation.from_matrix(turn.reshape(-1, 3, 3).transpose(0, 2, 1))
+
+    share = times / times[-1]
+    meeting, nearer = QUINTIC(np.clip(share / MET, 0, 1)), QUINTIC(np.clip((share - LATE) / (1 - LATE), 0, 1))
+    grasped, turned = frames(bases)
+    own = chaser.tip_pose(start[1], start[0])
+    first, axes = np.array(ca.DM(own.position)).ravel(), Rotation.from_matrix(np.array(ca.DM(own.rotation)))
+    beside = grasped + (1 - nearer[:, None]) * turned.apply(out)
+    places = first + meeting[:, None] * (beside - first)
+    # onto the attitude at the end, and with it as it was a while before, which is none at last
+    before = times[-1] - meeting * (times[-1] - times)
+    then = frames(np.column_stack([np.interp(before, times, column) for column in bases.T]))[1]
+    vector = (axes.inv() * turned[-1]).as_rotvec()
+    turns = axes * Rotation.from_rotvec(meeting[:, None] * vector) * turned[-1].inv() * then
+    return places, turns.as_matrix()
+
+
+def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Array, base: Array) -> None:
+    """Give a detumbling its guess from where it starts: the arm slows down evenly, the wheels take the momentum."""
+    duration = guessed(problem)
+    times = np.linspace(0.0, duration, STEPS + 1)
+    share = times[:, None] / duration
+    slowing = 1 - 3 * share**2 + 2 * share**3
+    way = (share - share**3 + share**4 / 2) * duration
+    wheels = wheels_of(pair.robot)
+    turning = [k for k, name in enumerate(pair.robot.joint_names) if name in wheels]
+    angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
+    last = np.zeros(len(joints))
+    step = _stepper(pair)
+    for _ in range(ROUNDS if wheels else 1):
+        speeds = last + slowing * (rates - last)
+        angles = joints + last * times[:, None] + way * (rates - last)
+        found = [base]
+        for k in range(STEPS):
+            middle = (angles[k] + angles[k + 1]) / 2, (speeds[k] + speeds[k + 1]) / 2
+            found.append(step(times[1], found[-1], *middle))
+        held = np.array(ca.DM(pair.momentum_matrices(found[-1], angles[-1])[1]))[np.ix_(angular, turning)]
+        last[turning] = np.linalg.pinv(held) @ np.asarray(pair.conserved_momentum)[angular]
+    tell(problem, duration, _motion(times, angles, speeds, np.array(found)))
+
+
+def _stepper(machine: FreeFloating) -> Any:
+    """The configuration of the base after a step of Heun's rule with joints and rates as they are."""
+    b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
+    step = ca.SX.sym("step")
+    rate = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)])
+    first = rate(b, q, v)
+    after = b + step / 2 * (first + rate(b + step * first, q, v))
+    if machine.base == "spatial":
+        after = ca.vertcat(after[:3], after[3:] / ca.norm_2(after[3:]))
+    function = ca.Function("after", [step, b, q, v], [after])
+    return lambda *given: np.array(function(*given)).ravel()
+
+
+def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
+    second = np.gradient(velocities, times, axis=0)
+    found = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
+    return {name: _curve(times, samples) for name, samples in found.items()}
+
+
+def _curve(times: Array, samples: Array) -> Any:
+    return lambda t: np.column_stack([np.interp(t, times, column) for column in samples.T])
+
+
+def guessed(problem: Problem) -> float:
+    """The horizon, or what is guessed of it, s."""
+    horizon = problem.declared.horizon
+    assert horizon is not None
+    return float(constant(horizon.lower)[0]) if horizon.guess is None else float(horizon.guess)
+
+
+def tell(problem: Problem, duration: float, guesses: Guesses) -> None:
+    """Give a problem the guess of its horizon, where that is free, and those of states and controls, by name."""
+    declared = problem.declared
+    assert declared.horizon is not None
+    if not declared.horizon.fixed:
+        declared.horizon = replace(declared.horizon, guess=float(duration))
+    for name, guess in guesses.items():
+        for pool in (declared.states, declared.controls):
+            if name in pool:
+                pool[name] = replace(pool[name], guess=guess)

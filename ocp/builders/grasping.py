@@ -1,0 +1,225 @@
+"""A grasp between two bodies that float: from where it is approached, what the hand bears, and both as one machine.
+
+Twists match at the grasp, so nothing strikes, and the momentum of both as one is that of the one and of the other,
+about their common centre of mass,
+
+    P = P1 + P2,    L = L1 + L2 + (c2 - c1) x (m1 P2 - m2 P1) / (m1 + m2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FreeFloating, ModelError, Robot, attached, center_of_mass, link_frames, wheels_of
+from models.machines.machine import with_tip
+from models.shapes.bodies import bodies_of
+from models.shapes.distance import distance
+from models.spatial import Expression, cross
+from ocp.builders.clearance import ROUNDING
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
+from ocp.problem.problem import Problem
+from ocp.tasks.limits import Limits
+
+__all__ = [
+    "Cone", "Grasp", "checked_pair", "distances", "grasp_wrench", "joined", "motion_of", "pair_momentum",
+    "require_room",
+]  # fmt: skip
+
+MOST_WHEELS = 12
+"""Of which the greatest momentum is looked for over all corners."""
+ROOM = 1e-9
+"""Share by which a momentum may be greater than what wheels hold: rounding."""
+
+
+@dataclass(frozen=True)
+class Cone:
+    """Where the chaser's tip may be near the grasp, seen from the frame that is grasped.
+
+    Attributes:
+        direction: From the grasp out to where the tip comes from, in the frame that is grasped. Shape (3,).
+        half_angle: Of the cone, rad.
+        length: From the grasp, up to which it is a cone, m. Before twice that it has opened to all directions.
+        depth: How far behind the grasp its apex is, m: so much play is left at the grasp itself.
+
+    Raises:
+        ProblemError: No direction, an angle not between 0 and pi/2, lengths that are not positive.
+    """
+
+    direction: Any
+    half_angle: float
+    length: float
+    depth: float = 0.01
+
+    def __post_init__(self) -> None:
+        try:
+            given = floats(self.direction).ravel()
+        except NOT_NUMBERS:
+            given = np.zeros(0)
+        if given.shape != (3,) or not np.isfinite(given).all() or not np.linalg.norm(given) > 0:
+            words = f"cone: direction has to be three numbers, not all zero, not {self.direction!r}"
+            raise ProblemError(words, name="direction", value=self.direction)
+        object.__setattr__(self, "direction", given / np.linalg.norm(given))
+        if not checked_positive("cone: half_angle", self.half_angle) < np.pi / 2:
+            words = f"cone: half_angle has to be below pi/2, not {self.half_angle}"
+            raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
+        checked_positive("cone: length", self.length)
+        checked_positive("cone: depth", self.depth)
+
+    def inside(self, place: Expression) -> Expression:
+        """Not below zero within the cone, m. Shape (1, 1).
+
+        Args:
+            place: Of the tip, in the frame that is grasped. Shape (3, 1), m.
+        """
+        from_apex = place + self.depth * ca.DM(self.direction)
+        far = ca.fmin(ca.fmax((ca.sumsqr(place) / self.length**2 - 1) / 3, 0), 1)
+        opened = far**2 * (3 - 2 * far)
+        least = np.cos(self.half_angle) * (1 - opened) - 2 * opened
+        return ca.dot(ca.DM(self.direction), from_apex) - least * ca.norm_2(from_apex)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """What the hand bears between tip and target while they are one.
+
+    Attributes:
+        force, moment: Greatest sizes, at the tip, N and N m; inf for no limit.
+
+    Raises:
+        ProblemError: Numbers that are not positive.
+    """
+
+    force: float = np.inf
+    moment: float = np.inf
+
+    def __post_init__(self) -> None:
+        for what in ("force", "moment"):
+            if not real(getattr(self, what)) > 0:
+                words = f"grasp: {what} must be positive, not {getattr(self, what)!r}"
+                raise ProblemError(words, name=what, value=getattr(self, what), limit=0.0)
+
+
+def joined(chaser: Robot, target: Robot) -> Robot:
+    """The chaser's robot with the target as a link on its tip, held at the target's tip frame.
+
+    Raises:
+        ModelError: A robot without a tip, links of the same name.
+    """
+    turn = np.asarray(target.tip_rotation).T
+    shift = -turn @ np.asarray(target.tip_translation)
+    return attached(chaser, target, None, shift, turn, keep_tip=True)
+
+
+def checked_pair(chaser: Any, target: Any) -> Robot:
+    """Both as one robot."""
+    for what, machine in (("chaser", chaser), ("target", target)):
+        if checked_instance(f"capture: {what}", machine, FreeFloating).robot.tip is None:
+            raise ProblemError(f"capture: the robot of the {what} needs a tip", name=what, value=machine)
+    if target.base != chaser.base:
+        words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"
+        raise ProblemError(words, name="target", value=target.base, limit=chaser.base)
+    if target.joint_size or len(target.robot.links) != 1:
+        words = "capture: the target is one body: simplified(locked(robot, ...)) makes one of several"
+        raise ProblemError(words, name="target", value=target)
+    if not chaser.joint_size:
+        raise ProblemError("capture: the chaser has no joints to reach with", name="chaser", value=chaser)
+    try:
+        return joined(chaser.robot, target.robot)
+    except ModelError as error:
+        raise ProblemError(f"capture: {error}", name="target", value=error.value) from error
+
+
+def pair_momentum(
+    chaser: FreeFloating, target: FreeFloating, base: Any, target_base: Any, joints: Any, momentum: Any = None
+) -> Expression:
+    """Of both together, in the order of `FreeFloating.conserved_momentum`, about their common centre of mass.
+
+    Args:
+        base, target_base: Configurations of both. Shape (base_size,). joints: Of the chaser. Shape (n,).
+        momentum: Of the chaser, where it is not the conserved one.
+    """
+    rows = ca.DM.eye(6)[:, chaser.twist_rows]
+    own = rows @ ca.vertcat(chaser.conserved_momentum if momentum is None else momentum)
+    other = rows @ ca.vertcat(target.conserved_momentum)
+    one, two = chaser.robot.total_mass, target.robot.total_mass
+    arm = center_of_mass(target.robot, ca.DM(0, 1), target.world_from_base(target_base))
+    arm -= center_of_mass(chaser.robot, joints, chaser.world_from_base(base))
+    crossed = cross(arm, (one * other[3:6] - two * own[3:6]) / (one + two))
+    return ca.vertcat(own[0:3] + other[0:3] + crossed, own[3:6] + other[3:6])[chaser.twist_rows]
+
+
+def require_room(pair: FreeFloating, limits: Limits | None) -> None:
+    """Raise where wheels cannot hold the angular momentum, whatever the attitude of the base at the end.
+
+    Turned, the base brings the momentum along any axis of its own. So what counts is its size, beside the longest of
+    the momenta that the wheels can have, sum of h_k a_k with |h_k| <= I_k w_k: a corner of that set.
+    """
+    angular = np.asarray(pair.conserved_momentum)[[k for k, row in enumerate(pair.twist_rows) if row < 3]]
+    bounds = (Limits() if limits is None else limits).bounds(pair)
+    robot, held = pair.robot, []
+    wheels = wheels_of(robot)
+    for name, inertia in wheels.items():
+        joint, fastest = robot.joint(name), bounds.velocity[robot.joint_names.index(name)]
+        held.append(inertia * fastest * (np.asarray(joint.rotation) @ np.asarray(joint.axis)))
+    if not np.isfinite(held).all():
+        return
+    on_base = all(robot.joint(name).parent == robot.root for name in wheels)
+    if on_base and len(held) <= MOST_WHEELS:
+        corners = np.array(list(product((-1.0, 1.0), repeat=len(held)))) @ np.reshape(held, (-1, 3))
+        most = float(np.linalg.norm(corners, axis=1).max())
+    else:  # never less than that
+        most = float(np.linalg.norm(held, axis=1).sum())
+    size = float(np.linalg.norm(angular))
+    if size > most * (1 + ROOM) + ROOM:
+        words = (
+            f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold {most:.6g} at "
+            f"most: {size - most:.6g} N m s are missing for it to come to rest. Thrusters, other wheels, momentum of "
+            "the chaser against that of the target, or rest=False help"
+        )
+        raise ProblemError(words, name="momentum", value=size, limit=most)
+
+
+def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
+    """Base, with the momentum where that is a state, joints and velocities."""
+    states = {name: variable.symbol for name, variable in problem.declared.states.items()}
+    base = states["base"] if "momentum" not in states else ca.vertcat(states["base"], states["momentum"])
+    return base, states["joints"], states["velocities"]
+
+
+def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
+    """What the tip does to the target while detumbling: (force, moment about the tip), world axes. Shape (3, 1) each.
+
+    The rate of the target's momentum, m c'' and (I w)' about its centre of mass.
+    """
+    base, joints, rates = motion_of(problem)
+    body = target.robot.links[0]
+    middle = with_tip(pair, body.name, body.center_of_mass)
+    center, twist = middle.tip_pose(base, joints), middle.tip_twist(base, joints, rates)
+    inertia = ca.mtimes([center.rotation, ca.DM(np.asarray(body.inertia)), center.rotation.T])
+    names = [name for name in ("base", "momentum", "joints", "velocities") if name in problem.declared.states]
+    at = ca.vertcat(*(problem.declared.states[name].symbol for name in names))
+    along = ca.vertcat(*(problem.declared.dynamics[name] for name in names))
+    rate = ca.jtimes(ca.vertcat(ca.mtimes(inertia, twist[0:3]), body.mass * twist[3:6]), at, along)
+    arm = center.position - pair.tip_pose(base, joints).position
+    return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
+
+
+def distances(chaser: FreeFloating, target: FreeFloating, base: Any, joints: Any, goal: Any) -> Any:
+    """Of the bodies of the chaser, but for those of the link that grasps, from those of the target. Shape (k, 1)."""
+    frames = link_frames(chaser.robot, joints, chaser.world_from_base(base))
+    theirs = link_frames(target.robot, ca.DM(0, 1), target.world_from_base(goal))
+    found = [
+        distance(one.shape, other.shape, frames[one.link], theirs[other.link], rounding=ROUNDING)
+        for one in bodies_of(chaser.robot)
+        for other in bodies_of(target.robot)
+        if one.link != chaser.robot.tip_link
+    ]
+    if not found:
+        words = "capture: a clearance is asked for, and chaser or target has no shapes (but for the link that grasps)"
+        raise ProblemError(words, name="clearance")
+    return ca.vertcat(*found)

@@ -1,0 +1,221 @@
+"""Capture and detumbling: what is grasped is met, nothing strikes, the momentum stays, and wheels take it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+
+from models import FreeFloating, Thruster
+from models.machines.machine import with_tip
+from ocp import Cone, Effort, ProblemError, Solution, capture_problem, chained_capture, dynamics_problem, plan_capture
+from ocp.builders.grasping import grasp_wrench, joined
+from tests.models.robot.trees import Array
+from tests.ocp.builders.captures import (
+    CONE,
+    GRASP,
+    capture,
+    planar_capture,
+    planar_chaser,
+    planar_target,
+    replayed_momentum,
+    target,
+    turned,
+)
+
+nan = np.nan
+
+
+@cache
+def planar() -> Solution:
+    return plan_capture(**planar_capture())
+
+
+def gaps(asked: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
+    """Between tip and grasp where the phases meet: greatest entry of the relative twist, of the way, and the turn."""
+    end, one, other = plan.phase("approach").at_fraction(1.0), asked["chaser"], asked["target"]
+    nothing = np.zeros(0)
+    tip, grasped = one.tip_pose(end["base"], end["joints"]), other.tip_pose(end["target"], nothing)
+    twist = one.tip_twist(end["base"], end["joints"], end["velocities"])
+    twist = np.array(ca.DM(twist - other.tip_twist(end["target"], nothing, nothing)))
+    way = np.array(ca.DM(tip.position - grasped.position))
+    turn = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.rotation)))
+    return float(np.abs(twist).max()), float(np.abs(way).max()), float(np.abs(turn - np.eye(3)).max())
+
+
+def at_rest(asked: dict[str, Any], plan: Solution) -> None:
+    """The arm and the base do not move at the end, wheels are within their limits all the way, and hold it all."""
+    one = asked["chaser"]
+    arm = [k for k, name in enumerate(one.robot.joint_names) if "wheel" not in name]
+    wheels = [k for k in range(one.joint_size) if k not in arm]
+    after = plan.phase("detumble")
+    assert np.abs(after["velocities"][-1, arm]).max() < 1e-9
+    before, later = replayed_momentum(asked, plan)
+    assert np.abs(later[-1]).max() > 0.1  # there is something to hold
+    fine = np.linspace(0, 1, 501)
+    for phase in ("approach", "detumble"):
+        rates = plan.phase(phase).at_fraction(fine)["velocities"][:, wheels]
+        assert (np.abs(rates) <= np.array(one.robot.velocity)[wheels] * (1 + 1e-6)).all()
+    assert np.abs(later - before[0]).max() < 1e-9
+    assert np.abs(before - before[0]).max() < 1e-9
+
+
+def assert_captured(asked: dict[str, Any], plan: Solution) -> None:
+    twist, way, turn = gaps(asked, plan)
+    assert twist < 1e-6
+    assert way < 1e-6
+    assert turn < 1e-6
+    at_rest(asked, plan)
+    audit = plan.audit()
+    assert audit.feasible, audit
+    assert audit.optimal is not False, audit
+
+
+def test_a_turning_body_is_met_and_brought_to_rest() -> None:
+    """Planar: twist matched at the grasp, momentum the same in MuJoCo before and after, final rates zero."""
+    assert_captured(planar_capture(), planar())
+    assert planar().audit().passed
+
+
+def test_the_wheel_holds_what_the_target_had() -> None:
+    asked, end = planar_capture(), planar().phase("detumble").at_fraction(1.0)
+    spin = 0.15 * 3.0
+    assert 0.02 * end["velocities"][-1] == pytest.approx(spin, rel=1e-9)
+    begin = planar().phase("approach")
+    angle = begin.at_fraction(0.5)["target"][2]
+    assert angle == pytest.approx(0.15 * begin.horizon / 2, rel=1e-9)
+    assert asked["target"].base_size == 3
+
+
+def test_what_the_hand_bears_changes_the_momentum_of_the_target() -> None:
+    """Its integral over the detumbling, force and moment about the centre of mass, within the limits of the hand."""
+    asked, after = planar_capture(), planar().phase("detumble")
+    other = asked["target"]
+    pair = FreeFloating(joined(asked["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
+    problem = dynamics_problem(pair, None, 1.0, start="free", end="free", start_base=np.full(3, nan))
+    names = ("base", "joints", "velocities", "accelerations")
+    variables = problem.declared.states | problem.declared.controls
+    force, moment = grasp_wrench(pair, other, problem)
+    body = with_tip(pair, "target")
+    states = [variables[name].symbol for name in names]
+    arm = body.tip_pose(*states[:2]).position - pair.tip_pose(*states[:2]).position
+    found = ca.vertcat(force, moment - ca.cross(arm, force), body.tip_twist(*states[:3]))
+    fractions = np.linspace(0, 1, 4001)
+    along = after.at_fraction(fractions)
+    values = np.array(ca.Function("f", states, [found]).map(len(fractions))(*(along[name].T for name in names))).T
+    given = simpson(values[:, :6], fractions * after.horizon, axis=0)
+    spins, speeds = values[:, 6:9], values[:, 9:12]
+    assert given[:3] == pytest.approx(30.0 * (speeds[-1] - speeds[0]), abs=1e-6)
+    assert given[3:] == pytest.approx(3.0 * (spins[-1] - spins[0]), abs=1e-6)
+    assert spins[0] == pytest.approx([0, 0, 0.15], abs=1e-9)
+    assert np.linalg.norm(values[:, :3], axis=1).max() <= GRASP.force * (1 + 1e-6)
+
+
+def test_the_tip_comes_along_the_axis_of_the_cone() -> None:
+    asked, begin = planar_capture(), planar().phase("approach")
+    states = begin.at_fraction(np.linspace(0, 1, 201))
+    near = 0
+    for base, joints, there in zip(states["base"], states["joints"], states["target"], strict=True):
+        tip, grasped = asked["chaser"].tip_pose(base, joints), asked["target"].tip_pose(there, np.zeros(0))
+        place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position))).ravel()
+        if np.linalg.norm(place) < CONE.length:
+            near += 1
+            apex = place + CONE.depth * CONE.direction
+            assert apex @ CONE.direction >= (np.cos(CONE.half_angle) - 1e-6) * np.linalg.norm(apex)
+    assert near > 20
+
+
+def test_a_cone_is_one_near_the_grasp_and_none_far_away() -> None:
+    cone = Cone((0, 0, 2), 0.5, 0.3, depth=0.02)
+    side = np.array([np.sin(0.5), 0.0, np.cos(0.5)])
+    for size in (0.02, 0.1, 0.25):
+        assert float(cone.inside(ca.DM(size * side - [0, 0, 0.02]))) == pytest.approx(0.0, abs=1e-12)
+    assert float(cone.inside(ca.DM([0.0, 0.0, -0.1]))) < 0 < float(cone.inside(ca.DM([0.0, 0.0, -0.7])))
+
+
+def test_momentum_that_wheels_cannot_hold_is_refused_with_what_is_missing() -> None:
+    asked = planar_capture() | {"chaser": planar_chaser(0.3)}
+    with pytest.raises(ProblemError, match=r"0\.15 N m s are missing") as caught:
+        plan_capture(**asked)
+    assert (caught.value.name, caught.value.limit) == ("momentum", pytest.approx(0.3))
+    assert caught.value.value == pytest.approx(0.45)
+    asked |= {"approach": 10.0, "detumble": 10.0}
+    capture_problem(**(asked | {"rest": False}))
+    thrusters = [Thruster("hub", (0, 1, 0), 2.0, (0.3, 0, 0)), Thruster("hub", (0, -1, 0), 2.0, (0.3, 0, 0))]
+    assert "detumble.momentum" in capture_problem(**(asked | {"thrusters": thrusters})).declared.states
+
+
+def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
+    """The base turns the momentum to where the wheels hold most."""
+    most = 4.0 * np.sqrt(3.0)
+    spin = np.array([most / 5.0, 0.0, 0.0])
+    capture_problem(**(capture(0.999 * spin) | {"approach": 10.0, "detumble": 10.0}))
+    with pytest.raises(ProblemError) as caught:
+        capture_problem(**capture(1.001 * spin))
+    assert caught.value.limit == pytest.approx(most)
+
+
+def test_what_cannot_be_captured_is_refused_by_name() -> None:
+    asked = planar_capture()
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"target": target((0.0, 0.0, 0.1)), "target_base": None}, "target"),
+        ({"target": planar_chaser()}, "target"),
+        ({"chaser": planar_target()}, "chaser"),
+        ({"clearance": 0.02}, "clearance"),
+        ({"target_base": [1.0, 0.2, np.pi]}, "cone"),
+        ({"cone": 0.3}, "cone"),
+        ({"thrusters": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
+        ({"target": FreeFloating(planar_chaser().robot, "planar")}, "target"),
+    ]
+    for told, name in wrong:
+        with pytest.raises(ProblemError) as caught:
+            capture_problem(**(asked | told))
+        assert str(caught.value.name).rpartition(" ")[2] == name
+
+
+@pytest.mark.long
+def test_both_phases_together_cost_less_than_one_after_the_other() -> None:
+    asked = planar_capture()
+    chain = chained_capture(**asked)
+    assert planar().cost < sum(plan.cost for plan in chain) * (1 - 1e-4)
+
+
+@pytest.mark.long
+def test_thrusters_take_what_the_wheel_cannot() -> None:
+    """The chaser starts beside a target that drifts; thrusters change the momentum of the pair."""
+    thrusters = [
+        Thruster("hub", (side, 0, 0), 3.0, (0, lever, 0)) for side in (1, -1) for lever in (-0.3, 0.3)
+    ]  # fmt: skip
+    asked = planar_capture() | {
+        "chaser": planar_chaser(0.3), "thrusters": thrusters,
+        "effort": Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], fuel=0.1, time=0.05),
+    }  # fmt: skip
+    plan = plan_capture(**asked)
+    twist, way, turn = gaps(asked, plan)
+    assert max(twist, way, turn) < 1e-6
+    end = plan.phase("detumble").at_fraction(1.0)
+    assert abs(end["momentum"][0]) <= 0.3 * (1 + 1e-6)
+    assert abs(end["momentum"][0] - 0.45) > 0.1
+
+
+def random_target(seed: int) -> tuple[Array, Array, Array]:
+    """Spin about a random axis, moments of inertia that a body can have, attitude near that of the world."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    spin = rng.uniform(0.02, 0.08) * axis / np.linalg.norm(axis)
+    squares = rng.uniform(1.0, 5.0, 3)
+    return spin, squares.sum() - squares, turned(rng.normal(size=3), rng.uniform(0.0, 0.3))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
+    spin, inertia, attitude = random_target(seed)
+    asked = capture(spin, inertia)
+    asked["target_base"] = [2.5, 0.2, 0.6, *attitude]
+    plan = plan_capture(**asked)
+    assert_captured(asked, plan)
