@@ -52,62 +52,83 @@ class Program:
 
 
 class Numbers:
-    """Derivatives of a program as arrays of numpy and scipy; those at the last point are kept.
+    """Values and derivatives of a program as arrays of numpy and scipy; those at the last point are kept.
 
     CasADi hands its matrices to Python number by number, which takes longer than computing them: here functions write
     into arrays, and where the nonzeros stand is asked once.
     """
 
     def __init__(self, program: Program) -> None:
-        self._gradient, self._jacobian, self._hessian = (
-            Written(function, output)
-            for function, output in ((program.gradient, 1), (program.jacobian, 1), (program.hessian, 0))
-        )
+        functions = program.gradient, program.jacobian, program.hessian, program.inside, program.parametric
+        self._gradient, self._jacobian, self._hessian, self._inside, self._parametric = map(Written, functions)
         self._at: tuple[np.ndarray, np.ndarray] | None = None
-        self._first: tuple[np.ndarray, sp.csc_array] | None = None
+        self._found: tuple[Any, ...] = ()
+
+    def _all(self, x: np.ndarray, p: np.ndarray) -> tuple[Any, ...]:
+        """Cost, its gradient, rows and their Jacobian."""
+        at = self._at
+        if at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
+            (cost, slope), (rows, jacobian) = self._gradient(x, p), self._jacobian(x, p)
+            self._found = float(cost.sum()), slope.data, rows.data, jacobian
+            self._at = x.copy(), p.copy()
+        return self._found
 
     def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, sp.csc_array]:
         """Gradient of the cost (n,), and Jacobian of the rows (m, n)."""
-        at = self._at
-        if self._first is None or at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
-            self._first = self._gradient(x, p).data, self._jacobian(x, p)
-            self._at = x.copy(), p.copy()
-        return self._first
+        _, slope, _, jacobian = self._all(x, p)
+        return slope, jacobian
+
+    def values(self, x: np.ndarray, p: np.ndarray) -> tuple[float, np.ndarray]:
+        """Cost and rows (m,)."""
+        cost, _, rows, _ = self._all(x, p)
+        return cost, rows
 
     def gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Gradient of the cost alone. Shape (n,)."""
-        return np.asarray(self._gradient(x, p).data)
+        return np.asarray(self._gradient(x, p)[1].data)
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> sp.csc_array:
         """Upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
-        return self._hessian(x, p, np.array([sigma]), lam)
+        return self._hessian(x, p, np.array([sigma]), lam)[0]
+
+    def inside(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Gradient of the cost inside the horizon. Shape (n,)."""
+        return np.asarray(self._inside(x, p)[0].data)
+
+    def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """Gradient of f + lam . g in the parameters. Shape (n_p,)."""
+        return np.asarray(self._parametric(x, p, lam)[0].toarray()).ravel()
 
 
 class Written:
-    """An output of a casadi Function of dense vectors, written into an array of its nonzeros."""
+    """A casadi Function of dense vectors that writes its outputs into arrays of their nonzeros."""
 
-    def __init__(self, function: Any, output: int) -> None:
-        self._function, self._output = function, output
-        pattern = function.sparsity_out(output)
-        self._index = np.array(pattern.row(), dtype=np.int32), np.array(pattern.colind(), dtype=np.int32)
-        self._shape = pattern.shape
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        patterns = [function.sparsity_out(i) for i in range(function.n_out())]
+        self._index = [
+            (np.array(each.row(), dtype=np.int32), np.array(each.colind(), dtype=np.int32)) for each in patterns
+        ]
+        self._shapes = [each.shape for each in patterns]
         self._buffer, self._run = function.buffer()
 
-    def __call__(self, *given: np.ndarray) -> sp.csc_array:
-        """Its value, a matrix of its own.
+    def __call__(self, *given: np.ndarray) -> list[sp.csc_array]:
+        """Its values, matrices of their own.
 
         Raises:
             RuntimeError: The function fails, as an integrator does.
         """
-        found = np.zeros(len(self._index[0]))
+        found = [np.zeros(len(row)) for row, _ in self._index]
         kept = [np.ascontiguousarray(each, dtype=float).ravel() for each in given]
         for i, each in enumerate(kept):
             self._buffer.set_arg(i, each.data)
-        self._buffer.set_res(self._output, found.data)
+        for i, each in enumerate(found):
+            self._buffer.set_res(i, each.data)
         self._run()
         if self._buffer.ret():
             raise RuntimeError(f"{self._function.name()} cannot be evaluated")
-        return sp.csc_array((found, *self._index), shape=self._shape)
+        parts = zip(found, self._index, self._shapes, strict=True)
+        return [sp.csc_array((data, *index), shape=shape) for data, index, shape in parts]
 
 
 class Derivatives(NamedTuple):

@@ -14,8 +14,9 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 
-__all__ = ["Samples", "initial_point", "names_told"]
+__all__ = ["Samples", "initial_point", "later", "names_told"]
 
+SAME = 1e-9  # of the horizon: times nearer to each other are the same
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 
@@ -86,6 +87,25 @@ def names_told(form: Formulation, guess: Guess) -> set[str]:
     if isinstance(guess, Solution):
         return told | {*guess.states, *guess.controls, "horizon"}
     return told | {*(guess or {})}
+
+
+def later(fragment: Fragment, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each variable and each row of a program, the one of the same meaning so many equal intervals later.
+
+    Itself where the horizon ends before.
+    """
+    step = intervals / (len(fragment.mesh) - 1)
+    meanings = [f"{role} {entry}" for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)]
+    found = []
+    for words, fractions in ((meanings, fragment.variable_fraction), (fragment.row_labels, fragment.row_fractions)):
+        _, label = np.unique(words, return_inverse=True)
+        order = np.lexsort((fractions, label))
+        at = label[order] + fractions[order] / 2  # one meaning after the other, in time
+        there = np.searchsorted(at, label + (fractions + step - SAME) / 2)
+        other = order[np.minimum(there, len(order) - 1)]
+        fits = (label[other] == label) & (np.abs(fractions[other] - fractions - step) < SAME)
+        found.append(np.where(fits, other, np.arange(len(label))))
+    return found[0], found[1]
 
 
 def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:

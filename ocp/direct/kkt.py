@@ -6,17 +6,20 @@ Nocedal, Wright 2006, Numerical Optimization, chapters 12 and 16.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
-import scipy.linalg as la
 import scipy.sparse as sp
+import scipy.sparse.linalg as sla
 
 from ocp.direct.assembly import Program
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "conditions", "corrected", "curves_upwards", "held_by"]
+__all__ = ["Conditions", "Sides", "conditions", "corrected", "curves_upwards", "held_by"]
 
+Sides: TypeAlias = dict[str, np.ndarray]
+"""On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""
 PUSHES = 1e-8
 """Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
 FLAT = 1e-7
@@ -65,9 +68,7 @@ def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) ->
     return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
 
 
-def held_by(
-    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
-) -> dict[str, np.ndarray]:
+def held_by(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
     """On which side each variable (x) and row (g) stands at a limit that pushes: -1 below, 1 above, 0 at none."""
     push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
@@ -80,13 +81,8 @@ def held_by(
 
 
 def corrected(
-    program: Program,
-    outcome: Outcome,
-    arguments: dict[str, np.ndarray],
-    scales: Scales,
-    sides: dict[str, np.ndarray],
-    tolerance: float,
-) -> dict[str, np.ndarray] | None:
+    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, sides: Sides, tolerance: float
+) -> Sides | None:
     """Which limits to hold next, after some were held and the others let go: those that push, and those missed.
 
     Where these are the same as before, what was found is right. None where the cost still falls along what is free,
@@ -131,21 +127,21 @@ def curves_upwards(program: Program, outcome: Outcome, arguments: dict[str, np.n
     rows = at.jacobian[np.flatnonzero(at.held)][:, free]
     size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
     rows = sp.diags_array(1 / np.where(size > 0, size, 1.0)) @ rows
-    missing, own = sp.coo_array(rows.T @ rows), sp.coo_array(at.hessian[free][:, free] / largest)
-    return any(positive_definite(sp.coo_array(own + price * missing)) for price in PRICES)
+    missing, own = sp.csc_array(rows.T @ rows), at.hessian[free][:, free] / largest
+    return any(positive_definite(sp.csc_array(own + price * missing)) for price in PRICES)
 
 
-def positive_definite(symmetric: sp.coo_array) -> bool:
-    """Whether a banded matrix is."""
-    below = symmetric.row >= symmetric.col
-    row, column, value = symmetric.row[below], symmetric.col[below], symmetric.data[below]
-    band = np.zeros((int((row - column).max(initial=0)) + 1, symmetric.shape[0]))
-    band[row - column, column] = value
+def positive_definite(symmetric: sp.csc_array) -> bool:
+    """Whether a matrix is that is given in an order in which it fills little: all its pivots on the diagonal are."""
+    options = {"SymmetricMode": True, "Equil": False}
     try:
-        la.cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
-    except la.LinAlgError:
+        factors = sla.splu(
+            symmetric, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=4, options=options
+        )
+    except RuntimeError:  # a pivot is zero
         return False
-    return True
+    moved = np.any(factors.perm_r != np.arange(symmetric.shape[0]))
+    return bool(not moved and np.all(factors.U.diagonal() > 0))
 
 
 def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:

@@ -7,7 +7,6 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -18,18 +17,18 @@ import numpy as np
 
 from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Watch, interruptible, limited
 from ocp.curves import PiecewisePolynomial
+from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.compiled import Blocks, stop_compiling
 from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
-from ocp.direct.guess import initial_point, names_told
-from ocp.direct.kkt import corrected, curves_upwards, held_by
+from ocp.direct.guess import initial_point, later, names_told
+from ocp.direct.kkt import curves_upwards, held_by
 from ocp.direct.known import Known
 from ocp.direct.native import NativeSolver, why_not
 from ocp.direct.nlp import (
     DEFAULTS,
-    ROUNDING,
     SOLVERS,
     Outcome,
     broken_down,
@@ -61,9 +60,6 @@ __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
 COMMON = ("tol", "max_iter", "print_level")  # options that all solvers but sleqp take
-MOST_KEPT = 8  # plans, with what is known of them for solves that begin there
-MOST_HELD = 8  # sets of limits held in turn, near a plan
-MOST_STEPS = 20  # of Newton's, where the limits that push are held to be known
 MOST_ELSEWHERE = 200  # iterations from each other start
 
 
@@ -211,7 +207,6 @@ class Prepared:
         self._own_options, self._scaling = own, scaling
         # sleqp asks for products with the Hessian, which compiled functions do not have
         self._blocks = Blocks(self.fragment, compiled if solver != "sleqp" else False)
-        self._found: deque[tuple[np.ndarray, Scales, dict[str, np.ndarray]]] = deque(maxlen=MOST_KEPT)
         self._build()
         self._most = largest_number_of_iterations(self.solver_name, own)
         self._made_of = problem, method, solver, options, compiled, scaling
@@ -221,7 +216,7 @@ class Prepared:
     def _build(self) -> None:
         """The program and its solver, of the functions of the blocks that are at hand."""
         form, fragment = self.formulation, self.fragment
-        for made_of_others in ("scaled", "_ipopt", "_warm"):
+        for made_of_others in ("scaled", "_ipopt", "_newton"):
             self.__dict__.pop(made_of_others, None)
         self.program = assemble(fragment, form.np, self._blocks.functions)
         self._solver, self._progress = self._built_solver(self.solver_name, self._own_options)
@@ -263,22 +258,34 @@ class Prepared:
         check: bool = True,
         tighter: Mapping[str, np.ndarray] | None = None,
         time_limit: float | None = None,
+        *,
+        shift: int = 0,
     ) -> Solution:
         """Solve with these parameters from this guess; see :func:`ocp.methods.solve`. Another thread's solve is
         waited for.
 
         With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
         and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
-        From one of the last plans that ``native`` found here, the limits that pushed there are held first, and the
-        others let go, which takes a few steps; then those that come out of it. Where that ends nowhere it is solved
-        as ever.
+        From a plan of this problem, method and mesh, the limits that push there are held first, and the others let go,
+        which takes a few steps of Newton's; then those that come out of it (:mod:`ocp.direct.active_set`;
+        ``Solution.solver`` is ``newton``). Where that ends nowhere, ipopt or native begins from the guess as ever.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
+        ``shift`` is by how many intervals a receding horizon has moved on since such a plan: each interval then begins
+        from what the plan has so many intervals later, its limits and multipliers too, and the last ones from their
+        own. The mesh must be of equal intervals.
+
+        Raises:
+            ProblemError: Wrong arguments. SolveError: There is no plan, and why.
         """
+        ahead = checked_count("solve: shift", shift, least=0, most=self.method.intervals - 1)
+        if ahead and not (self._fits(guess) and self.method.mesh is None):
+            words = "solve: shift asks for a plan of this very problem, method and mesh, of equal intervals, as guess"
+            raise ProblemError(words, name="shift", value=shift)
         with limited(checked_time_limit(time_limit)), self._lock:
             if self._blocks.seconds > self.seconds and self._blocks.renewed():
                 self._build()
             try:
-                return self._solve(parameters, guess, check, tighter)
+                return self._solve(parameters, guess, check, tighter, ahead)
             except KeyboardInterrupt:
                 stop_compiling()
                 raise
@@ -307,25 +314,20 @@ class Prepared:
             return write_controller(form, fragment, point, place)
 
     def _solve(
-        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None
+        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, ahead: int = 0
     ) -> Solution:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        lower, upper = bounds
-        arguments = {
-            "p": p,
-            "lbx": lower[fragment.variable_bounds],
-            "ubx": upper[fragment.variable_bounds],
-            "lbg": lower[fragment.row_bounds],
-            "ubg": upper[fragment.row_bounds],
-        }
+        arguments = self._arguments(p, bounds)
         if tighter is not None:
             draw_in(arguments, tighter)
-        again = self._again(guess, arguments, bounds)
+        again = self._again(guess, arguments, bounds, ahead)
         if again is not None:
             return again
         point = initial_point(form, fragment, guess, bounds)
+        if ahead and isinstance(guess, Solution):
+            point = guess.variables[later(fragment, ahead)[0]]
         told = names_told(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
         if self.solver_name == "native":
@@ -369,62 +371,69 @@ class Prepared:
             self._badness(told_of, bounds),
         ) from told_of.error
 
+    def _arguments(self, p: np.ndarray, bounds: Bounds) -> dict[str, np.ndarray]:
+        """Parameters, and the bounds of variables and rows, of the program."""
+        (lower, upper), fragment = bounds, self.fragment
+        return {
+            "p": p,
+            "lbx": lower[fragment.variable_bounds],
+            "ubx": upper[fragment.variable_bounds],
+            "lbg": lower[fragment.row_bounds],
+            "ubg": upper[fragment.row_bounds],
+        }
+
     def _confirmed(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> Attempt:
         """What native found; where it missed its tolerance or failed, what ipopt finds from the same start."""
         outcome = first.outcome
         out_of_time = outcome.status.startswith(OUT_OF_TIME)
         asked = "max_iter" in self._own_options and outcome.status.startswith("Maximum_Iterations_Exceeded")
         if outcome.status == "Solve_Succeeded":
-            self._keep(first)
             return first.with_curvature(not curves_upwards(self.program, outcome, first.arguments, first.scales))
         if out_of_time or asked:
             return first
         second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
         return second if second.found is not None or first.found is None else first
 
-    def _keep(self, found: Attempt, sides: dict[str, np.ndarray] | None = None) -> None:
-        """Keep with a plan, for solves that begin there, which limits push in it; found out where they are not told."""
-        assert found.solution is not None
-        if sides is None:
-            sides = held_by(self.program, found.outcome, found.arguments, found.scales)
-        self._found.append((found.solution.variables, found.scales, sides))
+    def _fits(self, guess: Guess) -> bool:
+        """Whether a guess is a plan of this very program, by its method, mesh, sizes and parameters."""
+        if not isinstance(guess, Solution) or guess.method != self._told_method:
+            return False
+        sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
+        return sizes == ((self.fragment.size,), (self.fragment.n_rows,), set(self.formulation.parameters))
 
-    def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds) -> Solution | None:
-        """The plan beside the guess, one of the last that native found here; None where it is not near.
-
-        With the limits held that push, and the others let go, Newton's steps alone are left, from where the last ones
-        ended. First those are held that pushed in the guess, then what comes out of it says which.
-        """
-        kept = [each for each in self._found if isinstance(guess, Solution) and each[0] is guess.variables]
-        if not kept or not isinstance(guess, Solution):
+    def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, ahead: int) -> Solution | None:
+        """The plan beside the guess, moved on by ``ahead`` intervals; None where it is not found near it."""
+        form = self.formulation
+        if not isinstance(guess, Solution) or not self._fits(guess) or self.solver_name not in ("ipopt", "native"):
             return None
-        variables, scales, sides = kept[0]
-        tried: list[dict[str, np.ndarray]] = []
-        while len(tried) < MOST_HELD and not any(_same(sides, each) for each in tried):
-            tried.append(sides)
-            own = dict(arguments)
-            for kind, side in sides.items():
-                low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
-                given = low == high
-                own[f"lb{kind}"] = np.where(given | (side < 0), low, np.where(side > 0, high, -np.inf))
-                own[f"ub{kind}"] = np.where(given | (side > 0), high, np.where(side < 0, low, np.inf))
-            found = self._attempt(GUESS, variables, set(), own, bounds, self._warm, scales)
-            if not found.outcome.success:
+        if guess.regularised or not guess.success:
+            return None
+        try:
+            p = form.parameter_vector(guess.parameters)
+            before = self._known.relaxed(self._arguments(p, form.bound_values(p)))
+            v, lam = guess.variables, guess.multipliers
+            scales = self._scales(v, {*form.states, *form.controls, "horizon"}, bounds, arguments["p"])
+            cost, rows = self.program.numbers.values(v, p)
+            start = Outcome(v, cost, rows, lam, True, guess.status, 0, 0.0)
+            sides = held_by(self.program, start, before, scales)
+            if ahead:
+                of_x, of_g = later(self.fragment, ahead)
+                start = dataclasses.replace(start, variables=v[of_x], multipliers=lam[of_g])
+                sides = {"x": sides["x"][of_x], "g": sides["g"][of_g]}
+            outcome = self._newton.beside(start, sides, self._known.relaxed(arguments), scales)
+            if outcome is not None:
+                outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
+            if outcome is None or not outcome.success:
                 return None
-            after = corrected(self.program, found.outcome, arguments, scales, sides, ROUNDING)
-            if after is None:
-                return None
-            sides = after
-            if _same(sides, tried[-1]):
-                self._keep(found, sides)
-                return found.with_curvature(guess.regularised).solution
-            variables = found.outcome.variables
-        return None
+            self._blocks.worked(outcome.seconds)
+            return self._solution(outcome, arguments["p"], GUESS)
+        except (ProblemError, RuntimeError):  # parameters that this problem refuses; an integrator that breaks down
+            return None
 
     @cached_property
-    def _warm(self) -> tuple[Any, Any]:
-        """The native solver for a few steps of Newton's."""
-        return self._built_solver("native", {**self._own_options, "max_iter": MOST_STEPS})
+    def _newton(self) -> Newton:
+        """What solves beside a plan."""
+        return Newton(self.program, self.fragment)
 
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
@@ -438,21 +447,14 @@ class Prepared:
         limits: dict[str, np.ndarray],
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
-        scales: Scales | None = None,
     ) -> Attempt:
-        """Run a solver, its own for None, once from a start, scaled by the sizes along it where no scales are told.
+        """Run a solver, its own for None, once from a start, scaled by the sizes along it.
 
         See :func:`sizes_along` for ``told``.
         """
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
-        told_scales, scales = scales is not None, scales or unscaled(self.fragment)
-        if self._scaling and not told_scales:
-            sizes = sizes_along(self._pattern, x0, told, bounds, p)
-            scales = fitting_scales(self._pattern, sizes, x0, p)
-            if getattr(self.method, "integrator", "") == "cvodes":
-                # its tolerances are absolute: what it integrates backwards is not made larger
-                scales = dataclasses.replace(scales, cost=max(scales.cost, 1.0))
+        scales = self._scales(x0, told, bounds, p)
         relaxed = self._known.relaxed(arguments)
         own = scales.inside(relaxed)
         run, progress = solver or (self._solver, self._progress)
@@ -474,6 +476,16 @@ class Prepared:
             words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
             raise Interrupted(words, solution)
         return Attempt(start, arguments, told, scales, outcome, solution)
+
+    def _scales(self, point: np.ndarray, told: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
+        """What fits the sizes along a start; see :func:`sizes_along` for ``told``."""
+        if not self._scaling:
+            return unscaled(self.fragment)
+        scales = fitting_scales(self._pattern, sizes_along(self._pattern, point, told, bounds, p), point, p)
+        if getattr(self.method, "integrator", "") == "cvodes":
+            # its tolerances are absolute: what it integrates backwards is not made larger
+            return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
+        return scales
 
     def _badness(self, attempt: Attempt, bounds: Bounds) -> str:
         """What was badly scaled to the solver, in words; "" where nothing was."""
@@ -537,11 +549,12 @@ class Prepared:
         fragment = self.fragment
         costates = outcome.multipliers[fragment.costate_rows] * fragment.costate_scale[:, None]
         inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
-        _, jacobian = self.program.numbers.first(outcome.variables, p)
+        numbers = self.program.numbers
+        _, jacobian = numbers.first(outcome.variables, p)
         rows, columns = jacobian.indices, np.repeat(np.arange(fragment.size), np.diff(jacobian.indptr))
         with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
             terms = jacobian.data * inner[rows]
-        running = np.asarray(self.program.inside(outcome.variables, p).full()).reshape(-1)
+        running = numbers.inside(outcome.variables, p)
 
         node_of = np.full(fragment.size, -2)
         node_of[fragment.nodes] = np.arange(len(fragment.mesh))
@@ -558,7 +571,7 @@ class Prepared:
         """Derivative of the optimal cost in the parameters: of the Lagrangian, and through every active bound."""
         form, fragment = self.formulation, self.fragment
         v, lam = outcome.variables, outcome.multipliers
-        direct = np.asarray(self.program.parametric(v, p, lam).full()).reshape(-1)
+        direct = self.program.numbers.parametric(v, p, lam)
         slope, jacobian = self.program.numbers.first(v, p)
         lam_x = -(slope + jacobian.T @ lam)
         push = np.zeros((2, sum(len(place) for place in form.bounds.places.values())))
@@ -624,11 +637,6 @@ def transcribed(form: Formulation, method: DirectMethod, solver: str) -> tuple[s
             why = str(error)
     LOG.info("problem %r is solved by ipopt, not by native: %s", form.name, why)
     return "ipopt", method.transcribe(form)
-
-
-def _same(sides: dict[str, np.ndarray], others: dict[str, np.ndarray]) -> bool:
-    """Whether the same limits are held."""
-    return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

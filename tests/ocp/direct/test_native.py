@@ -171,53 +171,6 @@ def test_other_parameters_may_make_equalities_of_limits() -> None:
             np.testing.assert_allclose(found["u"][:, 1], 0.0, atol=1e-12)
 
 
-# ---- once more ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["fastest", "strength", "duration", "way"])
-@pytest.mark.parametrize("method", ["radau", "legendre", "rk4-linear"])
-def test_from_the_last_plan_a_few_steps_lead_to_the_next(name: str, method: str) -> None:
-    """While the same limits push, Newton's steps; where others do, the whole way. The optimum is that of ipopt."""
-    prepared, ipopt = built(moved(), FINE[method]), prepare(moved(), FINE[method])
-    plan = prepared.solve(MOVED)
-    for factor in (1.0005, 0.9995, 1.04, 0.9):
-        parameters = {**MOVED, name: MOVED[name] * factor}
-        plan, reference = prepared.solve(parameters, plan), ipopt.solve(parameters)
-        assert plan.cost == pytest.approx(reference.cost, rel=1e-9)
-        assert not plan.regularised
-        # where Legendre's nodes and points all stand at the limit of v, its multipliers are not unique
-        for pool in ("states", "controls", *(() if method == "legendre" else ("costates",))):
-            for entry, values in getattr(reference, pool).items():
-                assert relative(getattr(plan, pool)[entry], values) < 1e-5, f"{pool} {entry}"
-        if abs(factor - 1) < 1e-3:
-            assert plan.iterations <= 4
-            assert plan.solver == "native"
-
-
-def test_a_guess_of_another_make_is_taken_as_a_guess() -> None:
-    prepared = built(moved(), FINE["radau"])
-    other = built(moved(), Collocation(14)).solve(MOVED)
-    first, second = prepared.solve(MOVED, other), prepared.solve(MOVED)
-    assert first.cost == pytest.approx(second.cost, rel=1e-10)
-    assert prepared.solve(MOVED, first).cost == pytest.approx(second.cost, rel=1e-10)
-
-
-@pytest.mark.parametrize("method", ["radau", "rk4-held"])
-@pytest.mark.parametrize("change", [{"fastest": 0.7}, {"strength": 0.5}, {"way": 1.2}, {"fastest": 0.8}], ids=str)
-def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(
-    method: str, change: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prepared = built(moved(), FINE[method])
-    near = prepared.solve(MOVED)
-    cold = prepared.solve(MOVED | change)
-    monkeypatch.setattr(prepared, "_solver", None)  # which begins anew, inside all limits
-    warm = prepared.solve(MOVED | change, near)
-    assert warm.cost == pytest.approx(cold.cost, rel=1e-9)
-    assert warm["v"].max() <= (MOVED | change)["fastest"] + 1e-8
-    pushed = {bool(plan["v"].max() > (MOVED | change)["fastest"] - 1e-6) for plan in (warm, cold)}
-    assert len(pushed) == 1
-
-
 # ---- where it cannot ---------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,162 @@
+"""Plans solved again beside themselves: the optimum of a solve from afar, in a few steps, and no other."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ocp import Collocation, MultipleShooting, Problem, ProblemError, prepare
+from ocp.direct.guess import later
+from ocp.direct.prepared import Prepared
+from tests.ocp.direct.test_native import FINE, MOVED, moved
+from tests.ocp.problems import Method, relative, van_der_pol
+
+
+def ready(problem: Problem, method: Method, solver: str = "ipopt") -> Prepared:
+    prepared = prepare(problem, method, solver=solver)
+    assert isinstance(prepared, Prepared)
+    return prepared
+
+
+@pytest.mark.parametrize("name", ["fastest", "strength", "duration", "way"])
+@pytest.mark.parametrize("method", ["radau", "rk4-linear"])
+def test_from_the_last_plan_a_few_steps_lead_to_the_next(name: str, method: str) -> None:
+    """While the same limits push, Newton's steps; where others do, the whole way. The optimum is that from afar."""
+    prepared = ready(moved(), FINE[method])
+    plan = prepared.solve(MOVED)
+    for factor in (1.0005, 0.9995, 1.04, 0.9):
+        parameters = {**MOVED, name: MOVED[name] * factor}
+        plan, reference = prepared.solve(parameters, plan), prepared.solve(parameters)
+        assert plan.cost == pytest.approx(reference.cost, rel=1e-9)
+        assert not plan.regularised
+        for pool in ("states", "controls", "costates"):
+            for entry, values in getattr(reference, pool).items():
+                assert relative(getattr(plan, pool)[entry], values) < 1e-5, f"{pool} {entry}"
+        if abs(factor - 1) < 1e-3:
+            assert plan.iterations <= 5
+            assert plan.solver == "newton"
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "native"])
+@pytest.mark.parametrize("change", [{"fastest": 0.7}, {"strength": 0.5}, {"way": 1.2}, {"fastest": 0.8}], ids=str)
+def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(
+    solver: str, change: dict[str, float]
+) -> None:
+    prepared = ready(moved(), FINE["radau"], solver)
+    near = prepared.solve(MOVED)
+    cold, warm = prepared.solve(MOVED | change), prepared.solve(MOVED | change, near)
+    assert warm.solver == "newton"
+    assert warm.cost == pytest.approx(cold.cost, rel=1e-9)
+    assert warm["v"].max() <= (MOVED | change)["fastest"] + 1e-9
+    pushed = {bool(plan["v"].max() > (MOVED | change)["fastest"] - 1e-6) for plan in (warm, cold)}
+    assert len(pushed) == 1
+
+
+def test_limits_that_repeat_each_other_are_no_matter() -> None:
+    def repeated(times: int) -> Problem:
+        problem = moved()
+        v = problem.declared.states["v"].symbol
+        for k in range(times):
+            problem.path(f"again {k}", (k + 2) * v, upper=(k + 2) * problem.declared.parameters["fastest"].symbol)
+        return problem
+
+    costs = []
+    for times in (0, 2):
+        prepared = ready(repeated(times), FINE["radau"])
+        plan = prepared.solve({**MOVED, "fastest": 0.7}, prepared.solve(MOVED))
+        assert plan.solver == "newton"
+        costs.append(plan.cost)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
+
+
+def test_rows_are_met_so_well_that_the_cost_is_that_of_the_optimum() -> None:
+    """Its slope in a limit that 27 points stand at, by small differences, is the sum of their multipliers."""
+    problem = Problem("limits")
+    speed = problem.parameter("speed")
+    x, u = problem.state("x", 2, initial=[0.0, 0.0]), problem.control("u")
+    problem.horizon(lower=0.5, upper=1.0, guess=0.9)
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.path("speed", x[1], upper=speed)
+    problem.end("reach", x[0], lower=1.0)
+    problem.minimize(running=u**2 / 2)
+    prepared = ready(problem, Collocation(20))
+    plan = prepared.solve({"speed": 1.23})
+    for step in (1e-3, 1e-4, 1e-5):
+        up, down = (prepared.solve({"speed": 1.23 + sign * step}, plan) for sign in (1, -1))
+        assert {up.solver, down.solver} == {"newton"}
+        assert (up.cost - down.cost) / (2 * step) == pytest.approx(float(plan.cost_gradient("speed")[0]), rel=1e-6)
+
+
+def test_what_is_no_plan_of_the_very_program_is_a_guess_like_any_other() -> None:
+    prepared = ready(moved(), FINE["radau"])
+    plan = prepared.solve(MOVED)
+    other = ready(moved(), Collocation(14)).solve(MOVED)
+    loose = prepared.solve({**MOVED, "way": 1.0})
+    for guess in (other, {"x": 0.5}, prepared.solve(MOVED, check=False)):
+        assert prepared.solve(MOVED, guess).cost == pytest.approx(plan.cost, rel=1e-9)
+    assert prepared.solve(MOVED, other).solver == "ipopt"
+    assert prepared.solve({**MOVED, "way": 1.0}, plan).cost == pytest.approx(loose.cost, rel=1e-9)
+
+
+def receding(method: Method) -> Problem:
+    """A mass that is steered back to rest from where it is, with little force."""
+    problem = Problem("receding")
+    x = problem.state("x", 2, initial=problem.parameter("now", 2))
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, ca.vertcat(x[1], u - 0.1 * x[1] ** 3))
+    problem.horizon(6.0)
+    problem.minimize(running=ca.sumsqr(x) + 0.1 * u**2, terminal=5 * ca.sumsqr(x))
+    return problem
+
+
+@pytest.mark.parametrize("method", [Collocation(30), MultipleShooting(30)], ids=["radau", "rk4"])
+def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -> None:
+    """The plan's own state an interval later is where the next one begins: what is left of it is nearly the plan."""
+    prepared = ready(receding(method), method)
+    plan = prepared.solve({"now": [3.0, 1.0]})
+    steps = {0: 0, 1: 0}
+    for _ in range(8):
+        now = {"now": plan.at(6.0 / 30)["x"].ravel()}
+        found = {shift: prepared.solve(now, plan, shift=shift) for shift in steps}
+        cold = prepared.solve(now)
+        for shift, each in found.items():
+            steps[shift] += each.iterations
+            assert each.cost == pytest.approx(cold.cost, rel=1e-9)
+        assert found[1].solver == "newton"
+        plan = found[1]
+    assert steps[1] < steps[0]
+
+
+@pytest.mark.parametrize("method", FINE)
+@pytest.mark.parametrize("solver", ["ipopt", "native"])
+def test_what_is_later_stands_for_the_same_so_many_intervals_later(method: str, solver: str) -> None:
+    fragment = ready(van_der_pol(), FINE[method], solver).fragment
+    n = len(fragment.mesh) - 1
+    of_x, of_g = later(fragment, 3)
+    labels = np.array(fragment.row_labels)
+    for index, fractions, meanings in (
+        (of_x, fragment.variable_fraction, (fragment.variable_role, fragment.variable_entry)),
+        (of_g, fragment.row_fractions, (labels,)),
+    ):
+        for meaning in meanings:
+            assert np.array_equal(meaning[index], meaning)
+        moves = fractions[index] - fractions
+        still = index == np.arange(len(index))
+        np.testing.assert_allclose(moves[~still], 3 / n, atol=1e-9)
+        # rows of the ends, the horizon and what stands in the last intervals alone have nothing later
+        inner = np.isin(np.arange(len(index)), still.nonzero()[0]) & (fractions < 1 - 3.01 / n)
+        assert np.mean(inner) < 0.2
+
+
+@pytest.mark.parametrize("shift", [-1, 1.5, 12, "one", True, 10**400])
+def test_a_shift_that_is_none_is_refused(shift: object) -> None:
+    prepared = ready(van_der_pol(), Collocation(10))
+    plan = prepared.solve()
+    with pytest.raises(ProblemError, match="shift"):
+        prepared.solve(guess=plan, shift=shift)  # type: ignore[arg-type]
+    with pytest.raises(ProblemError, match="shift"):
+        prepared.solve(shift=1)
+    uneven = ready(van_der_pol(), Collocation(2, mesh=(0.0, 0.3, 1.0)))
+    with pytest.raises(ProblemError, match="equal intervals"):
+        uneven.solve(guess=uneven.solve(), shift=1)
