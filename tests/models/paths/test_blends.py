@@ -102,6 +102,15 @@ few = settings(max_examples=40)
 
 
 @few
+@given(seeds)
+def test_the_curvature_is_that_of_the_place(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = smooth(random_path(rng, 5, arcs=0.3, helices=0.3), 0.02)
+    s = np.concatenate([path.dense(), path.bounds])
+    np.testing.assert_allclose(path.curvature(s), np.linalg.norm(path.at(s).curvature, axis=1), rtol=1e-12, atol=1e-9)
+
+
+@few
 @given(seeds, st.integers(2, 8), st.sampled_from(["cubic", "quintic"]), st.floats(-3.5, -1))
 def test_random_paths_stay_within_the_deviation(seed: int, count: int, kind: Any, exponent: float) -> None:
     deviation = 10**exponent

@@ -25,6 +25,7 @@ from ocp.schedule import (
     ramp_time,
     ramps,
     schedule,
+    zones,
 )
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
@@ -325,3 +326,28 @@ def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
         with pytest.raises(error, match=message) as caught:
             call(wrong)
         assert vars(caught.value)["name"] in str(caught.value)
+
+
+@given(seeds, st.integers(2, 60))
+def test_about_the_slowest_place_of_each_run_a_stretch_gets_its_speed(seed: int, count: int) -> None:
+    """As far as the run goes on and no more than a spread is permitted, looked at place by place."""
+    rng = np.random.default_rng(seed)
+    s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.1, 1.0, count))])
+    permitted, speed = np.exp(rng.uniform(-1, 1, count + 1)), rng.uniform(0.5, 3.0, count)
+    most, steady = np.minimum(permitted[:-1], permitted[1:]), 1.5
+    even = SpeedProfile(np.array([0.0, s[-1] / steady]), s[[0, -1]], np.full(2, steady), np.zeros(2), np.zeros(1))
+    fast, expected = np.minimum(steady, speed) > most * (1 + 1e-9), speed.copy()
+    for k in np.flatnonzero(fast):
+        first = last = k
+        while first > 0 and fast[first - 1]:
+            first -= 1
+        while last < count - 1 and fast[last + 1]:
+            last += 1
+        if k == first + most[first : last + 1].argmin():
+            for way in (range(k, first - 1, -1), range(k, last + 1)):
+                for at in way:
+                    if most[at] > zones.SPREAD * most[k]:
+                        break
+                    expected[at] = min(speed[at], most[k])
+    assert zones._lowered(s, permitted, speed, even, False) == fast.any()
+    assert speed == pytest.approx(expected)
