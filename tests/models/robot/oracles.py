@@ -56,8 +56,10 @@ def pinocchio_dynamics(
     return np.array(needed[6:]), np.concatenate([needed[3:6], needed[0:3]])
 
 
-def mujoco_model(robot: Robot, ground: str = "", foot: str = "", options: str = "") -> mujoco.MjModel:
-    """The robot on a free joint. `ground` and `foot` are geoms of the world and of the root link, as MJCF."""
+def mujoco_model(
+    robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False
+) -> mujoco.MjModel:
+    """The robot on a free joint, or `fixed`. `ground` and `foot` are geoms of the world and of the root, as MJCF."""
 
     def numbers(values: Array) -> str:
         return " ".join(repr(float(value)) for value in np.ravel(values))
@@ -82,7 +84,7 @@ def mujoco_model(robot: Robot, ground: str = "", foot: str = "", options: str = 
                 below += f'<body name="{joint.child}" {place}>{moving}{body(joint.child, "")}</body>'
         return head + own + below
 
-    root = f'<body name="{robot.root}">{body(robot.root, "<freejoint/>" + foot)}</body>'
+    root = f'<body name="{robot.root}">{body(robot.root, foot if fixed else "<freejoint/>" + foot)}</body>'
     settings = f'<compiler angle="radian" boundmass="0"/><option {options}/>'
     return mujoco.MjModel.from_xml_string(f"<mujoco>{settings}<worldbody>{ground}{root}</worldbody></mujoco>")
 
