@@ -19,7 +19,7 @@ import scipy.sparse.linalg as sla
 from ocp.console import reason_to_stop
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Fragment
-from ocp.direct.kkt import Sides, corrected, curves_upwards
+from ocp.direct.kkt import Sides, corrected, curves_upwards, scaled
 from ocp.direct.nlp import ROUNDING, Outcome
 from ocp.direct.scaling import Scales
 
@@ -31,6 +31,7 @@ cost, by what rows are missed; all relative to 1 at least."""
 ROOM = 1e-9  # by which limits that are let go may be passed, relative to the value and at least to 1
 MOST_SETS = 8  # of limits held in turn
 MOST_STEPS = 12  # while one set is held
+MOST_BORDERS = 16  # limits that are held or let go without making the matrix anew
 GAIN = 0.1  # of what is missed, by each step at least: else the matrix is made anew
 SOFTENED = 1e-10
 """By which rows may be missed while solving, relative to their own size and to the curvature."""
@@ -80,11 +81,11 @@ class Newton:
             sides: On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none.
             arguments: p and the bounds. scales: By which misses and multipliers are judged.
         """
-        began, tried, steps = time.monotonic(), list[Sides](), 0
+        began, tried, steps, factors = time.monotonic(), list[Sides](), 0, None
         while len(tried) < MOST_SETS and not any(_same(sides, each) for each in tried):
             tried.append(sides)
-            at = self._held(start, sides, arguments, scales)
-            steps += at.steps
+            at = self._held(start, sides, arguments, scales, factors)
+            steps, factors = steps + at.steps, at.factors
             if not at.found:
                 return None
             start = Outcome(at.v, 0.0, at.rows, at.lam, True, "Solve_Succeeded", steps, 0.0, False, "newton")
@@ -101,8 +102,10 @@ class Newton:
             sides = after
         return None
 
-    def _held(self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales) -> _End:
-        """Newton's steps with some limits held and the others let go."""
+    def _held(
+        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, factors: _Factors | None
+    ) -> _End:
+        """Newton's steps with some limits held and the others let go; with factors of other limits where these do."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         low, high = arguments["lbx"], arguments["ubx"]
         fixed, goal = (low == high) | (sides["x"] != 0), np.where(sides["x"] > 0, high, low)
@@ -110,8 +113,8 @@ class Newton:
         low, high = arguments["lbg"], arguments["ubg"]
         held, aim = (low == high) | (sides["g"] != 0), np.where(sides["g"] > 0, high, low)
         lam = np.where(held, start.multipliers, 0.0)
-        factors: Any = None
-        before, is_new = np.inf, False
+        border = None if factors is None else factors.border(fixed, held)
+        before, is_new, last = np.inf, False, (v, lam)
         for step in range(MOST_STEPS):
             slope, jacobian = self._program.numbers.first(v, p)
             cost, rows = self._program.numbers.values(v, p)
@@ -124,21 +127,25 @@ class Newton:
                 float(push @ np.abs(gaps)) / max(1.0, abs(cost / c)),  # what the gaps are worth
             )
             if missed <= TOLERANCE or (is_new and GAIN * before < missed <= ROUNDING):  # rounding leaves no more
-                return _End(True, step, v, rows, lam)
+                return _End(True, step, v, rows, lam, factors)
+            if border is not None and border.columns.size and not missed <= GAIN * before:  # it is of little use
+                border, before, (v, lam) = None, np.inf, last
+                continue
             if not missed < np.inf or (is_new and missed > before and step > 1) or reason_to_stop():
                 break
-            is_new = factors is None or missed > GAIN * before
+            is_new = factors is None or border is None or missed > GAIN * before
             if is_new:
                 try:
                     factors = self._factors(v, p, lam, jacobian, (fixed, held), scales)
                 except RuntimeError:  # it is singular
                     break
-            before = missed
-            right = np.empty(len(self._place))
-            right[self._place] = -np.concatenate([falls, gaps])
-            change = factors.solve(right)[self._place]
-            v, lam = v + change[: len(v)] * a, lam + change[len(v) :] * (c / b)
-        return _End(False, step, v, rows, lam)
+                border = factors.border(fixed, held)
+            assert factors is not None
+            assert border is not None
+            before, last = missed, (v, lam)
+            of_x, of_g = factors.step(falls, gaps, border)
+            v, lam = v + of_x * a, lam + of_g * (c / b)
+        return _End(False, step, v, rows, lam, factors)
 
     def _factors(
         self,
@@ -148,7 +155,7 @@ class Newton:
         jacobian: sp.csc_array,
         which: tuple[np.ndarray, np.ndarray],
         scales: Scales,
-    ) -> Any:
+    ) -> _Factors:
         """The system's factors, of scaled variables and rows; ``which`` variables are fixed and which rows held.
 
         Raises:
@@ -166,18 +173,88 @@ class Newton:
         values = np.bincount(self._number, np.concatenate(parts), minlength=len(self._indices))
         system = sp.csc_array((values, self._indices, self._starts), shape=(len(self._place),) * 2, copy=True)
         system.eliminate_zeros()
-        return sla.splu(system, permc_spec="NATURAL", relax=1, panel_size=4)
+        factors = sla.splu(system, permc_spec="NATURAL", relax=1, panel_size=4)
+        return _Factors(factors, self._place, scaled(jacobian, 1.0 / b, free), fixed, held)
+
+
+@dataclass(frozen=True)
+class _Border:
+    """What makes a system with some limits held one with others: rows and columns behind its own.
+
+    Attributes:
+        columns: In the order of variables and rows. Shape (n + m, k). solved: The system's solutions for them.
+        inner: What is left to solve. Shape (k, k). new: Rows that are held now, the last of the columns.
+    """
+
+    columns: np.ndarray
+    solved: np.ndarray
+    inner: np.ndarray
+    new: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Factors:
+    """The factors of the system at a point, and of which it was made.
+
+    Attributes:
+        own: Of SuperLU. place: Where each variable and row stands there. slopes: Scaled, of all rows (m, n).
+        fixed, held: Variables (n,) and rows (m,).
+    """
+
+    own: Any
+    place: np.ndarray
+    slopes: sp.csc_array
+    fixed: np.ndarray
+    held: np.ndarray
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """For right sides (n + m, ...)."""
+        moved = np.empty_like(right)
+        moved[self.place] = right
+        return np.asarray(self.own.solve(moved)[self.place])
+
+    def border(self, fixed: np.ndarray, held: np.ndarray) -> _Border | None:
+        """What is to be added where other limits are held; None where it is as little work to begin anew."""
+        n, m = len(fixed), len(held)
+        stopped, released = np.flatnonzero(fixed & ~self.fixed), np.flatnonzero(self.held & ~held)
+        new = np.flatnonzero(held & ~self.held)
+        if np.any(self.fixed & ~fixed) or len(stopped) + len(released) + len(new) > MOST_BORDERS:
+            return None
+        columns = np.zeros((n + m, len(stopped) + len(released) + len(new)))
+        if columns.size:
+            alone = np.concatenate([stopped, n + released])
+            columns[alone, np.arange(len(alone))] = 1.0
+            columns[:n, len(alone) :] = self.slopes[new].T.toarray()
+        solved = self.solve(columns) if columns.size else columns
+        return _Border(columns, solved, columns.T @ solved, new)
+
+    def step(self, falls: np.ndarray, gaps: np.ndarray, border: _Border) -> tuple[np.ndarray, np.ndarray]:
+        """Newton's step of variables and multipliers, scaled; not finite where there is none."""
+        n, right = len(falls), -np.concatenate([falls, gaps])
+        right[n + border.new] = 0.0
+        change = self.solve(right)
+        if border.columns.size:
+            aims = np.zeros(border.columns.shape[1])
+            aims[len(aims) - len(border.new) :] = -gaps[border.new]
+            try:
+                forces = np.linalg.solve(border.inner, border.columns.T @ change - aims)
+            except np.linalg.LinAlgError:
+                forces = np.full(len(aims), np.nan)
+            change = change - border.solved @ forces
+            change[n + border.new] = forces[len(aims) - len(border.new) :]
+        return change[:n], change[n:]
 
 
 @dataclass(frozen=True)
 class _End:
-    """Where Newton's steps ended: whether at a root, after how many, variables, rows and multipliers there."""
+    """Where Newton's steps ended: whether at a root, after how many, variables, rows and multipliers, last factors."""
 
     found: bool
     steps: int
     v: np.ndarray
     rows: np.ndarray
     lam: np.ndarray
+    factors: _Factors | None
 
 
 def _same(sides: Sides, others: Sides) -> bool:

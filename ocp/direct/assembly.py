@@ -69,7 +69,7 @@ class Numbers:
         at = self._at
         if at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
             (cost, slope), (rows, jacobian) = self._gradient(x, p), self._jacobian(x, p)
-            self._found = float(cost.sum()), slope.data, rows.data, jacobian
+            self._found = float(cost[0]), slope, rows, jacobian
             self._at = x.copy(), p.copy()
         return self._found
 
@@ -85,19 +85,19 @@ class Numbers:
 
     def gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Gradient of the cost alone. Shape (n,)."""
-        return np.asarray(self._gradient(x, p)[1].data)
+        return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> sp.csc_array:
         """Upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
-        return self._hessian(x, p, np.array([sigma]), lam)[0]
+        return sp.csc_array(self._hessian(x, p, np.array([sigma]), lam)[0])
 
     def inside(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Gradient of the cost inside the horizon. Shape (n,)."""
-        return np.asarray(self._inside(x, p)[0].data)
+        return np.asarray(self._inside(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """Gradient of f + lam . g in the parameters. Shape (n_p,)."""
-        return np.asarray(self._parametric(x, p, lam)[0].toarray()).ravel()
+        return np.asarray(self._parametric(x, p, lam)[0])
 
 
 class Written:
@@ -106,19 +106,19 @@ class Written:
     def __init__(self, function: Any) -> None:
         self._function = function
         patterns = [function.sparsity_out(i) for i in range(function.n_out())]
-        self._index = [
-            (np.array(each.row(), dtype=np.int32), np.array(each.colind(), dtype=np.int32)) for each in patterns
+        self._sizes, self._shapes = [each.nnz() for each in patterns], [each.shape for each in patterns]
+        self._indices = [
+            tuple(np.array(part, dtype=np.int32) for part in (one.row(), one.colind())) for one in patterns
         ]
-        self._shapes = [each.shape for each in patterns]
         self._buffer, self._run = function.buffer()
 
-    def __call__(self, *given: np.ndarray) -> list[sp.csc_array]:
-        """Its values, matrices of their own.
+    def __call__(self, *given: np.ndarray) -> list[Any]:
+        """Its values: columns as arrays (n,), the others as matrices of their own.
 
         Raises:
             RuntimeError: The function fails, as an integrator does.
         """
-        found = [np.zeros(len(row)) for row, _ in self._index]
+        found = [np.zeros(size) for size in self._sizes]
         kept = [np.ascontiguousarray(each, dtype=float).ravel() for each in given]
         for i, each in enumerate(kept):
             self._buffer.set_arg(i, each.data)
@@ -127,8 +127,19 @@ class Written:
         self._run()
         if self._buffer.ret():
             raise RuntimeError(f"{self._function.name()} cannot be evaluated")
-        parts = zip(found, self._index, self._shapes, strict=True)
-        return [sp.csc_array((data, *index), shape=shape) for data, index, shape in parts]
+        return [
+            whole(data, index[0], shape[0]) if shape[1] == 1 else sp.csc_array((data, *index), shape=shape)
+            for data, index, shape in zip(found, self._indices, self._shapes, strict=True)
+        ]
+
+
+def whole(nonzeros: np.ndarray, rows: np.ndarray, size: int) -> np.ndarray:
+    """A column of its nonzeros. Shape (size,)."""
+    if len(nonzeros) == size:
+        return nonzeros
+    column = np.zeros(size)
+    column[rows] = nonzeros
+    return column
 
 
 class Derivatives(NamedTuple):

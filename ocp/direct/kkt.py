@@ -16,7 +16,7 @@ from ocp.direct.assembly import Program
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "Sides", "conditions", "corrected", "curves_upwards", "held_by"]
+__all__ = ["Conditions", "Sides", "conditions", "corrected", "curves_upwards", "held_by", "scaled"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
 """On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""

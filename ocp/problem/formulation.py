@@ -8,6 +8,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -88,10 +89,15 @@ class BoundTable:
 
     def pull(self, p: np.ndarray, push: np.ndarray) -> np.ndarray:
         """Sum of ``push`` (2, n) on lower and upper bounds times their derivatives in the parameters. Shape (np,)."""
-        q = ca.MX.sym("p", len(p))
-        slopes = ca.Function("slopes", [q], [ca.jacobian(bound, q) for bound in self.function(q)])(p)
-        pulls = [np.asarray((slope.T @ ca.DM(force)).full()) for slope, force in zip(slopes, push, strict=True)]
-        return np.asarray(sum(pulls)).reshape(-1)
+        return np.asarray(self._pull(p, push.T).full()).reshape(-1)
+
+    @cached_property
+    def _pull(self) -> Any:
+        """The function of :meth:`pull`."""
+        count, n = self.function.numel_in(0), self.function.numel_out(0)
+        q, push = ca.MX.sym("p", count), ca.MX.sym("push", n, 2)
+        bounds = self.function(q)
+        return ca.Function("pull", [q, push], [sum(ca.jtimes(bounds[i], q, push[:, i], True) for i in (0, 1))])
 
 
 class Formulation:
