@@ -27,7 +27,7 @@ from ocp.local.branches import Branches, branches_of
 from ocp.problem.formulation import Sampler
 from ocp.tasks.equations import TaskEquations
 
-__all__ = ["Charts", "Held", "Instant", "JointSpace", "SelfMotions", "point"]
+__all__ = ["Charts", "Held", "Instant", "JointSpace", "Parts", "SelfMotions", "point"]
 
 Indices = NDArray[np.intp]
 
@@ -39,8 +39,9 @@ SINGULAR = 1e-9
 """Singular value of a task's Jacobian relative to the largest below which a row counts as dependent."""
 REACH = 0.9
 """Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by the rest."""
-BENT = 0.1
-"""Share of its radius by which the set may leave a chart at its edge; the radius is halved until it does not."""
+BENT = (0.1, 0.1, 0.15)
+"""Share of its radius by which the set may leave a chart at its edge, by the directions that are free; the radius is
+halved until it does not."""
 HALVINGS = 7
 """Of the radius, at most: nearer to singular postures the cover ends, and says so."""
 LISTED = 64
@@ -168,6 +169,19 @@ def point(joints: Array) -> Charts:
 def together(parts: list[Charts]) -> Charts:
     """One after the other."""
     return Charts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Charts.__dataclass_fields__))
+
+
+class Parts(NamedTuple):
+    """Charts of half the radius.
+
+    Attributes:
+        charts: N of them. owners: Whose parts they are. Shape (N,). low, high: Ends of the part. Shape (N, r).
+    """
+
+    charts: Charts
+    owners: Indices
+    low: Array
+    high: Array
 
 
 class _Edges(NamedTuple):
@@ -310,7 +324,7 @@ class SelfMotions:
                 break
             on, apart = self._strays(layer[busy], joints[busy], tangents[busy], radii[busy])
             points[busy], strays[busy] = on, apart
-            far = ~(self.space.length(apart) <= BENT * radii[busy, None]).all(axis=1)
+            far = ~(self.space.length(apart) <= BENT[tangents.shape[2]] * radii[busy, None]).all(axis=1)
             if halving < HALVINGS:
                 radii[busy[far]] /= 2
             busy = busy[far]
@@ -386,7 +400,7 @@ class SelfMotions:
             beyond = edges.points + REACH * edges.radii[:, None] * edges.ways
             joints, good = self.corrected(edges.layer, beyond)
             shift = self.space.length(joints - beyond)
-            good &= shift <= 2 * BENT * edges.radii
+            good &= shift <= 2 * BENT[charts.tangents.shape[2]] * edges.radii
             chosen = np.flatnonzero(good)
             chosen = chosen[self._apart(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
             like = charts.tangents[edges.owners[chosen]]
@@ -411,6 +425,10 @@ class SelfMotions:
 
     def halved(self, charts: Charts) -> Charts:
         """Charts of half the radius in their place."""
+        return self.parts(charts).charts
+
+    def parts(self, charts: Charts) -> Parts:
+        """Charts of half the radius in their place, and what of these they are."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         flat = charts.centers[:, None] + charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
@@ -426,7 +444,15 @@ class SelfMotions:
         tangents = self.tangents_at(layer, joints, like[part])
         strays = self._strays(layer, joints, tangents, radii)[1]
         new = self._within(layer, joints, tangents, radii, strays)
-        return together([new.of(self.inside(new)), charts.of(~whole)])
+        inside, rest = self.inside(new), np.flatnonzero(~whole)
+        owners = np.append((part // max(shape[1], 1))[inside], rest)
+        sides = np.vstack([signs[part % shape[1]][inside], np.zeros((len(rest), r))])
+        ends = charts.low[owners], charts.high[owners]
+        low = np.where(sides > 0, np.maximum(ends[0], 0.0), ends[0])
+        high = np.where(sides < 0, np.minimum(ends[1], 0.0), ends[1])
+        none = low > high  # of a box that ends before: what is there belongs to its other side
+        low, high = np.where(none, ends[0], low), np.where(none, ends[1], high)
+        return Parts(together([new.of(inside), charts.of(rest)]), owners, low, high)
 
     def covered(self, charts: Charts, layer: Indices, joints: Array, but: Indices | None = None) -> NDArray[np.bool_]:
         """Whether postures lie in charts; of edges, in others `but` their own. Shape (M,)."""
@@ -448,7 +474,7 @@ class SelfMotions:
             flat = np.einsum("kn,knr->kr", apart, charts.tangents[which] * self.space.scale[:, None])
             normal = np.sqrt(np.maximum((apart**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
             radii = charts.radii[which]
-            near = normal <= 2 * BENT * radii + 1e-6
+            near = normal <= 2 * BENT[r] * radii + 1e-6
             found[rows] = near & (np.abs(flat) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
         return found
 

@@ -25,8 +25,8 @@ from models import Surroundings
 from models.arrays import Array
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import distances_along
-from ocp.planning.charts import Charts, Instant, JointSpace, point
-from ocp.planning.steps import StepCost, Values
+from ocp.planning.charts import Charts, Instant, JointSpace, Parts, point
+from ocp.planning.steps import StepCost, Values, least_in_box
 from ocp.planning.tight import DEAR, drawn_tight
 from ocp.planning.value import FARTHEST, Graph
 
@@ -48,6 +48,8 @@ MOTIONS = 12
 """Classes of motions that are followed up, the cheapest first."""
 FAR = 3.0
 """Share of the least cost beyond which they are not."""
+WITHIN = (1.5, 1.5, 1.0)
+"""Share of the least cost within which bounds say that these may be, by the directions that are free."""
 SAME = 0.1
 """rad or m: motions nearer to each other than this everywhere are one."""
 WHOLE = 1e-9
@@ -117,12 +119,15 @@ class Search:
 
     def allowed(self, charts: Charts, k: int) -> Charts:
         """But for charts on which every posture touches something."""
+        return charts.of(self._allowed(charts, k))
+
+    def _allowed(self, charts: Charts, k: int) -> NDArray[np.bool_]:
         around = self.surroundings
         if around is None or not len(charts):
-            return charts
+            return np.ones(len(charts), dtype=bool)
         times, none = np.full(len(charts), self.times[k]), np.zeros(0)
         apart = distances_along(around, none, charts.centers, times, around.clearance)
-        return charts.of((apart + charts.spans @ around.levers.joints.T >= around.clearance).all(axis=1))
+        return np.asarray((apart + charts.spans @ around.levers.joints.T >= around.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], most: Array) -> Graph:
         """The steps between charts, which cost at most so much each. Shape (K - 1,)."""
@@ -231,7 +236,8 @@ class Search:
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
-        share = 1 - max(GAPS[instant.sets.size] for instant in self.instants)
+        free = max(0, *(instant.sets.size for instant in self.instants))
+        share = 1 - GAPS[free]
         layers, best = self.first(most)
         if not layers:
             return None, np.inf
@@ -240,9 +246,11 @@ class Search:
             return None, max(float(graph.least(graph.to_come()[0], 0).min()), 0.0)
         least = self.steps(best)
         coarse, others = True, np.zeros(len(self.times) - 1)  # what a motion costs at least before and after each step
+        rest: list[Values] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
-            to_come = graph.to_come()
+            far = (WITHIN[free] if coarse else share) * least  # beyond that nothing is looked for
+            to_come = graph.to_come(rest, far)
             if coarse:
                 self._known = graph, to_come, None
             low = float(graph.least(to_come[0], 0).min(initial=np.inf))
@@ -251,18 +259,20 @@ class Search:
                 best, least = path, cost
             if low >= share * least:
                 return best, share * least
-            passed = graph.passed()
+            passed = graph.passed(to_come, far)
             if coarse:
                 self._known, coarse = (graph, to_come, passed), False
             through = [graph.through(passed, to_come, k) for k in range(len(layers))]
             before, after = ([float(graph.least(each, k).min()) for k, each in enumerate(v)] for v in (passed, to_come))
             others = np.maximum(others, np.array(before[:-1]) + np.array(after[1:]))
-            kept = [charts.of(total < share * least) for charts, total in zip(layers, through, strict=True)]
+            cheap = [total < share * least for total in through]
+            kept = [charts.of(own) for charts, own in zip(layers, cheap, strict=True)]
             if not all(len(charts) for charts in kept):
                 return best, share * least
             if not self._may_be_halved(kept):
                 return best, max(low, 0.0)
-            layers = [self.allowed(self.halved(charts, k), k) for k, charts in enumerate(kept)]
+            finer = [self._finer(kept[k], k, passed[k].of(own)) for k, own in enumerate(cheap)]
+            layers, rest = [charts for charts, _ in finer], [values for _, values in finer]
 
     def first(self, most: float) -> tuple[list[Charts], Array | None]:
         """Charts through which motions may pass all of whose steps cost at most so much, and one motion.
@@ -344,7 +354,19 @@ class Search:
 
     def halved(self, charts: Charts, k: int) -> Charts:
         """Charts of an instant of half the radius in their place."""
+        return self._parts(charts, k).charts
+
+    def _parts(self, charts: Charts, k: int) -> Parts:
         if not charts.tangents.shape[2]:
-            return charts
+            return Parts(charts, np.arange(len(charts)), charts.low, charts.high)
         own = replace(charts, layer=np.full(len(charts), self.instants[k].number))
-        return self.instants[k].sets.halved(own)
+        return self.instants[k].sets.parts(own)
+
+    def _finer(self, charts: Charts, k: int, values: Values) -> tuple[Charts, Values]:
+        """Charts of half the radius but for those on which every posture touches something, and values on these."""
+        parts = self._parts(charts, k)
+        good = self._allowed(parts.charts, k)
+        values, low, high = values.of(parts.owners[good]), parts.low[good], parts.high[good]
+        least = values.least + least_in_box(values.slope, values.curve, low, high)[0]
+        new = parts.charts.of(good)
+        return new, Values(least, np.zeros_like(new.low), np.zeros((*new.low.shape, new.low.shape[1])))

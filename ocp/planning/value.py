@@ -35,6 +35,8 @@ PAIRS = 200_000
 """Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
 ROUNDS, LOWER = 4, 3
 """Times that the least of a step in a box is looked at nearer, and places on the way to it at first."""
+SUNK = 0.5
+"""Share of its curvature that a bound may lose where the least of all steps is bent less."""
 RISE = 0.02
 """Share of what is left to be gained by which that has to raise it, or it is the last time."""
 
@@ -62,13 +64,13 @@ class Graph:
         """Charts of each instant, and how the set bends away from them."""
         return [Sheets(charts, *charts.bent()) for charts in self.layers]
 
-    def to_come(self) -> list[Values]:
-        """Bounds of what is to come from each instant."""
-        return self._swept(range(len(self.layers) - 1, -1, -1), -1)
+    def to_come(self, passed: list[Values] | None = None, most: float = np.inf) -> list[Values]:
+        """Bounds of what is to come from each instant, of motions that cost less than `most` with what has `passed`."""
+        return self._swept(range(len(self.layers) - 1, -1, -1), -1, passed, most)
 
-    def passed(self) -> list[Values]:
-        """Bounds of what has been until each instant."""
-        return self._swept(range(len(self.layers)), 1)
+    def passed(self, to_come: list[Values] | None = None, most: float = np.inf) -> list[Values]:
+        """Bounds of what has been until each instant, of motions that cost less than `most` with what is `to_come`."""
+        return self._swept(range(len(self.layers)), 1, to_come, most)
 
     def alive(self) -> list[NDArray[np.bool_]]:
         """Of the charts of each instant, which lie on a way from the first instant to the last. Shapes (N,)."""
@@ -128,29 +130,33 @@ class Graph:
         for i in np.argsort(costs, kind="stable")[:LOOKED].tolist():
             yield joints + delta[chosen[i]] + into.tangents[i] @ places[i]
 
-    def _swept(self, order: range, direction: int) -> list[Values]:
+    def _swept(self, order: range, direction: int, rest: list[Values] | None, most: float) -> list[Values]:
         layers = self.layers
         found: list[Any] = [None] * len(layers)
         first = order[0]
-        r = layers[first].tangents.shape[2]
-        count = len(layers[first])
-        found[first] = Values(np.zeros(count), np.zeros((count, r)), np.zeros((count, r, r)))
+        found[first] = none = _none(layers[first])
+        if rest is not None:
+            dear = self.least(rest[first], first) >= most
+            found[first] = none._replace(least=np.where(dear, np.inf, 0.0))
         for k in order[1:]:
-            found[k] = self._before(k, k - direction, found[k - direction])
+            found[k] = self._before(k, k - direction, found[k - direction], None if rest is None else rest[k], most)
         return found
 
-    def _before(self, k: int, other: int, after: Values) -> Values:
-        """Bounds on the charts of an instant by those of the one that motions go on to."""
+    def _before(self, k: int, other: int, after: Values, rest: Values | None, most: float) -> Values:
+        """Bounds on the charts of an instant by those of the one that motions go on to.
+
+        With what is known of the `rest` of the motions, those that cost `most` or more are left out.
+        """
         here, there = self.layers[k], self.layers[other]
-        r = here.tangents.shape[2]
         seconds = float(self.seconds[min(k, other)])
-        found = Values(np.full(len(here), np.inf), np.zeros((len(here), r)), np.zeros((len(here), r, r)))
+        found = _none(here)._replace(least=np.full(len(here), np.inf))
+        known = np.zeros(len(here)) if rest is None else self.least(rest, k)
         # steps that are nowhere the cheapest from their chart are left out: seen from far, then by their tangents
         here_spans, there_spans = here.spans, there.spans
         place = np.clip(0.0, there.low, there.high)
         lowest, middle = self.least(after, other), after.at(place)
         for i, j in self.steps(k, other):
-            alive = np.isfinite(after.least[j])
+            alive = np.isfinite(after.least[j]) & (known[i] + lowest[j] < most)
             i, j = i[alive], j[alive]
             if not i.size:
                 continue
@@ -158,14 +164,33 @@ class Graph:
             way, span = np.abs(delta), here_spans[i] + there_spans[j]
             low = self.cost.of(np.maximum(way - span, 0.0), seconds) + lowest[j]
             high = self.cost.of(way + span, seconds) + middle[j]
-            near = low <= _least_of_groups(high, i)
+            floor = np.full(len(here), np.inf)
+            np.minimum.at(floor, i, low)
+            near = (low <= _least_of_groups(high, i)) & (known[i] + low < most)
             i, j, delta = i[near], j[near], delta[near]
             steps = self.cost.below(delta, self.sheets[k].of(i), self.sheets[other].of(j), after.of(j), seconds)
+            if rest is not None:
+                cheap = np.flatnonzero(_whole(steps, here.of(i), rest.of(i)) < most)
+                i, steps = i[cheap], steps.of(cheap)
+            if not i.size:
+                continue
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _below_all(*_lowest(steps, here.of(i), starts))
+            parts = _below_all(*_lowest(steps, here.of(i), starts), most - known[i[starts]])
+            parts = self._raised(parts, here.of(i[starts]), floor[i[starts]])
             for whole, part in zip(found, parts, strict=True):
                 whole[i[starts]] = part
         return found
+
+    @staticmethod
+    def _raised(values: Values, charts: Charts, floor: Array) -> Values:
+        """Values, or constants that are bounds, too, where these are higher in the middle and at the least together."""
+        least = values.least + least_in_box(values.slope, values.curve, charts.low, charts.high)[0]
+        flat = values.at((charts.low + charts.high) / 2) + least < 2 * floor
+        return Values(
+            np.where(flat, floor, values.least),
+            np.where(flat[:, None], 0.0, values.slope),
+            np.where(flat[:, None, None], 0.0, values.curve),
+        )
 
     def least(self, values: Values, k: int) -> Array:
         """The least of values anywhere on the charts of an instant. Shape (N,)."""
@@ -176,6 +201,20 @@ class Graph:
         """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
         both = Values(*(one + other for one, other in zip(passed[k], to_come[k], strict=True)))
         return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
+
+
+def _none(charts: Charts) -> Values:
+    """No cost at all."""
+    count, r = len(charts), charts.tangents.shape[2]
+    return Values(np.zeros(count), np.zeros((count, r)), np.zeros((count, r, r)))
+
+
+def _whole(steps: Steps, own: Charts, rest: Values) -> Array:
+    """What steps from charts cost at least, with what is known of the rest. Shape (P,)."""
+    middle, curve = (own.low + own.high) / 2, steps.curve
+    tangents = _tangents(middle, steps.at(middle), curve, np.zeros_like(curve))
+    both = Tangents(tangents.value + rest.least, tangents.slope + rest.slope)
+    return both.least(own, curve + rest.curve)
 
 
 def _least_of_groups(values: Array, group: Indices) -> Array:
@@ -210,21 +249,27 @@ def _lowest(steps: Steps, own: Charts, starts: Indices) -> tuple[Steps, Charts, 
     return steps.of(kept), own.of(kept), np.flatnonzero(np.diff(group[kept], prepend=-1))
 
 
-def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:
-    """A bound for each chart that steps go from, whose steps are together and begin at `starts`."""
+def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Values:
+    """A bound for each chart that steps go from, whose steps are together and begin at `starts`.
+
+    Above `most`, of shape (M,), it is of no use.
+    """
     r = own.tangents.shape[2]
-    group = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(own))))
+    count = np.diff(np.append(starts, len(own)))
+    group = np.repeat(np.arange(len(starts)), count)
     middle, half = (own.low + own.high) / 2, (own.high - own.low) / 2
     places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
-    touching = [steps.at(place) for place in places]
-    # less the curvature of the cheapest they are affine, or nearly so
-    curves = steps.curve
-    curve = curves[np.lexsort((touching[0][0], group))[starts]]
+    # less the curvature of the cheapest, and what the least of all bends down, they are affine, or nearly so
+    touching, curves = [steps.at(place) for place in places], steps.curve
+    curve = curves[np.lexsort((touching[0][0], group))[starts]].copy()
+    heights = np.minimum.reduceat(np.stack([value for value, _ in touching]), starts, axis=1)
+    heights = np.minimum(heights, most)
+    curve += _sunk(heights - _pressed_all(curve, places, starts), half[starts], curve)
     common = curve[group]
-    concave = np.minimum(lowest_curvature(curves - common), 0.0)
-    touching = [_less(place, one, common) for place, one in zip(places, touching, strict=True)]
-    lowest = [np.minimum.reduceat(value, starts) for value, _ in touching]
-    slope, boxes = _rise(lowest, half[starts]), own.of(starts)
+    tangents = [_tangents(place, one, curves, common) for place, one in zip(places, touching, strict=True)]
+    values = np.stack([value - _pressed(common, place) for (value, _), place in zip(touching, places, strict=True)])
+    lowest = heights - _pressed_all(curve, places, starts)
+    slope, boxes = _rise([*lowest], half[starts]), own.of(starts)
 
     def least_of(least: Array, slope: Array, chosen: Any) -> Array:
         box = boxes.of(chosen)
@@ -234,34 +279,45 @@ def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:
     def under(slope: Array, chosen: Indices) -> Array:
         """How far above the linear functions the steps of some charts lie. Shape (M,)."""
         which = np.flatnonzero(np.isin(group, chosen))
-        first = np.searchsorted(group[which], chosen)
-        lean = slope[np.searchsorted(chosen, group[which])]
-        near, part, box, bend = which, steps.of(which), own.of(which), concave[which]
-        at = [place[which] for place in places]
-        looked = [(value[which], leaning[which]) for value, leaning in touching]
-        tangents = [_tangents(place, one, lean) for place, one in zip(at, looked, strict=True)]
-        best, least = tangents[0], tangents[0].least(box, bend)
-        for one in tangents[1:]:
-            best, least = best.mixed(one, box, bend)
-        # what may be the least of all is looked at nearer
-        values = np.stack([value - (place * lean).sum(axis=1) for (value, _), place in zip(looked, at, strict=True)])
-        found, place = least.copy(), np.stack(at)[values.argmin(axis=0), np.arange(len(which))]
-        most = np.repeat(np.minimum.reduceat(values.min(axis=0), first), np.diff(np.append(first, len(which))))
-        rows, before = np.arange(len(which)), np.full(len(which), -np.inf)
-        for _ in range(ROUNDS):
+        first, own_group = np.searchsorted(group[which], chosen), np.searchsorted(chosen, group[which])
+        lean = slope[own_group]
+        known = values[:, which] - np.stack([(place[which] * lean).sum(axis=1) for place in places])
+        at = known.argmin(axis=0)
+        rows = np.arange(len(which))
+        place, most = (
+            np.stack([place[which] for place in places])[at, rows],
+            np.minimum.reduceat(known.min(axis=0), first),
+        )
+        best = Tangents(
+            *(np.stack(parts)[at, rows] for parts in zip(*(one.of(which) for one in tangents), strict=True))
+        )
+        best = best.leaning(lean)
+        bend, box = (curves - common)[which], own.of(which)
+        found, before = best.least(box, bend), np.full(len(which), -np.inf)
+        for number in range(ROUNDS + 1):
             # until it is out of the question, or hardly rises any more
-            kept = np.flatnonzero(found[rows] - before[rows] > RISE * (most[rows] - found[rows]).clip(0.0))
-            kept = kept[found[rows[kept]] < most[rows[kept]]]
+            room = most[own_group[rows]]
+            kept = np.flatnonzero(found[rows] - before[rows] > RISE * (room - found[rows]).clip(0.0))
+            kept = kept[found[rows[kept]] < room[kept]]
             if not kept.size:
                 break
-            rows, near, part, box, bend = rows[kept], near[kept], part.of(kept), box.of(kept), bend[kept]
-            best, place, before[rows] = best.of(kept), place[kept], found[rows]
+            rows, place, best, bend, box = rows[kept], place[kept], best.of(kept), bend[kept], box.of(kept)
+            near = which[rows]
+            before[rows] = found[rows] if number else -np.inf
+            if not number:
+                for one in tangents:
+                    best, found[rows] = best.mixed(one.of(near).leaning(lean[rows]), box, bend)
+                continue
+            part = steps.of(near)
             for _ in range(LOWER):
                 place = part.lower(place, lean[rows], common[near])
             for looked_at in (place, None):
                 there = best.lowest(box, bend) if looked_at is None else looked_at
-                one = _tangents(there, _less(there, part.at(there), common[near]), lean[rows])
+                touched = part.at(there)
+                one = _tangents(there, touched, curves[near], common[near]).leaning(lean[rows])
                 best, found[rows] = best.mixed(one, box, bend)
+                seen = touched[0] - _pressed(common[near], there) - (there * lean[rows]).sum(axis=1)
+                np.minimum.at(most, own_group[rows], seen)
         return np.asarray(np.minimum.reduceat(found, first))
 
     every = np.arange(len(starts))
@@ -277,70 +333,73 @@ def _below_all(steps: Steps, own: Charts, starts: Indices) -> Values:
 
 
 class Tangents(NamedTuple):
-    """Functions value + slope . t below others, those that touch these at places or means of such.
+    """Functions value + slope . t + t . bend . t / 2 below others, those that touch these at places or means of such.
+
+    What they bend, shape (P, r, r), is told apart: it is one for all that touch one function.
 
     Attributes:
-        value: Shape (P,). slope: Shape (P, r). place: Where they touch, in the mean. Shape (P, r).
-        square: Mean square of the place. Shape (P,).
+        value: Shape (P,). slope: Shape (P, r).
     """
 
     value: Array
     slope: Array
-    place: Array
-    square: Array
 
     def of(self, chosen: Any) -> Tangents:
         """Some of them."""
-        return Tangents(*(part[chosen] for part in self))
+        return Tangents(self.value[chosen], self.slope[chosen])
 
-    def _ends(self, charts: Charts, curve: Array) -> tuple[Array, Array]:
-        """What the sides of the boxes add, (2, P, r), and a value without them (P,)."""
-        bent, ways = curve[:, None] / 2, np.stack([charts.low, charts.high])
-        return self.slope * ways + bent * ways * (ways - 2 * self.place), self.value + curve / 2 * self.square
+    def leaning(self, lean: Array) -> Tangents:
+        """Less lean . t, of shape (P, r)."""
+        return Tangents(self.value, self.slope - lean)
 
-    def least(self, charts: Charts, curve: Array) -> Array:
-        """The least in boxes, with curve |t - place|^2 / 2 of each place, which is not positive. Shape (P,)."""
-        ends, value = self._ends(charts, curve)
-        return np.asarray(value + ends.min(axis=0).sum(axis=1))
+    def least(self, charts: Charts, bend: Array) -> Array:
+        """The least in boxes. Shape (P,)."""
+        return np.asarray(self.value + least_in_box(self.slope, bend, charts.low, charts.high)[0])
 
-    def lowest(self, charts: Charts, curve: Array) -> Array:
+    def lowest(self, charts: Charts, bend: Array) -> Array:
         """Where that is. Shape (P, r)."""
-        ends, _ = self._ends(charts, curve)
-        return np.where(ends[1] < ends[0], charts.high, charts.low)
+        return least_in_box(self.slope, bend, charts.low, charts.high)[1]
 
-    def mixed(self, other: Tangents, charts: Charts, curve: Array) -> tuple[Tangents, Array]:
+    def mixed(self, other: Tangents, charts: Charts, bend: Array) -> tuple[Tangents, Array]:
         """The mean with others whose least is the largest, of those level along an axis; and that least."""
-        best, most = self, self.least(charts, curve)
+        best, most = self, self.least(charts, bend)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.clip(np.nan_to_num(-self.slope / (other.slope - self.slope)), 0.0, 1.0)
         for share in (*shares.T, np.ones(len(most))):
-            parts = [
-                one + (share[:, None] if one.ndim > 1 else share) * (two - one)
-                for one, two in zip(self, other, strict=True)
-            ]
-            mean = Tangents(*parts)
-            least = mean.least(charts, curve)
+            value = self.value + share * (other.value - self.value)
+            mean = Tangents(value, self.slope + share[:, None] * (other.slope - self.slope))
+            least = mean.least(charts, bend)
             better = least > most
-            best = Tangents(
-                *(
-                    np.where(better[:, None] if one.ndim > 1 else better, two, one)
-                    for one, two in zip(best, mean, strict=True)
-                )
-            )
+            best = Tangents(np.where(better, mean.value, best.value), np.where(better[:, None], mean.slope, best.slope))
             most = np.maximum(most, least)
         return best, most
 
 
-def _less(place: Array, values: tuple[Array, Array], curve: Array) -> tuple[Array, Array]:
-    """Values and slopes at places, less t . curve . t / 2."""
-    pressed = np.einsum("pab,pb->pa", curve, place)
-    return values[0] - (place * pressed).sum(axis=1) / 2, values[1] - pressed
+def _pressed(curve: Array, place: Array) -> Array:
+    """t . curve . t / 2. Shape (P,)."""
+    return np.asarray((place * np.einsum("pab,pb->pa", curve, place)).sum(axis=1) / 2)
 
 
-def _tangents(place: Array, values: tuple[Array, Array], lean: Array) -> Tangents:
-    """Of functions with such values and slopes at places, less lean . t."""
+def _pressed_all(curve: Array, places: list[Array], starts: Indices) -> Array:
+    return np.stack([_pressed(curve, place[starts]) for place in places])
+
+
+def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array) -> Tangents:
+    """Of functions less t . common . t / 2, of such values and slopes at places, which bend by curve at least."""
     value, slope = values
-    return Tangents(value - (place * slope).sum(axis=1), slope - lean, place, (place**2).sum(axis=1))
+    return Tangents(
+        value - (place * slope).sum(axis=1) + _pressed(curve, place), slope - np.einsum("pab,pb->pa", curve, place)
+    )
+
+
+def _sunk(values: Array, half: Array, curve: Array) -> Array:
+    """How functions in boxes bend down, (M, r, r), by values in the middle, and at each axis' ends."""
+    bent = (values[1::2] + values[2::2] - 2 * values[0]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bent = np.where(
+            half > 0, np.clip(bent / half**2, -SUNK * np.maximum(np.einsum("paa->pa", curve), 0.0), 0.0), 0.0
+        )
+    return bent[:, :, None] * np.eye(half.shape[1])
 
 
 def _rise(values: list[Array], half: Array) -> Array:

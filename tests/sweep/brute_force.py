@@ -32,6 +32,8 @@ KINDS = ("plain", "cut", "slow", "turning", "two")
 GRID, COARSE = 700, 36
 """Angles of the first joint of three; of each of the first two of four."""
 GAPS = {False: 0.03, True: 0.1}
+AT_ONCE = 100_000
+"""Steps that are looked at together."""
 AS_CHEAP = {False: 1.01, True: 1.02}
 """What is found of the least on the grid, at most; with two free directions the grid is coarse."""
 
@@ -107,11 +109,12 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
     value = np.zeros(len(nodes[-1]))
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
         before = np.full(len(here), np.inf)
-        for i, one in enumerate(here):
-            way = there - one
-            way[:, space.periodic] -= TURN * np.round(way[:, space.periodic] / TURN)
-            total = value + price.of(way, seconds)
-            before[i] = total[(np.abs(way) <= most).all(axis=1)].min(initial=np.inf)
+        share = max(1, AT_ONCE // max(len(there), 1))
+        for first in range(0, len(here), share):
+            way = there - here[first : first + share, None]
+            way[..., space.periodic] -= TURN * np.round(way[..., space.periodic] / TURN)
+            total = np.where((np.abs(way) <= most).all(axis=2), value + price.of(way, seconds), np.inf)
+            before[first : first + share] = total.min(axis=1, initial=np.inf)
         value = before
     return float(value.min(initial=np.inf))
 

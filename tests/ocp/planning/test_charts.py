@@ -132,6 +132,26 @@ def test_halves_cover_what_they_came_from() -> None:
     assert np.median(charts.radii) < 0.07 / 8 * 1.1
 
 
+def test_parts_are_of_the_charts_that_they_lie_in() -> None:
+    machine = planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0)
+    task = TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0)
+    sets, times = sets_of(machine, task)
+    charts = sets.cover(*found(machine, task, times, 16, 0), 0.2, 50_000)
+    parts = sets.parts(charts)
+    owners = charts.of(parts.owners)
+    assert (parts.low >= owners.low).all()
+    assert (parts.high <= owners.high).all()
+    assert (parts.low <= parts.high).all()
+    middle = (parts.low + parts.high) / 2
+    flat = owners.centers + np.einsum("knr,kr->kn", owners.tangents, middle)
+    on, good = sets.corrected(owners.layer, flat)
+    way = sets.space.difference(on, parts.charts.centers) * sets.space.scale
+    place = np.einsum("kn,knr->kr", way, parts.charts.tangents * sets.space.scale[:, None])
+    whole = ((owners.low < 0) & (owners.high > 0)).all(axis=1) & (parts.high - parts.low > 0).all(axis=1)
+    assert good.all()
+    assert (np.abs(place) <= parts.charts.radii[:, None])[whole].all()
+
+
 def test_boxes_end_at_the_limits_of_the_joints() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")

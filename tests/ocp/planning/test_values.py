@@ -192,6 +192,41 @@ def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: py
     assert low[0] >= low[1] * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("kind", [Squares, Length])
+@pytest.mark.parametrize("seed", [1, 6])
+def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: Any, seed: int) -> None:
+    """Cheap motions of a fine grid, each through the charts that its postures lie in."""
+    machine, lengths, places, weights = random_case(seed)
+    cost, seconds, rng = kind(weights), SECONDS / (INSTANTS - 1), np.random.default_rng(seed)
+    search = search_of(machine, places, cost)
+    graph = search.whole_graph()
+    nodes = [reached(lengths, place, float(machine.robot.upper[0]), 400) for place in places]
+    value = [np.zeros(len(nodes[-1]))]
+    for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
+        value.insert(0, (cost.of(there[None] - here[:, None], seconds) + value[0]).min(axis=1))
+    most = 1.3 * float(value[0].min())
+    to_come = graph.to_come(most=most)
+    passed = graph.passed(to_come, most)
+    again = graph.to_come(passed, most)
+    left = sum(int(np.isfinite(graph.through(passed, again, k)).sum()) for k in range(INSTANTS))
+    assert left < sum(map(len, graph.layers))
+    for first in rng.permutation(np.flatnonzero(value[0] < most))[:40].tolist():
+        path = [first]
+        for k in range(INSTANTS - 1):
+            steps = cost.of(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
+            path.append(int(steps.argmin()))
+        total = float(value[0][first])
+        for k, at in enumerate(path):
+            charts = graph.layers[k]
+            way = search.space.difference(nodes[k][at], charts.centers) * search.space.scale
+            flat = np.einsum("kn,knr->kr", way, charts.tangents * search.space.scale[:, None])
+            normal = np.sqrt(np.maximum((way**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
+            within = ((flat >= charts.low) & (flat <= charts.high)).all(axis=1) & (normal <= 0.2 * charts.radii)
+            assert within.any()
+            for bounds, cost_of in ((again[k], value[k][at]), (passed[k], total - value[k][at])):
+                assert (bounds.at(flat)[within] <= cost_of + 1e-9).all()
+
+
 @pytest.mark.parametrize("free", [1, 2])
 def test_the_least_of_a_quadratic_in_a_box_is_that_of_a_fine_grid(free: int) -> None:
     rng = np.random.default_rng(5)
