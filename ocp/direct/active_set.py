@@ -94,8 +94,7 @@ class Newton:
                 return None
             if _same(after, sides):
                 cost, _ = self._program.numbers.values(at.v, arguments["p"])
-                let_go = any(np.any((tried[0][kind] != 0) & (sides[kind] == 0)) for kind in sides)
-                if let_go and not curves_upwards(self._program, start, arguments, scales):
+                if not curves_upwards(self._program, start, arguments, scales):  # it is a saddle, or nearly one
                     return None
                 seconds = time.monotonic() - began
                 return Outcome(at.v, cost, at.rows, at.lam, True, start.status, steps, seconds, False, "newton")

@@ -70,6 +70,22 @@ def test_limits_that_repeat_each_other_are_no_matter() -> None:
     assert costs[1] == pytest.approx(costs[0], rel=1e-9)
 
 
+@pytest.mark.parametrize("stiffness", [8.0, 10.5, 15.0, 30.0])
+def test_a_saddle_beside_a_plan_is_none(stiffness: float) -> None:
+    """A rod that bows to one side: from about pi^2 on, what was the only way is a saddle between two."""
+    problem = Problem("rod")
+    k, x, u = problem.parameter("k"), problem.state("x", initial=[0.0]), problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.end("held", x, lower=0.0, upper=0.0)
+    problem.minimize(running=u**2 - k * x**2 + x**4 - 0.05 * x)
+    prepared = ready(problem, Collocation(20))
+    beside = prepared.solve({"k": stiffness}, prepared.solve({"k": 5.0}))
+    bowed = prepared.solve({"k": stiffness}, {"x": 0.3})
+    assert beside.cost == pytest.approx(bowed.cost, rel=1e-7)
+    assert beside.solver == ("newton" if stiffness < np.pi**2 else "ipopt")
+
+
 def test_rows_are_met_so_well_that_the_cost_is_that_of_the_optimum() -> None:
     """Its slope in a limit that 27 points stand at, by small differences, is the sum of their multipliers."""
     problem = Problem("limits")
