@@ -253,7 +253,7 @@ def _base_rate(machine: Any, base: Any, joints: Any, rates: Any, wrenches: Seque
     placement = machine.world_from_base(base)
     outside = external_wrench(machine.robot, joints, wrenches, placement)
     if gravity is not None:
-        weight = machine.robot.total_mass * ca.vertcat(gravity)
+        weight = machine.robot.total_mass * ca.vec(ca.vertcat(gravity))
         outside += ca.vertcat(cross(center_of_mass(machine.robot, joints, placement), weight), weight)
     return ca.vertcat(pose, machine.momentum_rate(base, joints, outside))
 

@@ -18,7 +18,7 @@ from tests.models.robot.trees import Array
 PLANAR_START = np.array([1.2, -2.0, 0.6, 0.0])
 START = np.array([-0.9, -1.3, 2.3, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 CONE, GRASP = Cone((-1, 0, 0), 0.4, 0.25), Grasp(force=20.0, moment=10.0)
-FREE = FreeTime(2.0, 40.0, 10.0)
+FREE = FreeTime(5.0, 40.0, 10.0)
 
 
 def planar_chaser(momentum: float = 6.0) -> FreeFloating:

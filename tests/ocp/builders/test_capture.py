@@ -206,7 +206,7 @@ def random_target(seed: int) -> tuple[Array, Array, Array]:
     """Spin about a random axis, moments of inertia that a body can have, attitude near that of the world."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
-    spin = rng.uniform(0.02, 0.08) * axis / np.linalg.norm(axis)
+    spin = rng.uniform(0.04, 0.08) * axis / np.linalg.norm(axis)
     squares = rng.uniform(1.0, 5.0, 3)
     return spin, squares.sum() - squares, turned(rng.normal(size=3), rng.uniform(0.0, 0.3))
 
