@@ -30,7 +30,7 @@ TOLERANCE = 1e-10
 cost, by what rows are missed; all relative to 1 at least."""
 ROOM = 1e-9  # by which limits that are let go may be passed, relative to the value and at least to 1
 MOST_SETS = 8  # of limits held in turn
-MOST_STEPS = 12  # while one set is held
+MOST_STEPS = 24  # in all: more, and an interior point from the guess is as quick
 MOST_BORDERS = 16  # limits that are held or let go without making the matrix anew
 GAIN = 0.1  # of what is missed, by each step at least: else the matrix is made anew
 SOFTENED = 1e-10
@@ -84,7 +84,7 @@ class Newton:
         began, tried, steps, factors = time.monotonic(), list[Sides](), 0, None
         while len(tried) < MOST_SETS and not any(_same(sides, each) for each in tried):
             tried.append(sides)
-            at = self._held(start, sides, arguments, scales, factors)
+            at = self._held(start, sides, arguments, scales, factors, MOST_STEPS - steps)
             steps, factors = steps + at.steps, at.factors
             if not at.found:
                 return None
@@ -102,19 +102,28 @@ class Newton:
         return None
 
     def _held(
-        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, factors: _Factors | None
+        self,
+        start: Outcome,
+        sides: Sides,
+        arguments: dict[str, np.ndarray],
+        scales: Scales,
+        factors: _Factors | None,
+        most: int,
     ) -> _End:
-        """Newton's steps with some limits held and the others let go; with factors of other limits where these do."""
+        """So many of Newton's steps at most, with some limits held and the others let go.
+
+        With the factors of other limits as long as these do.
+        """
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         low, high = arguments["lbx"], arguments["ubx"]
         fixed, goal = (low == high) | (sides["x"] != 0), np.where(sides["x"] > 0, high, low)
-        v = np.where(fixed, goal, start.variables)
+        v, rows, step = np.where(fixed, goal, start.variables), start.rows, 0
         low, high = arguments["lbg"], arguments["ubg"]
         held, aim = (low == high) | (sides["g"] != 0), np.where(sides["g"] > 0, high, low)
         lam = np.where(held, start.multipliers, 0.0)
         border = None if factors is None else factors.border(fixed, held)
         before, is_new, last = np.inf, False, (v, lam)
-        for step in range(MOST_STEPS):
+        for step in range(most + 1):
             slope, jacobian = self._program.numbers.first(v, p)
             cost, rows = self._program.numbers.values(v, p)
             falls = np.where(fixed, 0.0, (slope + jacobian.T @ lam) * (a / c))
@@ -130,7 +139,7 @@ class Newton:
             if border is not None and border.columns.size and not missed <= GAIN * before:  # it is of little use
                 border, before, (v, lam) = None, np.inf, last
                 continue
-            if not missed < np.inf or (is_new and missed > before and step > 1) or reason_to_stop():
+            if step == most or not missed < np.inf or (is_new and missed > before and step > 1) or reason_to_stop():
                 break
             is_new = factors is None or border is None or missed > GAIN * before
             if is_new:

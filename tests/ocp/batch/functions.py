@@ -96,7 +96,7 @@ def warm(task: Any, guess: Any) -> dict[str, Any]:
     solution: Solution = kept(arm, 1.0).solve(
         parameters={"mass": task["mass"]}, guess=None if guess is None else guess["plan"]
     )
-    told = {"iterations": solution.iterations, "guess": None if guess is None else guess["mass"]}
+    told = {"solver": solution.solver, "guess": None if guess is None else guess["mass"]}
     return {"plan": solution, **told, **task}
 
 

@@ -86,6 +86,28 @@ def test_a_saddle_beside_a_plan_is_none(stiffness: float) -> None:
     assert beside.solver == ("newton" if stiffness < np.pi**2 else "ipopt")
 
 
+def test_units_of_states_controls_and_cost_do_not_matter() -> None:
+    """Of powers of two, so that they round nothing: the same steps to the same plan."""
+    found = {}
+    for scale, strength, price in ((1.0, 1.0, 1.0), (2.0**20, 1.0, 1.0), (2.0**-18, 2.0**15, 2.0**17)):
+        problem = Problem("in units")
+        end = problem.parameter("end")
+        x = problem.state("x", 2, initial=[0.0, 0.0], terminal=ca.vertcat(end, 0.0))
+        u = problem.control("u", lower=-5 * strength, upper=5 * strength)
+        problem.dynamics(x, ca.vertcat(x[1], u * scale / strength - 0.2 * x[1] * ca.fabs(x[1]) / scale))
+        problem.horizon(1.0)
+        problem.path("speed", x[1], upper=1.4 * scale)
+        problem.minimize(running=price * (u / strength) ** 2)
+        prepared = ready(problem, Collocation(12))
+        near, plan = prepared.solve({"end": scale}), prepared.solve({"end": 0.98 * scale})
+        again = prepared.solve({"end": 0.98 * scale}, near)
+        assert again.solver == "newton"
+        assert again.cost == pytest.approx(plan.cost, rel=1e-9)
+        assert relative(again["x"], plan["x"]) < 1e-7
+        found[scale] = again.iterations
+    assert len(set(found.values())) == 1, found
+
+
 def test_rows_are_met_so_well_that_the_cost_is_that_of_the_optimum() -> None:
     """Its slope in a limit that 27 points stand at, by small differences, is the sum of their multipliers."""
     problem = Problem("limits")
