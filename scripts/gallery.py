@@ -39,11 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\nstopped; what is in {folder} is whole", file=sys.stderr)
         return 130
     if rows:
-        shown = {name: {key: "-" if row[key] is None else row[key] for key in COLUMNS} for name, row in rows.items()}
-        print("\n" + text_table([{"example": name, **row} for name, row in shown.items()], digits=5))
+        table = {name: {key: "-" if row[key] is None else row[key] for key in COLUMNS} for name, row in rows.items()}
+        print("\n" + text_table([{"example": name, **row} for name, row in table.items()], digits=5))
     for name, reason in failed.items():
         print(f"{name}: {reason}", file=sys.stderr)
-    print(f"written to {folder}; to look at a plan: selfmotion view {folder / (names[0] + '.npz')}")
+    shown = [file for name in names if (file := folder / f"{name}.npz").exists()]
+    print(f"written to {folder}" + (f"; to look at a plan: selfmotion view {shown[0]}" if shown else ""))
     return 1 if failed else 0
 
 

@@ -26,6 +26,7 @@ EXAMPLES: Mapping[str, str] = {
     "posture_set": UR5.package,
     "mobile_manipulator": "example-robot-data",
     "pushing": "example-robot-data",
+    "pick_and_place": PANDA.package,
     "steps": "selfmotion",
 }
 """Modules of this folder, each with `plan(coarse)`, which gives what its `draw(example, folder, animation=)` draws and

@@ -21,7 +21,7 @@ from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.files import read_trajectory
 from scripts import gallery
-from scripts.robots import panda, posture_set, pushing, robots, steps, ur5
+from scripts.robots import panda, pick_and_place, posture_set, pushing, robots, steps, ur5
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
@@ -197,6 +197,35 @@ def test_the_biped_walks_in_balance_and_faster_without(tmp_path: Path) -> None:
     assert row["com_margin_optimal_m"] < 0 < row["com_margin_static_m"]
     assert row["zmp_margin_optimal_m"] > 0.99 * steps.MARGIN
     with Image.open(tmp_path / "steps.png") as picture:
+        assert min(picture.size) > 500
+
+
+def test_the_load_that_is_known_stays_within_the_torques_of_another_library(tmp_path: Path) -> None:
+    """Pinocchio's torques, the load added to the hand where it is carried; more than there is where it is not known."""
+    example = pick_and_place.plan()
+    assert all(audit.passed for audit in example.audits.values())
+    model = pinocchio.buildModelFromUrdf(str(robots.PANDA.path))
+    hand = model.frames[model.getFrameId("panda_hand_tcp")]
+    x, y, z = pick_and_place.SIZE
+    block = pinocchio.Inertia.FromBox(pick_and_place.LOAD, x, y, z)
+    full = model.copy()
+    full.inertias[hand.parentJoint] += hand.placement.act(block)
+    for name, motion in example.motions.items():
+        found = np.zeros_like(motion.torques)
+        for k in range(len(motion.t)):
+            q = pinocchio.neutral(model)
+            q[7:] = 0.02
+            q[:7] = motion.joints[k]
+            rates, second = (
+                np.concatenate([part[k], [0.0, 0.0]]) for part in (motion.velocities, motion.accelerations)
+            )
+            one = full if motion.in_hand[k] else model
+            found[k] = pinocchio.rnea(one, one.createData(), q, rates, second)[:7]
+        np.testing.assert_allclose(motion.torques, found, atol=1e-8)
+        most = (np.abs(found) / robots.PANDA.read().effort).max()
+        assert most < 1 + 1e-6 if name == "load known" else most > 1.01
+    pick_and_place.draw(example, tmp_path, animation=False)
+    with Image.open(tmp_path / "pick_and_place.png") as picture:
         assert min(picture.size) > 500
 
 

@@ -1,0 +1,280 @@
+"""Gallery: a Panda picks a load up, carries it over and puts it down, at the least effort within its torques.
+
+Seven legs, each a phase of one problem: over the load, down to it, up with it, across, down, up without it, home. The
+arm is at rest at the end of each, so that the load changes hands at rest. The same motion is planned
+with a hand that is taken to be empty, and shown with the torques that the load asks for then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase, Link, Robot, VisualShape, attached, with_load
+from models.arrays import Array
+from ocp import Audit, Collocation, Effort, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
+from ocp.app.frames import TIP, Frames, frames_along
+from scripts.drawing import COLORS
+from scripts.robots.drawing import Scene, animate, joint_curves, page
+from scripts.robots.panda import HOME
+from scripts.robots.robots import PANDA
+
+__all__ = ["LOAD", "SIZE", "Motion", "carried", "draw", "legs", "plan"]
+
+LOAD = 4.0  # kg
+SIZE = (0.08, 0.04, 0.12)  # of the load, along the axes of the hand, m
+PICK, PLACE = (0.6, -0.7, 0.06), (0.6, 0.7, 0.26)
+"""Where the middle of the load is: distance from the arm's first axis, m; direction, rad; height, m."""
+ABOVE = 0.15  # m, of the points above the load and its place
+WAY, DOWN, ACROSS = 1.6, 0.4, 1.6  # durations of legs, s
+EFFORT = Effort(torque=1.0, acceleration=2.0)
+METHOD = Collocation(6, degree=5, scheme="legendre")
+FINE = 81  # times of a leg
+HANDED = ("lift", "carry", "set down")
+"""Legs with the load in hand."""
+KINDS = {"hand taken to be empty": "orange", "load known": "blue"}
+VIEW = (20.0, 12.0)  # deg
+STEEL, SHELF = (0.55, 0.35, 0.20, 1.0), (0.72, 0.72, 0.70, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A plan at FINE times of each leg, with the torques that it takes with the load in hand.
+
+    Attributes:
+        t: s. Shape (M,).
+        leg: Which one. Shape (M,).
+        joints, velocities, accelerations: Shape (M, 7).
+        torques: With the load, where it is in hand; empty: without it. Shape (M, 7), N m.
+    """
+
+    t: Array
+    leg: Array
+    joints: Array
+    velocities: Array
+    accelerations: Array
+    torques: Array
+    empty: Array
+
+    @property
+    def in_hand(self) -> Array:
+        """Where the load is in hand. Shape (M,)."""
+        return np.asarray(np.isin(self.leg, [k for k, (name, *_) in enumerate(ROUTE) if name in HANDED]))
+
+
+ROUTE = (
+    ("reach", "over the load", WAY),
+    ("lower", "at the load", DOWN),
+    ("lift", "over the load", DOWN),
+    ("carry", "over the place", ACROSS),
+    ("set down", "at the place", DOWN),
+    ("let go", "over the place", DOWN),
+    ("return", "home", WAY),
+)
+"""Legs: name, posture at the end, duration, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class PickAndPlace:
+    """The motion planned with the load and without, by their names in KINDS.
+
+    Attributes:
+        plans: Audited. motions: What they take. audits: Of each.
+    """
+
+    plans: dict[str, Solution]
+    motions: dict[str, Motion]
+    audits: dict[str, Audit]
+
+    @property
+    def audit(self) -> Audit:
+        """Of the plan that is not sound, if one is not, else of the one that knows the load."""
+        return next((audit for audit in self.audits.values() if not audit.passed), self.audits["load known"])
+
+    def share(self, name: str) -> Array:
+        """Largest torque of each joint over its limit, of a plan. Shape (7,)."""
+        return np.asarray(np.abs(self.motions[name].torques).max(axis=0) / arm().robot.effort)
+
+    def summary(self) -> dict[str, Any]:
+        """A row of the summary."""
+        known = self.motions["load known"]
+        return {
+            "robot": PANDA.name,
+            "dof": arm().joint_size,
+            "task_rows": None,
+            "duration_s": float(known.t[-1]),
+            "cost_local": None,
+            "cost_optimal": float(self.plans["load known"].cost),
+            "tip_error": None,
+            "joint_return_rad": float(np.abs(known.joints[-1] - known.joints[0]).max()),
+            "audit_passed": all(audit.passed for audit in self.audits.values()),
+            "load_kg": LOAD,
+            "torque_share_load_known": self.share("load known").tolist(),
+            "torque_share_hand_taken_to_be_empty": self.share("hand taken to be empty").tolist(),
+        }
+
+
+@cache
+def arm() -> FixedBase:
+    """The arm with nothing in its hand."""
+    return FixedBase(PANDA.read())
+
+
+def carried() -> FixedBase:
+    """The arm with the load: a block of steel, its middle where the hand grips."""
+    robot = arm().robot
+    squares = np.square(SIZE)
+    inertia = LOAD / 12 * np.diag(squares.sum() - squares)
+    return FixedBase(with_load(robot, robot.tip_link, LOAD, robot.tip_translation, inertia))
+
+
+@cache
+def postures() -> dict[str, Array]:
+    """Joints at the points of the way, by name, rad: the hand points down, one finger inwards."""
+    found = {"home": np.array(HOME)}
+    for name, (far, direction, height) in (("load", PICK), ("place", PLACE)):
+        near = np.array(HOME)
+        for which, above in ((f"over the {name}", ABOVE), (f"at the {name}", 0.0)):
+            goal = ca.DM([far, 0.0, height + above])
+            task = TipTask(position=lambda t, at=goal: at, orientation=lambda t: ca.DM(np.diag([1.0, -1.0, -1.0])))
+            near = inverse_kinematics(arm(), task, near=near, starts=0)[0].joints
+            found[which] = near + direction * np.eye(len(near))[0]
+    return found
+
+
+def legs(known: bool) -> list[Leg]:
+    """Of the way, with the load where it is known and in hand."""
+    found = []
+    for k, (name, end, horizon) in enumerate(ROUTE):
+        machine = carried() if known and name == HANDED[0] else arm() if k == 0 or name == "let go" else None
+        found.append(Leg(postures()[end], horizon, machine=machine, name=name))
+    return found
+
+
+def plan(coarse: bool = False) -> PickAndPlace:
+    """Both plans, audited; on one mesh only, `coarse` or not."""
+    plans, motions, audits = {}, {}, {}
+    for name in KINDS:
+        plans[name] = plan_dynamics(arm(), HOME, legs(name == "load known"), effort=EFFORT, method=METHOD)
+        motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
+    return PickAndPlace(plans, motions, audits)
+
+
+def motion_of(solution: Solution) -> Motion:
+    """A plan at many times, and its torques."""
+    parts: dict[str, list[Array]] = {name: [] for name in ("joints", "velocities", "accelerations")}
+    times, leg, torques, empty, begin = [], [], [], [], 0.0
+    full, bare = (torque_function(machine) for machine in (carried(), arm()))
+    for k, (name, *_) in enumerate(ROUTE):
+        phase = solution.phase(name)
+        at = phase.at_fraction(np.linspace(0.0, 1.0, FINE))
+        for what, values in parts.items():
+            values.append(at[what])
+        columns = [at[what].T for what in parts]
+        empty.append(np.array(bare(*columns)).T)
+        torques.append(np.array(full(*columns)).T if name in HANDED else empty[-1])
+        times.append(begin + phase.horizon * np.linspace(0.0, 1.0, FINE))
+        leg.append(np.full(FINE, k))
+        begin += phase.horizon
+    stacked = {what: np.vstack(values) for what, values in parts.items()}
+    return Motion(
+        np.concatenate(times), np.concatenate(leg), **stacked, torques=np.vstack(torques), empty=np.vstack(empty)
+    )
+
+
+def torque_function(machine: FixedBase) -> Any:
+    """Joints, velocities and accelerations to torques, columns side by side."""
+    symbols = [ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a")]
+    return ca.Function("torques", symbols, [joint_torques(machine, ca.DM(0, 1), *symbols)])
+
+
+def scene_of(name: str, example: PickAndPlace) -> Scene:
+    """A motion with the load beside the arm, in its hand, or where it was put."""
+    motion, robot = example.motions[name], arm().robot
+    most = example.share(name).max()
+    frames = frames_along(arm(), motion.joints)
+    first, last = np.flatnonzero(motion.in_hand)[[0, -1]]
+    number = np.clip(np.arange(len(motion.t)), first, last)
+    frames.rotations["load"], frames.positions["load"] = (
+        part[TIP][number] for part in (frames.rotations, frames.positions)
+    )
+    for what in (frames.rotations, frames.positions):
+        what["stands"] = what[robot.root]
+    title = f"{name}: {100 * most:.0f} % of a joint's torque"
+    return Scene(
+        title, furnished(robot), Frames(frames.rotations, frames.positions), motion.t, KINDS[name], view=VIEW, floor=0.0
+    )
+
+
+def furnished(robot: Robot) -> Robot:
+    """The arm with the load and what it is put on, for pictures."""
+    block = Link("load", visuals=(VisualShape("box", SIZE, color=STEEL),))
+    far, direction, height = PLACE
+    tall = height - SIZE[2] / 2
+    place = (far * np.cos(direction), far * np.sin(direction), tall / 2)
+    shelf = Link("stands", visuals=(VisualShape("box", (0.2, 0.2, tall), translation=place, color=SHELF),))
+    for each in (block, shelf):
+        robot = attached(robot, each, robot.root, keep_tip=True)
+    return robot
+
+
+def draw(example: PickAndPlace, folder: Path, *, animation: bool = True) -> None:
+    """pick_and_place.png and pick_and_place.gif."""
+    robot, blind, known = arm().robot, *(example.share(name) for name in KINDS)
+    title = (
+        f"Planned for an empty hand, a load of {LOAD:g} kg asks {100 * blind.max():.0f} % of what joint "
+        f"{blind.argmax() + 1} can give; planned with the load, at most {100 * known.max():.0f} %"
+    )
+    note = (
+        f"{PANDA.name}: over a load of {LOAD:g} kg, down, up with it, across, down, and home in {len(ROUTE)} legs and "
+        f"{example.motions['load known'].t[-1]:g} s, from rest to rest on each; earlier postures pale. The load is a "
+        "block of steel, more than the 3 kg that the arm is sold for. Limits of torque: "
+        f"{', '.join(f'{value:g}' for value in robot.effort)} N m, of its description. Both plans are the cheapest by "
+        f"the squared torques, and {EFFORT.acceleration:g} (N m)² s⁴/rad² of the squared accelerations, within the "
+        "limits of joints, velocities and torques; one knows the load, the other was planned as if there were none, "
+        "and its torques are those that the load asks for. Durations are given, no friction in the joints."
+    )
+    scenes = [scene_of(name, example) for name in KINDS]
+    ends = np.cumsum([0.0, *(horizon for *_, horizon in ROUTE)])
+    with page(
+        folder / "pick_and_place.png",
+        scenes,
+        [float(at) for at in ends[[1, 2, 4, 5]]],
+        height=6.4,
+        share=1.35,
+        note=note,
+        title=title,
+    ) as axes:
+        names = [str(k + 1) for k in range(robot.dof)]
+        for ax, name in zip(axes, KINDS, strict=False):
+            motion = example.motions[name]
+            joint_curves(ax, motion.t, motion.torques / robot.effort, names)
+            _limits(ax, motion)
+            ax.set(title=name, xlabel="time, s", ylabel="torque with the load, limits = ±1")
+        axes[0].legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
+        motion = example.motions["load known"]
+        for k, color in ((1, "orange"), (5, "purple")):
+            lifted = np.where(motion.in_hand, motion.torques[:, k], np.nan)
+            axes[2].plot(motion.t, lifted / robot.effort[k], color=COLORS[color], label=f"{k + 1}, with load")
+            axes[2].plot(
+                motion.t, motion.empty[:, k] / robot.effort[k], color=COLORS[color], ls=":", label=f"{k + 1}, without"
+            )
+        _limits(axes[2], motion)
+        axes[2].set(title="what the load asks", xlabel="time, s", ylabel="torque, limits = ±1")
+        axes[2].legend(fontsize=6.3, loc="lower center", ncols=2, handlelength=1.6, columnspacing=0.8)
+    if animation:
+        animate(folder / "pick_and_place.gif", scenes, frames=48, seconds=0.12, note=note)
+
+
+def _limits(ax: Any, motion: Motion) -> None:
+    """The limits of torque, and when the load is in hand."""
+    for low, high in ((-9.0, -1.0), (1.0, 9.0)):
+        ax.axhspan(low, high, color=COLORS["grey"], alpha=0.25, lw=0)
+    held = motion.t[motion.in_hand]
+    ax.axvspan(held[0], held[-1], color=COLORS["yellow"], alpha=0.15, lw=0)
+    ax.set_ylim(-1.6, 1.2)  # with room for a legend
