@@ -205,7 +205,7 @@ def scene_of(name: str, example: PickAndPlace) -> Scene:
     )
     for what in (frames.rotations, frames.positions):
         what["stands"] = what[robot.root]
-    title = f"{name}: {100 * most:.0f} % of a joint's torque"
+    title = f"{name}: {100 * most:.0f} % torque"
     return Scene(
         title, furnished(robot), Frames(frames.rotations, frames.positions), motion.t, KINDS[name], view=VIEW, floor=0.0
     )
