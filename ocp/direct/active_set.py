@@ -117,7 +117,7 @@ class Newton:
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         low, high = arguments["lbx"], arguments["ubx"]
         fixed, goal = (low == high) | (sides["x"] != 0), np.where(sides["x"] > 0, high, low)
-        v, rows, step = np.where(fixed, goal, start.variables), start.rows, 0
+        v = np.where(fixed, goal, start.variables)
         low, high = arguments["lbg"], arguments["ubg"]
         held, aim = (low == high) | (sides["g"] != 0), np.where(sides["g"] > 0, high, low)
         lam = np.where(held, start.multipliers, 0.0)

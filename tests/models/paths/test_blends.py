@@ -98,6 +98,20 @@ def test_arc_length_and_its_inverse_agree_with_adaptive_quadrature(degrees: floa
     assert along == pytest.approx(np.cumsum([0, *parts[:-1]]), rel=1e-10, abs=1e-12)
 
 
+@pytest.mark.parametrize("degrees", [30.0, 90.0, 150.0])
+@pytest.mark.parametrize(("kind", "shape"), [("cubic", 2.2), ("cubic", 3.0), ("quintic", 1.5)])
+def test_a_step_towards_an_arc_length_cubes_the_error(
+    degrees: float, kind: str, shape: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, found = corner(degrees, 0.3, kind, shape), list[Any]()
+    for steps in (0, 1, 4):
+        monkeypatch.setattr("models.paths.arc_length.MOST_STEPS", steps)
+        found.append(path.parameter(path.dense(40)))
+    before, after = (np.nanmax(np.abs(each - found[2])) for each in found[:2])
+    assert 1e-4 < before < 1e-2
+    assert after < before**2.5
+
+
 few = settings(max_examples=40)
 
 

@@ -23,7 +23,7 @@ from tests.ocp.app.motions import joint, link, write_table
 SEED, DOF, POSTURES = 9, 7, 5
 SHARE = 1e-3
 PERIOD = 1e-3
-"""s, between samples."""
+"""s, between samples: what joins them overshoots the kinks of these accelerations, at twice as much by 2 %."""
 
 
 def example() -> tuple[Any, Any, Any]:
