@@ -8,10 +8,7 @@ Results are added line by line to a file; a case that is there already is not do
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -26,6 +23,7 @@ from ocp.planning.steps import Length, Squares, StepCost
 from ocp.tasks.equations import bind
 from tests.ocp.planning.test_charts import planar
 from tests.ocp.planning.test_values import INSTANTS, SECONDS, reached
+from tests.sweep.results import parser, results
 
 KINDS = ("plain", "cut", "slow", "turning", "two")
 """Limits that hardly matter; that cut the set of postures; slow joints; joints that turn without end; four joints."""
@@ -120,31 +118,14 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
-    parser.add_argument("--only", choices=KINDS, action="append")
-    parser.add_argument("--count", type=int, default=1000, help="cases, of the kinds in turn")
-    parser.add_argument("--minutes", type=float, default=60.0, help="after which no further case is begun")
-    given = parser.parse_args()
-    kinds, end, rows = given.only or list(KINDS), time.time() + 60 * given.minutes, dict[Any, dict[str, Any]]()
-    if given.out.exists():
-        rows = {(row["kind"], row["seed"]): row for row in map(json.loads, given.out.read_text().splitlines())}
     shown = []
-    for number in range(given.count):
-        key = kinds[number % len(kinds)], number // len(kinds)
-        if key not in rows:
-            if time.time() > end:
-                break
-            rows[key] = judged(*key)
-            with given.out.open("a") as file:
-                file.write(json.dumps(rows[key]) + "\n")
-        shown.append(rows[key])
-        if rows[key]["wrong"]:
-            print(rows[key], flush=True)
+    for row in results(parser(__doc__, list(KINDS), 1000).parse_args(), list(KINDS), lambda *case: judged(*case[:2])):
+        shown.append(row)
+        if row["wrong"]:
+            print(row, flush=True)
     possible = sum(np.isfinite(row["steps"]) for row in shown)
-    print(
-        f"{len(shown)} cases, {possible} of which have a motion; {sum(bool(row['wrong']) for row in shown)} are wrong"
-    )
+    wrong = sum(bool(row["wrong"]) for row in shown)
+    print(f"{len(shown)} cases, {possible} of which have a motion; {wrong} are wrong")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Random tasks among random boxes: what is planned is clear by an engine of others, and what can be planned is.
 
-python -m tests.sweep.crowded --count 300 [--robot panda] [--postures 30]
+python -m tests.sweep.crowded --out FILE [--count 300] [--only panda] [--postures 30] [--minutes 60]
+
+Results are added line by line to a file; a task that is there already is not done again.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from ocp.local.touching import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.planning.motions import pair
 from tests.ocp.tasks.space_tasks import panda, ur5
+from tests.sweep.results import Row, parser, results
 
 SECONDS = 3.0
 CLEARANCE = 0.01
@@ -145,32 +147,31 @@ def by_postures(given: Crowd, count: int) -> Plan | None:
     return None
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.sweep.crowded", description=__doc__)
-    parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--robot", choices=sorted(ROBOTS), action="append")
-    parser.add_argument("--postures", type=int, default=0, help="of the search that the share solved is compared with")
-    given = parser.parse_args(arguments)
-    robots = given.robot or sorted(ROBOTS)
-    solved = hits = tried = lost = 0
-    for number in range(given.first, given.first + given.count):
-        robot, seed = robots[number % len(robots)], number // len(robots)
-        task, began = crowd(robot, seed), time.time()
-        result = planned(task)
-        took = time.time() - began
-        tried += 1
-        word = result if isinstance(result, str) else f"cost {result.cost:.4f}"
-        if isinstance(result, Plan):
-            solved += 1
-            least = least_by_coal(result, task.boxes)
-            hits += least < CLEARANCE - 1e-6
-            word += f", {least:.6f} m apart by coal"
-        elif given.postures and (other := by_postures(task, given.postures)) is not None:
-            lost += 1
-            word += f"; but from {np.round(other.at(0.0)['joints'], 3).tolist()} cost {other.cost:.4f}"
-        print(f"{robot} {seed}: {took:.1f} s, {word}", flush=True)
-    print(f"{tried} tasks, {solved} solved, {lost} that a search of postures solves, {hits} that touch by coal")
+def result(robot: str, seed: int, postures: int) -> Row:
+    """A task planned: its cost and least distance by coal, or why there is no plan and what a search of postures finds."""
+    task, begun = crowd(robot, seed), time.process_time()
+    found = planned(task)
+    row: Row = {"seconds": time.process_time() - begun}
+    if isinstance(found, Plan):
+        return row | {"cost": found.cost, "passed": found.audit().passed, "least": least_by_coal(found, task.boxes)}
+    other = by_postures(task, postures) if postures else None
+    return row | {"said": found, "other": None if other is None else other.cost}
+
+
+def main() -> int:
+    given = parser(__doc__, sorted(ROBOTS), 300)
+    given.add_argument("--postures", type=int, default=30, help="of the search that the share solved is compared with")
+    options = given.parse_args()
+    shown = []
+    for row in results(options, sorted(ROBOTS), lambda robot, seed, _: result(robot, seed, options.postures)):
+        shown.append(row)
+        print(row, flush=True)
+    solved = [row for row in shown if "cost" in row]
+    lost = sum(row.get("other") is not None for row in shown)
+    hits = sum(row["passed"] and row["least"] < CLEARANCE - 1e-6 for row in solved)
+    print(
+        f"{len(shown)} tasks, {len(solved)} solved, {lost} that a search of postures solves, {hits} that touch by coal"
+    )
     return int(hits > 0)
 
 

@@ -1,6 +1,6 @@
 """Seeded tasks planned by search over all motions, beside the best of many random starts.
 
-python -m tests.sweep.global_plans --out FILE [--kind panda] [--count 40] [--starts 200] [--minutes 60] [--again]
+python -m tests.sweep.global_plans --out FILE [--only panda] [--count 40] [--starts 200] [--minutes 60] [--again]
 
 The global plan must never be dearer than the best of the starts, must cost at most a tenth of their processor time, and
 its bound must be within 2 % with one free direction, 10 % with two. Results are added line by line to a file; a task
@@ -9,10 +9,7 @@ that is there already is not done again, or, with --again, only its global plan.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -24,6 +21,7 @@ from ocp import ProblemError, SolveError, TipTask, inverse_kinematics, plan
 from ocp.local.inverse_kinematics import Unreachable
 from tests.ocp.planning.test_charts import planar
 from tests.ocp.tasks.space_tasks import panda, ur5
+from tests.sweep.results import Row, parser, results
 
 SECONDS = 4.0
 KINDS = {"panda": (panda, 1), "ur5": (ur5, 1), "planar": (lambda: planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0), 2)}
@@ -110,45 +108,26 @@ def faults(row: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
-    parser.add_argument("--kind", choices=list(KINDS), action="append")
-    parser.add_argument("--count", type=int, default=40, help="tasks, of the kinds in turn")
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--minutes", type=float, default=60.0, help="after which no further task is begun")
-    parser.add_argument("--again", action="store_true", help="the global plans of the tasks in the file once more")
-    given = parser.parse_args()
-    kinds, rows, end = (
-        given.kind or list(KINDS),
-        dict[tuple[str, int], dict[str, Any]](),
-        time.time() + 60 * given.minutes,
-    )
-    if given.out.exists():
-        for line in given.out.read_text().splitlines():
-            row = json.loads(line)
-            rows[row["kind"], row["seed"]] = row
-    shown = {}
-    for number in range(given.count):
-        key = kinds[number % len(kinds)], number // len(kinds)
-        known = rows.get(key)
-        if time.time() > end:
-            break
-        if known is None or given.again:
-            row = {"kind": key[0], "seed": key[1], **by_search(*key)}
-            names = ("best", "failed", "starts", "starts_seconds")
-            row |= by_starts(*key, given.starts) if known is None else {name: known[name] for name in names}
-            rows[key] = row
-            with given.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-        shown[key] = rows[key]
-        row = shown[key]
+    given = parser(__doc__, list(KINDS), 40)
+    given.add_argument("--starts", type=int, default=200)
+    given.add_argument("--again", action="store_true", help="the global plans of the tasks in the file once more")
+    options = given.parse_args()
+
+    def result(kind: str, seed: int, known: Row | None) -> Row:
+        names = ("best", "failed", "starts", "starts_seconds")
+        starts = {name: known[name] for name in names} if known else by_starts(kind, seed, options.starts)
+        return by_search(kind, seed) | starts
+
+    wrong = done = 0
+    for row in results(options, list(KINDS), result):
+        done += 1
+        wrong += bool(faults(row))
         print(
-            f"{key[0]:7s} {key[1]:3d}  cost {row['cost']:.6f}  best of starts {row['best']:.6f}  bound "
+            f"{row['kind']:7s} {row['seed']:3d}  cost {row['cost']:.6f}  best of starts {row['best']:.6f}  bound "
             f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {faults(row)}",
             flush=True,
         )
-    wrong = [key for key, row in shown.items() if faults(row)]
-    print(f"{len(shown)} tasks, {len(wrong)} of which break what is promised")
+    print(f"{done} tasks, {wrong} of which break what is promised")
 
 
 if __name__ == "__main__":

@@ -3,14 +3,14 @@
 A motion is made first, its tip's path is the task: so it can be done. The pseudo-inverse loses a factor of 30 in
 manipulability on it, or breaks down. With `--beyond` paths lead out of reach, and are to be refused, soon.
 
-python -m tests.sweep.passages [--count 40] [--first 0] [--search postures] [--beyond 4]
+python -m tests.sweep.passages --out FILE [--count 40] [--search postures] [--beyond 4] [--minutes 60]
+
+Results are added line by line to a file; a path that is there already is not done again.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,10 @@ from models.arrays import Array
 from models.spatial import quaternion_from_rotation
 from ocp import Plan, ProblemError, SolveError, TipTask, plan, resolve
 from tests.models.robot.trees import seven_joint_arm
+from tests.sweep.results import Row, parser, results
 
+KINDS = ["pose", "place"]
+"""What is asked of the tip: its whole pose leaves one direction free, its place four."""
 SECONDS = 5.0
 LOSS = 30.0
 """Factor of manipulability that the pseudo-inverse loses."""
@@ -123,25 +126,27 @@ def planned(given: Passage, **options: Any) -> Plan | str:
         return f"{type(error).__name__} {error}"[:300]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.sweep.passages", description=__doc__)
-    parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--search", default="postures")
-    parser.add_argument("--beyond", type=float, default=0.0)
-    given = parser.parse_args(arguments)
-    solved = 0
-    for seed in range(given.first, given.first + given.count):
-        task = passage(seed, given.beyond)
-        began = time.process_time()
-        result = planned(task, search=given.search)
-        took = time.process_time() - began
-        word = result if isinstance(result, str) else f"cost {result.cost:.4f}"
-        solved += isinstance(result, Plan)
-        print(f"{seed}: {took:.1f} s, {word}; made with {task.cost:.4f}", flush=True)
-    print(f"{solved} of {given.count} planned")
-    return 0
+def main() -> None:
+    given = parser(__doc__, KINDS, 40)
+    given.add_argument("--search", default="postures")
+    given.add_argument("--beyond", type=float, default=0.0)
+    options = given.parse_args()
+
+    def result(kind: str, seed: int, _: Row | None) -> Row:
+        task = passage(2 * seed + KINDS.index(kind), options.beyond)
+        begun = time.process_time()
+        found = planned(task, search=options.search)
+        row: Row = {"seconds": time.process_time() - begun, "made_with": task.cost}
+        return row | (
+            {"said": found} if isinstance(found, str) else {"cost": found.cost, "passed": found.audit().passed}
+        )
+
+    shown = []
+    for row in results(options, KINDS, result):
+        shown.append(row)
+        print(row, flush=True)
+    print(f"{sum('cost' in row for row in shown)} of {len(shown)} planned")
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()
