@@ -148,7 +148,7 @@ def by_postures(given: Crowd, count: int) -> Plan | None:
 
 
 def result(robot: str, seed: int, postures: int) -> Row:
-    """A task planned: its cost and least distance by coal, or why there is no plan and what a search of postures finds."""
+    """A task planned: cost and least distance by coal, or why there is no plan and what a search of postures finds."""
     task, begun = crowd(robot, seed), time.process_time()
     found = planned(task)
     row: Row = {"seconds": time.process_time() - begun}
