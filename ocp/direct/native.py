@@ -2,8 +2,10 @@
 
 Fatrop (Vanroye, Sathya, De Schutter, Decre, 2023) is an interior-point method whose linear algebra goes from stage to
 stage. CasADi's plugin for it takes a time that grows with the square of the intervals to build; here tables say where
-every number of a block stands in the matrices of the stages, and `stages.c`, compiled once a machine, puts them there.
-Its C interface wants equalities apart from inequalities, and bounds of variables among these.
+every number of a block stands in the matrices of the stages, and C, compiled once a machine, puts them there. Its
+interface wants equalities apart from inequalities, and bounds of variables among these. What the dynamics inside an
+interval define, fatrop does not see: `inner.c` finds it by Newton's method, with its slopes and curvature (condensing:
+Bock, Plitt, 1984; of collocation: Quirynen, Gros, Diehl, 2015).
 
 The blocks are evaluated by CasADi, all applications at once, through a call back to Python, five times an iteration.
 """
@@ -26,7 +28,7 @@ from ocp.console import Watch
 from ocp.direct.assembly import Derivatives, gather, inputs, mapped, nonzeros, repeat
 from ocp.direct.compiled import CompilerError, Library, built
 from ocp.direct.fragment import Fragment
-from ocp.direct.stages import Tables
+from ocp.direct.stages import Entries, Tables
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
 
@@ -34,7 +36,7 @@ __all__ = ["NativeSolver", "why_not"]
 
 KINDS = ("value", "gradient", "jacobian", "hessian")
 VALUE, GRADIENT, JACOBIAN, HESSIAN = range(4)
-DYNAMICS, EQUALITY, INEQUALITY = range(3)
+DYNAMICS, EQUALITY, INEQUALITY, INNER = range(4)
 MOST_KEPT = 4
 """Solvers kept of one program: which rows are equalities may change with the parameters, and makes another solver."""
 WORDS = {
@@ -43,7 +45,7 @@ WORDS = {
     2: "Solved_To_Acceptable_Level",
     3: "Infeasible_Problem_Detected",
 }
-SOURCE = Path(__file__).with_name("stages.c")
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("inner.c", "stages.c"))
 _CREATION = threading.Lock()  # fatrop sets a stream of the whole process when a solver is made
 
 
@@ -70,7 +72,7 @@ def library() -> Any:
     for name in ("libfatrop.so", "libblasfeo.so", "include/fatrop/ocp/OCPCInterface.h"):
         if not (home / name).exists():
             raise OSError(f"casadi brings no {name}")
-    text = SOURCE.read_text(encoding="utf-8")
+    text = "\n".join(source.read_text(encoding="utf-8") for source in SOURCES)
     link = (f"-L{home}", "-lfatrop", "-l:libblasfeo.so", f"-Wl,-rpath,{home}", "-lm")
     made = ctypes.CDLL(str(built(Library((text,), lambda: text, (str(home / "include"),), link))))
     address, number = ctypes.c_void_p, ctypes.c_int
@@ -80,7 +82,7 @@ def library() -> Any:
         ("stages_option", None, [address, ctypes.c_char_p, number, ctypes.c_double]),
         ("stages_option_type", number, [ctypes.c_char_p]),
         ("stages_solve", number, [address] * 5),
-        ("stages_values", None, [address] * 3),
+        ("stages_values", None, [address] * 4),
         ("stages_destroy", None, [address]),
     ):
         function = getattr(made, name)
@@ -89,10 +91,7 @@ def library() -> Any:
 
 
 class _Entries(ctypes.Structure):
-    _fields_ = [
-        ("size", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in ("matrix", "row", "column", "source", "scale")),
-    ]
+    _fields_ = [(name, ctypes.c_void_p) for name in ("first", "row", "column", "source")]
 
 
 EVALUATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
@@ -103,51 +102,77 @@ class _Program(ctypes.Structure):
     _fields_ = [
         *(
             (name, ctypes.c_int)
-            for name in ("stages", "variables", "rows", "bounds", "linear", "values", "slopes", "duals")
+            for name in ("stages", "variables", "rows", "values", "slopes", "linear", "duals", "plain")
         ),
         *(
             (name, ctypes.c_void_p)
             for name in (
-                *("nx", "nu", "ng", "ni", "place", "a", "target", "factor", "shift"),
-                *("bound_of", "bound_at", "bound_shift", "linear_row", "linear_column", "linear_value"),
+                *("nx", "nu", "nz", "ng", "ni"),
+                *("primal_first", "slack_first", "inner_first", "factors_first", "sensitivity_first"),
+                *("place", "local", "inner_variable", "inner_row", "a"),
+                *("kind", "position", "target", "factor", "shift"),
             )
         ),
+        *((name, _Entries) for name in ("constant", "inner", "jacobian", "hessian")),
+        ("half", ctypes.c_void_p),
         ("numbers", ctypes.c_void_p * 4),
-        *((name, ctypes.c_void_p) for name in ("value_row", "slope_at", "slope_scale")),
-        ("jacobian", _Entries),
-        ("hessian", _Entries),
+        *((name, ctypes.c_void_p) for name in ("value_row", "slope_of")),
         ("cost_scale", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in ("x", "g", "lam")),
         ("sigma", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in ("lower", "upper", "guess")),
         ("evaluate", EVALUATE),
         ("watch", WATCH),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("seen", "before", "slope", "step", "size", "factors", "sensitivity", "scratch", "pivots")
+        ),
         ("solver", ctypes.c_void_p),
-        ("stopped", ctypes.c_int),
-        ("known", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in ("slack_first", "primal_first", "seen")),
+        *((name, ctypes.c_int) for name in ("stopped", "lost", "known", "found", "ready", "sloped", "factored")),
     ]
+
+
+class _Kept:
+    """Arrays that C reads, kept as long as this is."""
+
+    def __init__(self) -> None:
+        self._kept: list[Any] = []
+
+    def keep(self, array: Any, kind: Any = np.int32) -> int:
+        """The address of an array that is kept from now on."""
+        whole = np.ascontiguousarray(array, dtype=kind)
+        self._kept.append(whole)
+        return int(whole.ctypes.data)
+
+    def entries(self, entries: Entries, stage: np.ndarray, stages: int) -> _Entries:
+        """Entries in C, those of one stage after those of the other; ``stage`` of each."""
+        order = np.argsort(stage, kind="stable")
+        first = np.searchsorted(stage[order], np.arange(stages + 1))
+        return _Entries(self.keep(first), *(self.keep(part[order]) for part in entries))
 
 
 # ---- the solver --------------------------------------------------------------------------------------------------
 
 
-class _Handle:
+class _Handle(_Kept):
     """A solver of fatrop for what is an equality, what an inequality and what neither.
 
+    The bounds of variables are rows behind those of the program.
+
     Attributes:
-        address: Of the solver in C. duals: How many multipliers. target: Where each row stands; -1: nowhere.
+        address: Of the solver in C. duals: How many multipliers. base: The program in C.
     """
 
     def __init__(self, solver: NativeSolver, kinds: tuple[np.ndarray, np.ndarray]) -> None:
-        """``kinds`` of each row and of each variable: EQUALITY, INEQUALITY, or -1."""
+        """``kinds`` of each row and of each variable: DYNAMICS, EQUALITY, INEQUALITY, INNER, or -1."""
+        super().__init__()
         tables = solver.tables
         of_rows, of_variables = kinds
         self.bounded = np.flatnonzero(of_variables >= 0)
         stage = np.concatenate([tables.row_stage, tables.stage[self.bounded]])
         kind = np.concatenate([of_rows, of_variables[self.bounded]])
-        stages, m = len(tables.nx), tables.fragment.n_rows
-        position = np.concatenate([tables.dynamics, np.full(len(self.bounded), -1)])
+        stages, m, more = len(tables.nx), tables.fragment.n_rows, len(self.bounded)
+        position = np.concatenate([np.maximum(tables.dynamics, tables.position), np.full(more, -1)])
         counts = {}
         for which in (EQUALITY, INEQUALITY):
             mine = np.flatnonzero(kind == which)
@@ -160,14 +185,13 @@ class _Handle:
         if np.any(ng > tables.nx + tables.nu):
             crowded = int(np.argmax(ng - tables.nx - tables.nu))
             raise RuntimeError(f"stage {crowded} has {ng[crowded]} equalities, more than it has variables; use ipopt")
-        self.slack = np.concatenate([[0], np.cumsum(ni)])
+        slack = np.concatenate([[0], np.cumsum(ni)])
         self.duals = int(tables.nx[1:].sum() + ng.sum() + ni.sum())
 
         self.base = base = _Program()
         ctypes.pointer(base)[0] = solver.base  # a copy
-        self.arrays = [np.ascontiguousarray(part, dtype=np.int32) for part in (ng, ni, self.slack)]
-        base.ng, base.ni, base.slack_first = (part.ctypes.data for part in self.arrays)
-        self.limits = np.zeros((2, self.slack[-1]))
+        base.ng, base.ni, base.slack_first = (self.keep(part) for part in (ng, ni, slack))
+        self.limits = np.zeros((2, slack[-1]))
         base.lower, base.upper = (part.ctypes.data for part in self.limits)
         library = solver.library
         with _CREATION:
@@ -175,59 +199,37 @@ class _Handle:
         weakref.finalize(self, library.stages_destroy, self.address)
         places = np.zeros(3 * stages, dtype=np.int32)
         library.stages_places(self.address, places.ctypes.data, stages)
-        for name, (type_, value) in solver.options.items():
-            library.stages_option(self.address, name.encode(), type_, float(value))
-        at = np.where(kind >= 0, places[3 * stage + np.maximum(kind, 0)] + position, -1)
-        self.target, bound_at = at[:m], at[m:]
-        is_slack = kind == INEQUALITY
-        self.slack_row = np.flatnonzero(is_slack[:m])
-        self.slack_of_row = (self.slack[stage] + position)[:m][self.slack_row]
-        self.slack_bound = np.flatnonzero(is_slack[m:])
-        self.slack_of_bound = (self.slack[stage] + position)[m:][self.slack_bound]
-        self.equal = kind[m:] == EQUALITY
+        for name, (type_, number) in solver.options.items():
+            library.stages_option(self.address, name.encode(), type_, number)
+        seen = (kind >= 0) & (kind != INNER)
+        base.target = self.keep(np.where(seen, places[3 * stage + np.where(seen, kind, 0)] + position, -1))
+        base.kind, base.position = self.keep(kind), self.keep(position)
+        self.is_slack, self.is_equality = kind == INEQUALITY, kind == EQUALITY
+        self.slack = (slack[stage] + position)[self.is_slack]
+        self.is_dynamics = tables.dynamics >= 0
 
-        # entries of the Jacobian: of rows that stand somewhere in variables of their stage; then of bounded variables
-        row, column, source = tables.jacobian.row, tables.jacobian.column, tables.jacobian.source
-        own = (of_rows[row] >= 0) & tables.own[column] & (tables.stage[column] == tables.row_stage[row])
-        row, column, source = row[own], column[own], source[own]
-        one = solver.one
-        parts = (
-            np.concatenate([3 * tables.row_stage[row] + of_rows[row], 3 * stage[m:] + kind[m:]]),
-            np.concatenate([tables.local[column], tables.local[self.bounded]]),
-            np.concatenate([position[row], position[m:]]),
-            np.concatenate([source, np.full(len(self.bounded), one)]),
-        )
-        self.row, self.column = row, column
-        self.scale = np.ones(len(parts[0]))
-        self.factor, self.shift = np.ones(m), np.zeros(m)
-        self.bound_shift = np.zeros(len(self.bounded))
-        ints = [np.ascontiguousarray(part, dtype=np.int32) for part in (*parts, self.target, self.bounded, bound_at)]
-        self.arrays += ints
-        base.jacobian = _Entries(len(parts[0]), *(part.ctypes.data for part in ints[:4]), self.scale.ctypes.data)
-        base.target, base.bound_of, base.bound_at = (part.ctypes.data for part in ints[4:])
-        base.bounds, base.duals = len(self.bounded), self.duals
-        base.factor, base.shift, base.bound_shift = (
-            part.ctypes.data for part in (self.factor, self.shift, self.bound_shift)
-        )
-        self.kinds, self.is_dynamics = kinds, tables.dynamics >= 0
+        at, column, value = tables.fragment.linear
+        bound = Entries(m + np.arange(more), self.bounded, np.full(more, solver.one))
+        constant = Entries(at, column, solver.one - len(value) + np.arange(len(at))).followed_by(bound)
+        base.constant = self.entries(constant, stage[constant.row], stages)
+        base.linear, base.rows, base.duals = len(constant.row), m + more, self.duals
+        entries = tables.jacobian.followed_by(bound)
+        entries = entries.select(seen[entries.row] & (tables.stage[entries.column] == stage[entries.row]))
+        base.jacobian = self.entries(entries, stage[entries.row], stages)
+        self.factor, self.shift = np.zeros(m + more), np.zeros(m + more)
+        base.factor, base.shift = self.factor.ctypes.data, self.shift.ctypes.data
 
     def bind(self, tables: Tables, a: np.ndarray, b: np.ndarray, sides: tuple[np.ndarray, ...]) -> None:
         """Set scales of variables and rows, and bounds (lbx, ubx, lbg, ubg)."""
         lbx, ubx, lbg, ubg = sides
-        onto = tables.onto[self.is_dynamics]
-        self.factor[:] = 1.0 / b
-        self.factor[self.is_dynamics] = -1.0 / a[onto]
-        self.shift[:] = np.where(
-            self.kinds[0] == INEQUALITY, 0.0, np.where(self.kinds[0] >= 0, lbg * b * self.factor, 0.0)
-        )
-        self.scale[: len(self.row)] = self.factor[self.row] * a[self.column]
-        self.bound_shift[:] = np.where(self.equal, lbx[self.bounded], 0.0)
-        for side, (of_rows, of_variables) in zip(self.limits, ((lbg, lbx), (ubg, ubx)), strict=True):
-            side[self.slack_of_row] = of_rows[self.slack_row]
-            side[self.slack_of_bound] = of_variables[self.bounded[self.slack_bound]]
+        self.factor[:] = 1.0 / np.concatenate([b, a[self.bounded]])
+        self.factor[: len(b)][self.is_dynamics] = -1.0 / a[tables.onto[self.is_dynamics]]
+        low, high = (np.concatenate([lbg, lbx[self.bounded]]), np.concatenate([ubg, ubx[self.bounded]]))
+        self.shift[:] = np.where(self.is_equality, low, 0.0)
+        self.limits[:, self.slack] = low[self.is_slack], high[self.is_slack]
 
 
-class NativeSolver:
+class NativeSolver(_Kept):
     """Fatrop for one program, called as a casadi solver is.
 
     Args:
@@ -246,17 +248,18 @@ class NativeSolver:
         options: Mapping[str, Any],
         watch: Watch,
     ) -> None:
+        super().__init__()
         self.library = library()
         self.options = checked_options(self.library, options)
         self.tables = tables = Tables(form, fragment, functions)
         self._parameters, self._watch = form.np, watch
         self._stats: dict[str, Any] = {}
         self._handles: OrderedDict[bytes, _Handle] = OrderedDict()
-        self._kept: list[Any] = []
         self._error: BaseException | None = None
-        self._x, self._lam, self._g = np.zeros(fragment.size), np.zeros(fragment.n_rows), np.zeros(fragment.n_rows)
-        self._p, self._sigma, self._a = np.zeros(form.np), np.zeros(1), np.ones(fragment.size)
-        self._slope_scale, self._curve_scale = np.ones(len(tables.slope_of)), np.ones(len(tables.hessian.row))
+        self._x, self._a = np.zeros(fragment.size), np.ones(fragment.size)
+        # the bounds of variables are rows too
+        self._lam, self._g = np.zeros(fragment.n_rows + fragment.size), np.zeros(fragment.n_rows + fragment.size)
+        self._p, self._sigma = np.zeros(form.np), np.zeros(1)
         self._numbers = [np.zeros(count) for count in tables.counts]
         self._numbers[JACOBIAN] = np.concatenate([self._numbers[JACOBIAN], fragment.linear[2], [1.0]])
         self.one = len(self._numbers[JACOBIAN]) - 1
@@ -273,44 +276,57 @@ class NativeSolver:
 
     # ---- the parts of the program that stay ----
 
-    def keep(self, array: Any, kind: Any) -> int:
-        """The address of an array that is kept from now on."""
-        whole = np.ascontiguousarray(array, dtype=kind)
-        self._kept.append(whole)
-        return int(whole.ctypes.data)
-
     def _program(self) -> _Program:
         me = weakref.proxy(self)  # no circle: what C holds is given back at once
-        tables, fragment = self.tables, self.tables.fragment
-        at, column, value = fragment.linear
-        entries, stage = tables.hessian, tables.stage[tables.hessian.row]
-        local = tables.local[entries.row], tables.local[entries.column]
-        curve = (self.keep(part, np.int32) for part in (stage, *local, entries.source))
+        tables = self.tables
+        inner = tables.jacobian.select(tables.position[tables.jacobian.row] >= 0)
+        own = tables.nx + tables.nu
+        first = {
+            "primal_first": own,
+            "inner_first": tables.nz,
+            "factors_first": tables.nz**2,
+            "sensitivity_first": tables.nz * own,
+        }
+        sums = {name: np.concatenate([[0], np.cumsum(part)]) for name, part in first.items()}
+        last = {name: int(part[-1]) for name, part in sums.items()}
+        scratch = int(((own + tables.nz) * own).max())
+        sizes = {
+            "seen": last["primal_first"],
+            "before": last["primal_first"] + last["inner_first"],
+            "slope": tables.fragment.size,
+            "step": last["inner_first"],
+            "size": len(own),
+            "factors": last["factors_first"],
+            "sensitivity": last["sensitivity_first"],
+            "scratch": scratch,
+        }
         base = _Program(
             stages=len(tables.nx),
-            variables=fragment.size,
-            rows=fragment.n_rows,
-            linear=len(at),
+            variables=tables.fragment.size,
             values=tables.counts[VALUE],
             slopes=tables.counts[GRADIENT],
-            nx=self.keep(tables.nx, np.int32),
-            nu=self.keep(tables.nu, np.int32),
-            place=self.keep(tables.place, np.int32),
-            linear_row=self.keep(at, np.int32),
-            linear_column=self.keep(column, np.int32),
-            linear_value=self.keep(value, float),
-            value_row=self.keep(tables.value_row, np.int32),
-            slope_at=self.keep(tables.place[tables.slope_of], np.int32),
-            slope_scale=self._slope_scale.ctypes.data,
-            hessian=_Entries(len(stage), *curve, self._curve_scale.ctypes.data),
+            plain=tables.plain,
+            nx=self.keep(tables.nx),
+            nu=self.keep(tables.nu),
+            nz=self.keep(tables.nz),
+            place=self.keep(tables.place),
+            local=self.keep(tables.local),
+            inner_variable=self.keep(tables.inner),
+            inner_row=self.keep(tables.inner_rows),
+            value_row=self.keep(tables.value_row),
+            slope_of=self.keep(tables.slope_of),
+            inner=self.entries(inner, tables.row_stage[inner.row], len(own)),
+            hessian=self.entries(tables.hessian, tables.stage[tables.hessian.row], len(own)),
+            half=self.keep(tables.half, float),
             a=self._a.ctypes.data,
             x=self._x.ctypes.data,
             lam=self._lam.ctypes.data,
             g=self._g.ctypes.data,
-            seen=self.keep(np.zeros(tables.first[-1]), float),
-            primal_first=self.keep(tables.first, np.int32),
+            pivots=self.keep(np.zeros(last["inner_first"])),
             watch=WATCH(lambda: me._ask()),
             evaluate=EVALUATE(lambda kind: me._evaluate(kind)),
+            **{name: self.keep(part) for name, part in sums.items()},
+            **{name: self.keep(np.zeros(size), float) for name, size in sizes.items()},
         )
         for i, numbers in enumerate(self._numbers):
             base.numbers[i] = numbers.ctypes.data
@@ -338,7 +354,7 @@ class NativeSolver:
             given = [x, p, sigma, lam] if kind == HESSIAN else [x, p]
             function = ca.Function(name, given, [ca.densify(nonzeros(pieces[kind]))])
             buffer, run = function.buffer()
-            for i, array in enumerate((self._x, self._p, self._sigma, self._lam)[: len(given)]):
+            for i, array in enumerate((self._x, self._p, self._sigma, self._lam[: fragment.n_rows])[: len(given)]):
                 buffer.set_arg(i, array.data)
             buffer.set_res(0, self._numbers[kind][: self.tables.counts[kind]].data)
             calls.append((function, buffer, run))
@@ -376,8 +392,8 @@ class NativeSolver:
             loose = np.isneginf(lower) & np.isposinf(upper)
             return np.where(lower == upper, EQUALITY, np.where(loose, -1, INEQUALITY))
 
-        of_rows = np.where(tables.dynamics >= 0, DYNAMICS, np.where(tables.twin >= 0, -1, kinds(lbg, ubg)))
-        of_variables = np.where(tables.own, kinds(lbx, ubx), -1)
+        of_rows = np.where(tables.dynamics >= 0, DYNAMICS, np.where(tables.position >= 0, INNER, kinds(lbg, ubg)))
+        of_variables = kinds(lbx, ubx)
         key = np.concatenate([of_rows, of_variables]).astype(np.int8).tobytes()
         handle = self._handles.pop(key, None) or _Handle(self, (of_rows, of_variables))
         self._handles[key] = handle
@@ -394,11 +410,11 @@ class NativeSolver:
         a, b, c = p[k : k + n], p[k + n : k + n + m], float(p[k + n + m])
         handle = self._handle((lbx, ubx, lbg, ubg))
         handle.bind(tables, a, b, (lbx, ubx, lbg, ubg))
-        self._p[:], self._a[:], self._error = p[:k], a[tables.standing], None
-        self._slope_scale[:] = a[tables.slope_of] / c
-        self._curve_scale[:] = a[tables.hessian.row] * a[tables.hessian.column]
+        self._p[:], self._a[:], self._error = p[:k], a, None
+        self._x[:] = x0 * a
         guess = np.zeros(tables.first[-1])
-        guess[tables.place[tables.own]] = x0[tables.own]
+        seen = tables.place >= 0
+        guess[tables.place[seen]] = x0[seen]
         primal, dual, told = np.zeros(len(guess)), np.zeros(handle.duals), np.zeros(2, dtype=np.int32)
         program, cost = handle.base, ctypes.c_double()
         program.guess, program.cost_scale = guess.ctypes.data, c
@@ -406,7 +422,7 @@ class NativeSolver:
         self.library.stages_solve(
             handle.address, ctypes.byref(program), primal.ctypes.data, dual.ctypes.data, told.ctypes.data
         )
-        self.library.stages_values(ctypes.byref(program), primal.ctypes.data, ctypes.byref(cost))
+        self.library.stages_values(ctypes.byref(program), primal.ctypes.data, dual.ctypes.data, ctypes.byref(cost))
         if program.stopped:
             self._handles.clear()  # it was stopped by an option that would stop it again
         if self._error is not None and not isinstance(self._error, RuntimeError):
@@ -414,11 +430,7 @@ class NativeSolver:
         flag, iterations = (int(value) for value in told)
         word = WORDS.get(flag, "Error_In_Step_Computation")
         self._stats = {"return_status": word, "success": flag == 0, "iter_count": iterations}
-        lam = np.where(handle.target >= 0, handle.factor * dual[handle.target], 0.0)
-        copies = tables.twin >= 0
-        lam[copies] = lam[tables.twin[copies]]
-        found = primal[tables.place] * self._a / a
-        return {"x": found, "f": np.array(cost.value), "g": self._g / b, "lam_g": lam * b}
+        return {"x": self._x / a, "f": np.array(cost.value), "g": self._g[:m] / b, "lam_g": self._lam[:m] * b}
 
 
 def checked_options(library: Any, options: Mapping[str, Any]) -> dict[str, tuple[int, float]]:

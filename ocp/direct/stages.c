@@ -1,71 +1,12 @@
-/* Between a partially separable program and fatrop's C interface: blocks in, matrices of stages out.
-
-   The same text for every problem; sizes and places come in the tables that ocp/direct/native.py makes. What the solver
-   sees is scaled: variables over `a`, rows and cost over their own. */
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-#include "blasfeo.h"
-#include "fatrop/ocp/OCPCInterface.h"
-
-#define VAST 1e20
-#define EXPORT __attribute__((visibility("default")))
-
-enum { VALUE, GRADIENT, JACOBIAN, HESSIAN, KINDS };
-
-/* Entries of the matrices of stages: number `source` times `scale` is added at (row, column) of `matrix`. */
-typedef struct {
-  int size;
-  const int *matrix, *row, *column, *source;
-  const double *scale;
-} entries;
-
-typedef struct {
-  int stages, variables, rows, bounds, linear, values, slopes, duals;
-  const int *nx, *nu, *ng, *ni; /* of each stage */
-  const int *place; /* of each variable in fatrop's vector */
-  const double *a;
-  const int *target;           /* of each row in fatrop's vector of constraints; -1: not there */
-  const double *factor, *shift; /* sign over scale; what an equality is asked to be */
-  const int *bound_of, *bound_at; /* bounded variables: which, and where as a row */
-  const double *bound_shift;
-  const int *linear_row, *linear_column;
-  const double *linear_value;
-  double *numbers[KINDS]; /* of all blocks: costs and rows; slopes; entries of the Jacobian, of the Hessian */
-  const int *value_row; /* of each number of VALUE; -1: a cost */
-  const int *slope_at;  /* of each number of GRADIENT in fatrop's vector */
-  const double *slope_scale;
-  entries jacobian, hessian; /* matrix: of the Jacobian 3 k + 0 dynamics, 1 equalities, 2 inequalities of stage k */
-  double cost_scale;
-  double *x, *g, *lam; /* scratch: variables and rows as they are, multipliers of these */
-  double sigma;
-  const double *lower, *upper, *guess; /* in fatrop's order */
-  int (*evaluate)(int); /* fills the numbers of a kind, at x, lam and sigma */
-  int (*watch)(void);   /* not zero where the solve must end */
-  struct FatropOcpCSolver *solver;
-  int stopped, known;
-  const int *slack_first, *primal_first;
-  double *seen;
-} program;
-
-static double tame(double v) { return isnan(v) ? VAST : v > VAST ? VAST : v < -VAST ? -VAST : v; }
-
-/* The variables of the program at fatrop's, and the values of the blocks there; not twice at the same place. */
-static void move(program *s, const double *primal) {
-  int i;
-  if (s->known && !memcmp(s->seen, primal, sizeof(double) * (size_t)s->primal_first[s->stages])) return;
-  memcpy(s->seen, primal, sizeof(double) * (size_t)s->primal_first[s->stages]);
-  for (i = 0; i < s->variables; ++i) s->x[i] = primal[s->place[i]] * s->a[i];
-  s->known = 1;
-  s->evaluate(VALUE);
-}
+/* What fatrop asks of a program, and its face to Python. */
 
 static int objective(double scale, const double *primal, const double *u0, const double *u1, double *out,
                      const struct FatropOcpCDims *d, void *data) {
   program *s = data;
   double sum = 0;
   int i;
-  move(s, primal);
+  *out = VAST;
+  if (!move(s, primal)) return 1;
   for (i = 0; i < s->values; ++i)
     if (s->value_row[i] < 0) sum += s->numbers[VALUE][i];
   *out = tame(scale * sum / s->cost_scale);
@@ -75,39 +16,36 @@ static int objective(double scale, const double *primal, const double *u0, const
 static int slope(double scale, const double *primal, const double *u0, const double *u1, double *out,
                  const struct FatropOcpCDims *d, void *data) {
   program *s = data;
-  int i;
-  move(s, primal);
-  s->evaluate(GRADIENT);
+  int i, j, k, q;
   memset(out, 0, sizeof(double) * (size_t)s->primal_first[s->stages]);
-  for (i = 0; i < s->slopes; ++i) out[s->slope_at[i]] += scale * s->slope_scale[i] * tame(s->numbers[GRADIENT][i]);
+  if (!slopes_at(s, primal)) {
+    s->lost = 1, end(s);
+    return 1;
+  }
+  slope_of_cost(s);
+  for (i = 0; i < s->variables; ++i)
+    if (s->place[i] >= 0) out[s->place[i]] = scale * s->slope[i];
+  for (k = 0; k < s->stages; ++k) {
+    const int w = own(s, k);
+    const double *along = s->sensitivity + s->sensitivity_first[k];
+    double *mine = out + s->primal_first[k];
+    for (j = 0, i = s->inner_first[k]; i < s->inner_first[k + 1]; ++i, ++j) {
+      const double v = scale * s->slope[s->inner_variable[i]];
+      if (v != 0.0)
+        for (q = 0; q < w; ++q) mine[q] += v * along[j * w + q];
+    }
+  }
   return 1;
-}
-
-static void sum_rows(program *s) {
-  int i;
-  memset(s->g, 0, sizeof(double) * (size_t)s->rows);
-  for (i = 0; i < s->values; ++i)
-    if (s->value_row[i] >= 0) s->g[s->value_row[i]] += s->numbers[VALUE][i];
-  for (i = 0; i < s->linear; ++i) s->g[s->linear_row[i]] += s->linear_value[i] * s->x[s->linear_column[i]];
 }
 
 static int violation(const double *primal, const double *u0, const double *u1, double *out,
                      const struct FatropOcpCDims *d, void *data) {
   program *s = data;
+  const int found = move(s, primal);
   int i;
-  move(s, primal);
-  sum_rows(s);
   for (i = 0; i < s->rows; ++i)
-    if (s->target[i] >= 0) out[s->target[i]] = tame(s->factor[i] * s->g[i] - s->shift[i]);
-  for (i = 0; i < s->bounds; ++i)
-    out[s->bound_at[i]] = s->x[s->bound_of[i]] / s->a[s->bound_of[i]] - s->bound_shift[i];
+    if (s->target[i] >= 0) out[s->target[i]] = found ? tame(s->factor[i] * s->g[i] - s->shift[i]) : VAST;
   return 1;
-}
-
-static void add(const entries *e, const double *numbers, struct blasfeo_dmat **of) {
-  int i;
-  for (i = 0; i < e->size; ++i)
-    BLASFEO_DMATEL(of[e->matrix[i]], e->row[i], e->column[i]) += e->scale[i] * tame(numbers[e->source[i]]);
 }
 
 static void clear(struct blasfeo_dmat *of, int rows, int columns) { blasfeo_dgese(rows, columns, 0.0, of, 0, 0); }
@@ -116,44 +54,72 @@ static int slopes_of_rows(const double *primal, const double *u0, const double *
                           struct blasfeo_dmat *equal, struct blasfeo_dmat *unequal, const struct FatropOcpCDims *d,
                           void *data) {
   program *s = data;
-  struct blasfeo_dmat **of = malloc(sizeof(*of) * 3 * (size_t)s->stages);
-  int k;
-  if (!s->stopped && s->watch()) {
-    s->stopped = 1;
-    fatrop_ocp_c_set_option_int(s->solver, "max_iter", 0);
-  }
-  move(s, primal);
-  s->evaluate(JACOBIAN);
+  const entries *e = &s->jacobian;
+  int i, k, q;
+  must_end(s);
+  if (!slopes_at(s, primal)) s->lost = 1, end(s);
   for (k = 0; k < s->stages; ++k) {
-    of[3 * k] = dynamics + k;
-    of[3 * k + 1] = equal + k;
-    of[3 * k + 2] = unequal + k;
-    if (k + 1 < s->stages) clear(dynamics + k, s->nu[k] + s->nx[k], s->nx[k + 1]);
-    clear(equal + k, s->nu[k] + s->nx[k], s->ng[k]);
-    clear(unequal + k, s->nu[k] + s->nx[k], s->ni[k]);
+    const int w = own(s, k);
+    struct blasfeo_dmat *of[3] = {dynamics + k, equal + k, unequal + k};
+    if (k + 1 < s->stages) clear(dynamics + k, w, s->nx[k + 1]);
+    clear(equal + k, w, s->ng[k]);
+    clear(unequal + k, w, s->ni[k]);
+    if (s->lost) continue;
+    for (i = e->first[k]; i < e->first[k + 1]; ++i) {
+      const double v = tame(s->numbers[JACOBIAN][e->source[i]]) * s->factor[e->row[i]] * s->a[e->column[i]];
+      struct blasfeo_dmat *m = of[s->kind[e->row[i]]];
+      const int at = s->position[e->row[i]], c = s->local[e->column[i]];
+      if (c < w) {
+        BLASFEO_DMATEL(m, c, at) += v;
+      } else {
+        const double *along = s->sensitivity + s->sensitivity_first[k] + (c - w) * w;
+        for (q = 0; q < w; ++q) BLASFEO_DMATEL(m, q, at) += v * along[q];
+      }
+    }
   }
-  add(&s->jacobian, s->numbers[JACOBIAN], of);
-  free(of);
   return 1;
 }
 
 static int curvature(double scale, const double *primal, const double *dual, const double *u0, const double *u1,
                      struct blasfeo_dmat *out, const struct FatropOcpCDims *d, void *data) {
   program *s = data;
-  struct blasfeo_dmat **of = malloc(sizeof(*of) * (size_t)s->stages);
-  int i, k;
-  move(s, primal);
+  const entries *e = &s->hessian;
+  int i, j, k, q, r;
+  for (k = 0; k < s->stages; ++k) clear(out + k, own(s, k), own(s, k));
+  if (!slopes_at(s, primal)) s->lost = 1, end(s);
+  if (s->lost) return 1;
   s->sigma = scale / s->cost_scale;
-  for (i = 0; i < s->rows; ++i) s->lam[i] = s->target[i] < 0 ? 0.0 : s->factor[i] * dual[s->target[i]];
+  multipliers(s, scale, dual);
   s->evaluate(HESSIAN);
   for (k = 0; k < s->stages; ++k) {
-    of[k] = out + k;
-    clear(out + k, s->nu[k] + s->nx[k], s->nu[k] + s->nx[k]);
+    const int w = own(s, k), n = s->nz[k];
+    const double *along = s->sensitivity + s->sensitivity_first[k];
+    double *half = s->scratch; /* half the curvature along (1, E) on its right side; then on both */
+    memset(half, 0, sizeof(double) * (size_t)((w + n) * w));
+    for (i = e->first[k]; i < e->first[k + 1]; ++i) {
+      const int c = s->local[e->column[i]];
+      const double scales = s->half[i] * s->a[e->row[i]] * s->a[e->column[i]];
+      const double v = tame(s->numbers[HESSIAN][e->source[i]]) * scales;
+      double *mine = half + s->local[e->row[i]] * w;
+      if (c < w) mine[c] += v;
+      else
+        for (q = 0; q < w; ++q) mine[q] += v * along[(c - w) * w + q];
+    }
+    for (j = 0; j < n; ++j) {
+      const double *mine = half + (w + j) * w;
+      for (r = 0; r < w; ++r) {
+        const double v = along[j * w + r];
+        if (v != 0.0)
+          for (q = 0; q < w; ++q) half[r * w + q] += v * mine[q];
+      }
+    }
+    for (r = 0; r < w; ++r)
+      for (q = 0; q < w; ++q) BLASFEO_DMATEL(out + k, r, q) = half[r * w + q] + half[q * w + r];
   }
-  add(&s->hessian, s->numbers[HESSIAN], of);
-  free(of);
   return 1;
 }
+
+/* ---- its face ---- */
 
 static int count_x(int k, void *data) { return ((program *)data)->nx[k]; }
 static int count_u(int k, void *data) { return ((program *)data)->nu[k]; }
@@ -224,25 +190,32 @@ EXPORT void stages_option(void *handle, const char *name, int type, double value
   if (type == 2) fatrop_ocp_c_set_option_bool(solver, name, value != 0);
 }
 
-/* Solve; `told`: flag, iterations. */
+/* Solve; `told`: flag, or -1 where it cannot go on; iterations. */
 EXPORT int stages_solve(void *handle, program *s, double *primal, double *dual, int *told) {
   kept *k = handle;
-  int word;
+  int i, word = -1;
   s->solver = k->solver;
-  s->known = s->stopped = 0;
-  word = fatrop_ocp_c_solve(k->solver);
-  memcpy(primal, fatrop_ocp_c_get_primal(k->solver)->pa, sizeof(double) * (size_t)s->primal_first[s->stages]);
-  memcpy(dual, fatrop_ocp_c_get_dual(k->solver)->pa, sizeof(double) * (size_t)s->duals);
-  told[0] = word < 0 ? -1 : fatrop_ocp_c_get_stats(k->solver)->return_flag;
-  told[1] = fatrop_ocp_c_get_stats(k->solver)->iterations_count;
+  s->known = s->factored = s->stopped = s->lost = 0;
+  for (i = 0; i < s->inner_first[s->stages]; ++i)
+    s->before[s->primal_first[s->stages] + i] = s->x[s->inner_variable[i]] / s->a[s->inner_variable[i]];
+  memcpy(primal, s->guess, sizeof(double) * (size_t)s->primal_first[s->stages]);
+  memset(dual, 0, sizeof(double) * (size_t)s->duals);
+  told[1] = 0;
+  if (move(s, primal)) {
+    word = fatrop_ocp_c_solve(k->solver);
+    memcpy(primal, fatrop_ocp_c_get_primal(k->solver)->pa, sizeof(double) * (size_t)s->primal_first[s->stages]);
+    memcpy(dual, fatrop_ocp_c_get_dual(k->solver)->pa, sizeof(double) * (size_t)s->duals);
+    told[1] = fatrop_ocp_c_get_stats(k->solver)->iterations_count;
+  }
+  told[0] = word < 0 || s->lost ? -1 : fatrop_ocp_c_get_stats(k->solver)->return_flag;
   return 0;
 }
 
-/* Cost (scaled) and rows (as they are, in `g`) at some variables. */
-EXPORT void stages_values(program *s, const double *primal, double *cost) {
-  move(s, primal);
+/* Cost (scaled); rows and their multipliers (as they are, in `g` and `lam`) at some variables. */
+EXPORT void stages_values(program *s, const double *primal, const double *dual, double *cost) {
   objective(1.0, primal, 0, 0, cost, 0, s);
-  sum_rows(s);
+  memset(s->lam, 0, sizeof(double) * (size_t)s->rows);
+  if (slopes_at(s, primal)) multipliers(s, 1.0, dual);
 }
 
 EXPORT int stages_option_type(const char *name) { return fatrop_ocp_c_option_type(name); }

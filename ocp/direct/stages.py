@@ -1,14 +1,14 @@
 """A stage-ordered program as a stage-wise solver reads it: where its variables, rows and numbers stand.
 
 Such a solver wants the controls of a stage before its states, and rows x_next = F(x, u) apart from those inside a
-stage. What a stage only copies from the end of its interval is no variable of its own here: the row that defines the
-copy defines the next state.
+stage. What the dynamics inside an interval define, its states at points and at its end, are inner variables: the
+solver never sees them, nor the rows that define them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,95 +20,90 @@ from ocp.problem.formulation import Formulation
 __all__ = ["Entries", "Tables"]
 
 
-@dataclass(frozen=True)
-class Entries:
+class Entries(NamedTuple):
     """Where numbers stand in a matrix of the program: number ``source`` at (``row``, ``column``), each (E,)."""
 
     row: np.ndarray
     column: np.ndarray
     source: np.ndarray
 
+    def select(self, which: np.ndarray) -> Entries:
+        """Those at some places, in their order."""
+        return Entries(*(part[which] for part in self))
+
+    def followed_by(self, others: Entries) -> Entries:
+        """These and others."""
+        return Entries(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+
 
 class Tables:
     """A stage-ordered program as stages: variables in fatrop's order, and where the numbers of its blocks belong.
 
     Attributes:
-        nx, nu: States and controls of each stage. Shape (N + 1,).
-        place: Where each variable of the program stands in fatrop's vector; a copy stands with what it is copied to.
-        own: Which variables are no copies. stage, local: Stage of each, and its place (controls, states) there.
+        nx, nu, nz: States, controls and inner variables of each stage. Shape (N + 1,).
+        place: Where each variable of the program stands in fatrop's vector; -1: an inner one.
+        stage, local: Stage of each, and its place there: controls, states, inner ones.
+        inner, inner_rows: The inner variables, and the rows that define them, stage by stage.
         row_stage: Stage of each row. dynamics: Entry of the next state that a row defines, -1 for other rows.
-            twin: For each row that only copies, the row that takes its part; -1 for others.
-        counts: Numbers of all blocks by kind. jacobian, hessian: Their entries, the constant ones of the Jacobian last.
+        onto: The variable that this is. position: Of each inner row among those of its stage; -1 for others.
+        plain: Whether no block reads an inner variable.
+        counts: Numbers of all blocks by kind. jacobian, hessian: Their entries, the constant ones of the Jacobian last,
+            of the Hessian one triangle; half: of each of these 1, on the diagonal 1/2.
     """
 
     def __init__(self, form: Formulation, fragment: Fragment, functions: Sequence[Derivatives]) -> None:
         assert fragment.stages is not None
         sizes = fragment.stages.states, fragment.stages.controls, fragment.stages.rows
-        states, controls, rows = (np.array(part) for part in sizes)
-        free, zero = (int(form.bounds.places[kind][0]) for kind in ("free", "zero"))
+        states, others, rows = (np.array(part) for part in sizes)
         self.fragment, self.functions = fragment, functions
-        n, m, last = fragment.size, fragment.n_rows, len(states) - 1
-        first = np.concatenate([[0], np.cumsum(states + controls)])
-        self.stage = np.repeat(np.arange(last + 1), states + controls)
+        n, m, stages = fragment.size, fragment.n_rows, len(states)
+        first = np.concatenate([[0], np.cumsum(states + others)])
+        self.stage = np.repeat(np.arange(stages), states + others)
         local = np.arange(n) - first[self.stage]
+        is_state = local < states[self.stage]
         joins = np.append(states[1:], 0)
         row_first = np.concatenate([[0], np.cumsum(joins + rows)])
-        self.row_stage = np.repeat(np.arange(last + 1), joins + rows)
+        self.row_stage = np.repeat(np.arange(stages), joins + rows)
         within = np.arange(m) - row_first[self.row_stage]
         join = within < joins[self.row_stage]
-
-        # what a row copies from: x_next - source = 0
-        at, column, value = fragment.linear
-        minus = join[at] & (value < 0)
-        source, onto = np.full(m, -1), np.full(m, -1)
-        source[at[minus]] = column[minus]
-        onto[at[join[at] & (value > 0)]] = column[join[at] & (value > 0)]
-
-        # a copy that one row defines, with factor one, and that nothing else reads or bounds
-        is_control = local >= states[self.stage]
-        read = np.zeros(n, dtype=bool)
-        for block in fragment.blocks:
-            read[block.variables] = True
-        copied = np.zeros(n, dtype=bool)
-        copied[source[source >= 0]] = True
-        copied &= is_control & ~read & (fragment.variable_bounds == free) & (np.bincount(column, minlength=n) == 2)
-        defines = ~join[at] & (value == 1.0) & copied[column] & (fragment.row_bounds[at] == zero)
-        definer = np.full(n, -1)
-        definer[column[defines]] = at[defines]
-        often = np.bincount(definer[definer >= 0], minlength=m) > 1  # a row defines one copy at most
-        definer[(definer >= 0) & often[definer]] = -1
-        self.own = definer < 0
-
-        self.nx = states
-        self.nu = np.bincount(self.stage[self.own & is_control], minlength=last + 1)
-        self.first = np.concatenate([[0], np.cumsum(self.nx + self.nu)])
-        rank = np.cumsum(self.own & is_control) - 1
-        before = np.concatenate([[0], np.cumsum(self.nu)])[self.stage]
-        self.local = np.where(is_control, rank - before, self.nu[self.stage] + local)
-        self.local[~self.own] = -1
-        self.place = self.first[self.stage] + self.local
         self.dynamics = np.where(join, within, -1)
-        self.twin = np.full(m, -1)
-        copying = np.flatnonzero(source >= 0)
-        gone = copying[~self.own[source[copying]]]
-        by = definer[source[gone]]
-        self.twin[gone], self.dynamics[by], self.dynamics[gone] = by, within[gone], -1
-        # a copy stands with the next state, in its units
-        self.standing = np.arange(n)
-        self.standing[source[gone]] = onto[gone]
-        self.place = self.place[self.standing]
-        self.onto = onto
-        self.onto[by] = onto[gone]
+        self.onto = np.full(m, -1)
+        self.onto[join] = (first[self.row_stage + 1] + within)[join]
+
+        # states inside an interval, and the rows that are zero there
+        inner = (fragment.variable_role == "state") & ~is_state
+        inner_row = ~join & (fragment.row_bounds == form.bounds.places["zero"][0]) & (fragment.row_stages >= 0)
+        self.inner, self.inner_rows = np.flatnonzero(inner), np.flatnonzero(inner_row)
+        self.nx, self.nz = states, self._count(inner)
+        self.nu = others - self.nz
+        if np.any(np.bincount(self.row_stage[inner_row], minlength=stages) != self.nz):
+            raise ProblemError("a stage-ordered program has other rows of its dynamics than states; use ipopt")
+        self.first = np.concatenate([[0], np.cumsum(self.nx + self.nu)])
+        self.position = self._ranks(inner_row, self.row_stage)
+        control = ~is_state & ~inner
+        self.local = np.where(is_state, self.nu[self.stage] + local, self._ranks(control, self.stage))
+        self.local[inner] = (self.nu + self.nx)[self.stage[inner]] + self._ranks(inner, self.stage)[inner]
+        self.place = np.where(inner, -1, self.first[self.stage] + self.local)
+        self.plain = not any(inner[block.variables].any() for block in fragment.blocks)
 
         self._numbers()
         self._check()
 
+    def _count(self, which: np.ndarray) -> np.ndarray:
+        """Variables of some kind of each stage."""
+        return np.bincount(self.stage[which], minlength=self.stage[-1] + 1)
+
+    @staticmethod
+    def _ranks(which: np.ndarray, stage: np.ndarray) -> np.ndarray:
+        """Of those that are meant how many stand before each in its stage; -1 of the others."""
+        before = np.concatenate([[0], np.cumsum(np.bincount(stage[which], minlength=stage[-1] + 1))])
+        return np.where(which, np.cumsum(which) - 1 - before[stage], -1)
+
     def _check(self) -> None:
         """Raise ProblemError where a row or a curvature reaches over stages."""
         row, column = self.jacobian.row, self.jacobian.column
-        ahead = (self.dynamics[row] >= 0) | (self.twin[row] >= 0)
         apart = self.stage[column] - self.row_stage[row]
-        if np.any((apart != 0) & ~(ahead & (apart == 1))) or np.any(
+        if np.any((apart != 0) & ~((self.dynamics[row] >= 0) & (apart == 1))) or np.any(
             self.stage[self.hessian.row] != self.stage[self.hessian.column]
         ):
             raise ProblemError("a stage-ordered program cannot couple stages that are apart; use ipopt")
@@ -138,11 +133,7 @@ class Tables:
         upper = np.concatenate([nothing, *(at[0] for at, _ in hess)])
         lower = np.concatenate([nothing, *(at[1] for at, _ in hess)])
         doubled = np.concatenate([np.zeros(0), *(twice for _, twice in hess)])
-        number = np.arange(upper.size)
-        # both halves; what stands for both its mirror images on the diagonal comes twice
-        mirrored = (upper != lower) | (doubled == 2.0)
-        self.hessian = Entries(
-            np.concatenate([upper, lower[mirrored]]),
-            np.concatenate([lower, upper[mirrored]]),
-            np.concatenate([number, number[mirrored]]),
-        )
+        by_stage = np.argsort(self.stage[upper], kind="stable")
+        self.hessian = Entries(upper, lower, np.arange(upper.size)).select(by_stage)
+        # what stands for both its mirror images on the diagonal comes twice
+        self.half = np.where((upper == lower) & (doubled == 1.0), 0.5, 1.0)[by_stage]
