@@ -15,6 +15,7 @@ from ocp.builders.standing.loads import StepsMotion, steps_motion
 from ocp.builders.standing.plan import plan_standing, plan_steps
 from ocp.builders.standing.postures import standing_posture
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.builders.standing.resolved import resolve_steps
 from ocp.builders.standing.stances import StancePhase, Steps, walk
 from ocp.builders.standing.steps import StepWeights, steps_problem
 from ocp.builders.timing import minimum_time_problem, plan_minimum_time
@@ -103,6 +104,7 @@ __all__ = [
     "refine",
     "resolve",
     "resolve_accelerations",
+    "resolve_steps",
     "roll_problem",
     "solve",
     "spline_targets",

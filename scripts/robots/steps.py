@@ -2,7 +2,8 @@
 
 53 kg on two legs of hip, knee and ankle; its left foot stays while the right one is set forward, then the other way
 round. In balance, its center of mass never leaves the soles that are held, so that it could stop anywhere. Dynamically,
-only the zero moment point stays there: it falls forward from foot to foot, in a fraction of the time.
+only the zero moment point stays there: it falls forward from foot to foot, in a fraction of the time. The pseudo-
+inverse sets the feet as far with the least joint rates; its zero moment point leaves the soles, and the biped falls.
 """
 
 from __future__ import annotations
@@ -18,7 +19,16 @@ from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape
 from models.arrays import Array
 from ocp import Audit, Collocation, Limits, Solution
 from ocp.app.frames import frames_along
-from ocp.builders.standing import StancePhase, Steps, StepsMotion, plan_steps, standing_posture, steps_motion, walk
+from ocp.builders.standing import (
+    StancePhase,
+    Steps,
+    StepsMotion,
+    plan_steps,
+    resolve_steps,
+    standing_posture,
+    steps_motion,
+    walk,
+)
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 
@@ -30,6 +40,7 @@ HEEL = 0.08  # of the ankle above the ground, m
 LENGTH = 0.25  # of a step, m
 FRICTION = 0.6
 MARGIN = 0.01  # m
+CLEARANCE = 0.02  # of a sole in the middle of its way, m
 KINDS: dict[str, dict[str, Any]] = {
     "in balance": {"balance": "static", "margin": 2 * MARGIN, "times": (1.5, 1.5), "color": "orange"},
     "as a whole": {"balance": "dynamic", "margin": MARGIN, "times": (0.5, 0.6), "color": "blue"},
@@ -46,11 +57,13 @@ class StepsExample:
 
     Attributes:
         plans: Audited. motions: What they take. audits: Of each.
+        local: The steps of the dynamic one by the pseudo-inverse.
     """
 
     plans: dict[str, Solution]
     motions: dict[str, StepsMotion]
     audits: dict[str, Audit]
+    local: StepsMotion
 
     @property
     def audit(self) -> Audit:
@@ -72,6 +85,7 @@ class StepsExample:
             "tip_error": None,
             "joint_return_rad": None,
             "audit_passed": all(audit.passed for audit in self.audits.values()),
+            "zmp_margin_local_m": self.local.summary()["zmp_margin_min_m"],
             "zmp_margin_optimal_m": fast["zmp_margin_min_m"],
             "com_margin_optimal_m": fast["com_margin_min_m"],
             "com_margin_static_m": slow["com_margin_min_m"],
@@ -157,10 +171,11 @@ def plan(coarse: bool = False) -> StepsExample:
         steps = planar_steps(2, *kind["times"])
         plans[name] = plan_steps(
             steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
-            method=METHOD,
+            clearance=CLEARANCE, method=METHOD,
         )  # fmt: skip
         motions[name], audits[name] = steps_motion(steps, plans[name]), plans[name].audit()
-    return StepsExample(plans, motions, audits)
+    steps = motions["as a whole"].steps
+    return StepsExample(plans, motions, audits, resolve_steps(steps, bent(steps), clearance=CLEARANCE))
 
 
 def scenes_of(example: StepsExample) -> list[Scene]:
@@ -185,17 +200,19 @@ def scenes_of(example: StepsExample) -> list[Scene]:
 def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None:
     """steps.png and steps.gif."""
     careful, whole = (example.motions[name] for name in KINDS)
-    out = -whole.summary()["com_margin_min_m"]
+    out, fallen = -whole.summary()["com_margin_min_m"], -example.local.summary()["zmp_margin_min_m"]
     title = (
-        f"With its center of mass up to {1000 * out:.0f} mm outside its feet the biped walks in {whole.t[-1]:.1f} s "
-        f"what takes {careful.t[-1]:.1f} s in balance"
+        f"With its center of mass up to {1000 * out:.0f} mm outside its feet a biped walks in {whole.t[-1]:.1f} s "
+        f"instead of {careful.t[-1]:.1f} s"
     )
     note = (
         f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier postures "
         f"pale, disc: zero moment point. In balance, its center of mass stays {2000 * MARGIN:g} mm inside the soles "
         f"that are held; as a whole only the zero moment point does, by {1000 * MARGIN:g} mm. Friction at most "
         f"{FRICTION:g}, torques at most 200 N m, feet land at rest; the durations are given, and both walks are the "
-        "cheapest in theirs by the same weights. Masses and limits are our own; the legs move in one plane and are "
+        "cheapest in theirs by the same weights. Dotted: the same steps in the same time with the least joint rates, "
+        f"by the pseudo-inverse; its zero moment point is up to {1000 * fallen:.0f} mm outside the soles, and in a "
+        "contact simulation it falls. Masses and limits are our own; the legs move in one plane and are "
         "drawn beside each other."
     )
     scenes = scenes_of(example)
@@ -203,6 +220,10 @@ def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None
         for ax, name in zip(axes, KINDS, strict=False):
             _balance(ax, name, example.motions[name])
         axes[0].legend(loc="upper left", fontsize=6.5)
+        local = example.local
+        line = axes[1].plot(local.t, local.zero_moment_point[:, 0], color="black", ls=":", lw=0.9)
+        axes[1].set_ylim(top=0.95)
+        axes[1].legend(line, ["pseudo-inverse"], loc="upper left", fontsize=6.5)
         _loads(axes[2], whole)
     if animation:
         animate(folder / "steps.gif", scenes, frames=44, seconds=0.1, note=note)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +38,7 @@ class StepsMotion:
         margin: Its distance from the edge of the hull of the soles, positive inside; nan with a grip. Shape (M,), m.
         balance: The same of the center of mass. Shape (M,), m.
 
-    Loads besides the first foot's are those planned, the first bears the rest.
+    Loads besides the first foot's are given, those planned say; the first bears the rest.
     """
 
     steps: Steps
@@ -121,6 +121,11 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
         found = sampled(steps, stance, motion, others)
         begin, end = times[name]
         parts.append({"t": begin + (end - begin) * share, "phase": np.full(count, float(k)), **found})
+    return motion_of(steps, parts)
+
+
+def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
+    """The whole of what `sampled` found in the phases, with "t" and "phase"."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def feet(what: str) -> dict[str, Array]:

@@ -20,31 +20,37 @@ from ocp.tasks.checks import checked_numbers
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["first_guess", "hold", "standing_posture"]
+__all__ = ["PLACED", "check_placed", "first_guess", "foot_task", "hold", "standing_posture"]
 
 NEAR = 1.0  # weight of a joint's square distance from where it was, 1/rad^2
 OVER = 300.0  # weight of the center of mass's, 1/m^2: a centimetre as a tenth of a radian and less
 KEPT = 1e-9
 """Gap between a foot and its foothold, m or rad, that a posture may have."""
+PLACED = 1e-6
+"""Gap between a foot and its foothold that a start may have, m or rad."""
 GUESS_STEPS = 40
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
 def hold(stance: Stance, places: dict[str, Foothold]) -> TaskEquations:
     """Equations that hold feet besides the first on footholds: in all directions that the joints can move them."""
-    tasks = []
-    for name, place in places.items():
-        foot = stance.feet[name]
-        tasks.append(
-            TipTask(
-                rows=stance.held_rows[name],
-                position=np.asarray(place.position),
-                orientation=np.asarray(place.rotation) @ np.asarray(foot.rotation).T,
-                link=foot.link,
-                point=foot.translation,
-            )
-        )
+    tasks = [foot_task(stance, name, place.position, place.rotation) for name, place in places.items()]
     return bind(stance, tasks)
+
+
+def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **asked: Any) -> TipTask:
+    """A foot besides the first, its sole's frame at a place, or on a way, in all directions that it can be moved."""
+    foot = stance.feet[name]
+    back = np.asarray(foot.rotation).T
+    turn = (lambda t: ca.mtimes(rotation(t), back)) if callable(rotation) else np.asarray(rotation) @ back
+    return TipTask(
+        rows=stance.held_rows[name],
+        position=position,
+        orientation=turn,
+        link=foot.link,
+        point=foot.translation,
+        **asked,
+    )
 
 
 def standing_posture(stance: Stance, near: Any, over: Any = None) -> Array:
@@ -84,6 +90,21 @@ def standing_posture(stance: Stance, near: Any, over: Any = None) -> Array:
         )
         raise ProblemError(words, name="footholds", value=left, limit=KEPT)
     return np.asarray(np.clip(np.array(found["x"]).ravel(), lower, upper))
+
+
+def check_placed(stance: Stance, joints: Array) -> None:
+    """Raise ProblemError where joints of a start, in the stance's order, have a foot off its foothold."""
+    if not stance.others:
+        return
+    equations = hold(stance, {name: stance.footholds[name] for name in stance.others})
+    found = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
+    gap = float(np.abs(found).max())
+    if gap > PLACED:
+        words = (
+            f"start_joints: a foot is {gap:.3g} (m or rad) away from its foothold; standing_posture(stance, near) "
+            "finds joints that put it there"
+        )
+        raise ProblemError(words, name="start_joints", value=gap, limit=PLACED)
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:

@@ -26,7 +26,7 @@ from models.arrays import Array
 from models.errors import ModelError
 from models.machines.stance import Stance
 from models.robot.indices import joint_limit_index
-from ocp.builders.standing.postures import first_guess, hold
+from ocp.builders.standing.postures import PLACED, check_placed, first_guess, hold
 from ocp.builders.standing.problem import FreeTime
 from ocp.builders.standing.stances import StancePhase, Steps, Swing
 from ocp.builders.standing.start import inside_limits
@@ -39,8 +39,6 @@ from ocp.tasks.limits import Limits
 
 __all__ = ["StepWeights", "steps_problem"]
 
-PLACED = 1e-6
-"""Gap between a foot and its foothold that a start may have, m or rad."""
 GRAZED = 0.01  # share of the clearance that a sole may be below the ground where it lifts and lands
 LIFTED = 1.5  # height of a foot in the middle of its way in the guess, over the clearance
 
@@ -150,16 +148,7 @@ def steps_problem(
 
 def _check_start(stance: Stance, joints: Array, asked: _Asked) -> None:
     """Raise ProblemError where a foot is not on its foothold, or the center of mass not over the support."""
-    if stance.others:
-        equations = hold(stance, {name: stance.footholds[name] for name in stance.others})
-        found = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
-        gap = float(np.abs(found).max())
-        if gap > PLACED:
-            words = (
-                f"start_joints: a foot is {gap:.3g} (m or rad) away from its foothold; standing_posture(stance, near) "
-                "finds joints that put it there"
-            )
-            raise ProblemError(words, name="start_joints", value=gap, limit=PLACED)
+    check_placed(stance, joints)
     if stance.support is not None:
         left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - asked.margin
         if left < -PLACED:

@@ -56,6 +56,7 @@ from ocp import (
     plan_steps,
     resolve,
     resolve_accelerations,
+    resolve_steps,
     roll_problem,
     solve,
     spline_targets,
@@ -641,6 +642,17 @@ STEPS = [
         standing_posture,
         {"stance": STEPPING.stances[0], "near": [0.3, 0.4, 0.5]},
         {"stance": INSTANCE, "near": array(3) | NOTHING, "over": array(2)},
+    ),
+    Case(
+        "resolve_steps",
+        resolve_steps,
+        {"steps": STEPPING, "start_joints": STEPPED["start_joints"], "clearance": 0.02, "samples": 5},
+        {
+            "steps": INSTANCE,
+            "start_joints": array(3) | NOTHING,
+            "clearance": NONNEGATIVE | NOTHING,
+            "samples": COUNT | NOTHING | {"one": 1},
+        },
     ),
     Case(
         "steps_motion",

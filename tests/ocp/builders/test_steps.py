@@ -4,14 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from itertools import pairwise
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
-from ocp import Collocation, Limits, ProblemError, Solution, solve
-from ocp.builders.standing import StancePhase, Steps, StepsMotion, plan_steps, steps_motion, steps_problem, walk
+from ocp import Collocation, Limits, ProblemError, Solution, SolveError, solve
+from ocp.builders.standing import (
+    StancePhase,
+    Steps,
+    StepsMotion,
+    plan_steps,
+    resolve_steps,
+    steps_motion,
+    steps_problem,
+    walk,
+)
 from scripts.robots.steps import bent, planar_biped, planar_feet, planar_steps
 from tests.models.robot.trees import numeric, numeric_poses
 from tests.ocp.builders.bipeds import FRICTION, mirrored, talos_steps
@@ -153,6 +164,56 @@ def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
     assert np.isnan(motion.margin[docked]).all()
     assert np.abs(motion.loads["hand"][docked]).max() > 1.0
     assert not motion.loads["hand"][~docked].any()
+
+
+# ---- by the pseudo-inverse -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", ["planar", pytest.param("talos", marks=pytest.mark.long)])
+def test_the_walk_of_the_pseudo_inverse_keeps_its_feet_on_their_ways_and_falls(robot: str) -> None:
+    """The zero moment point leaves the soles, and the contact simulation falls soon after it did."""
+    steps = planar_steps(2, 0.5, 0.6) if robot == "planar" else talos_steps(2, 0.8, 0.8)
+    clearance = 0.03
+    motion = resolve_steps(steps, bent(steps), clearance=clearance)
+    for name in steps.feet:
+        for k, phase in enumerate(steps.phases):
+            if name in phase.footholds:
+                gap = motion.sole_position[name][motion.phase == k] - np.asarray(phase.footholds[name].position)
+                assert np.abs(gap).max() < 1e-7
+        assert motion.sole_position[name][:, 2].max() == pytest.approx(clearance, abs=1e-7)
+    assert motion.margin.min() < -0.1
+    out = motion.t[np.flatnonzero(motion.margin < 0)[0]]
+    found = replay(motion, FRICTION, planar=robot == "planar")
+    assert found.fell
+    assert out < found.t[-1] < out + 2.0
+
+
+def test_the_walk_of_the_pseudo_inverse_has_the_least_rates_and_loads() -> None:
+    """Of all rates that move the foot as it goes, and of all loads that sum up to what the motion takes."""
+    steps = planar_steps(1, 0.5, 0.6)
+    motion = resolve_steps(steps, bent(steps))
+    stance, inside = steps.stances[1], motion.phase == 1
+    order = steps.order(stance)
+    for q, rates in zip(motion.joints[inside][::25, order], motion.joint_velocities[inside][::25, order], strict=True):
+        symbol = ca.SX.sym("q", len(q))
+        place = stance.sole_frame("right", symbol)
+        pitch = ca.atan2(place.rotation[0, 2], place.rotation[2, 2])
+        rows = ca.vertcat(place.position[0], place.position[2], pitch)
+        jacobian = numeric(ca.Function("J", [symbol], [ca.jacobian(rows, symbol)])(q))
+        np.testing.assert_allclose(np.linalg.pinv(jacobian) @ (jacobian @ rates), rates, atol=1e-8)
+    assert not motion.joint_velocities[motion.phase == 0].any()
+    still = motion.loads["left"][0] + motion.loads["right"][0]
+    assert still[5] == pytest.approx(steps.stances[0].weight)
+    np.testing.assert_allclose(motion.loads["left"][0], motion.loads["right"][0], atol=1e-9)  # side by side
+    chain = (motion.joints, motion.joint_velocities, motion.joint_accelerations)
+    for value, slope in pairwise(part[inside] for part in chain):
+        np.testing.assert_allclose(np.trapezoid(slope, motion.t[inside], axis=0), value[-1] - value[0], atol=2e-3)
+
+
+def test_the_pseudo_inverse_says_in_which_phase_a_leg_is_stretched() -> None:
+    steps = planar_steps(1, 0.5, 0.6, length=2.0)
+    with pytest.raises(SolveError, match="'2 left': the pseudo-inverse breaks down at"):
+        resolve_steps(steps, bent(steps))
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------------
