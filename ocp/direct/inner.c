@@ -30,7 +30,7 @@ typedef struct {
 
 typedef struct {
   int stages, variables, rows, values, slopes, linear, duals;
-  int plain;                     /* no block reads an inner variable */
+  int plain, most;               /* no block reads an inner variable; variables of the largest stage */
   const int *nx, *nu, *nz, *ng, *ni; /* of each stage */
   const int *primal_first, *slack_first, *inner_first, *factors_first, *sensitivity_first; /* where its part begins */
   const int *place;              /* of each variable in fatrop's vector; -1: an inner one */

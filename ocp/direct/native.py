@@ -83,6 +83,7 @@ def library() -> Any:
         ("stages_option_type", number, [ctypes.c_char_p]),
         ("stages_solve", number, [address] * 5),
         ("stages_values", None, [address] * 4),
+        ("stages_curve_upwards", number, [address] * 3),
         ("stages_destroy", None, [address]),
     ):
         function = getattr(made, name)
@@ -102,7 +103,7 @@ class _Program(ctypes.Structure):
     _fields_ = [
         *(
             (name, ctypes.c_int)
-            for name in ("stages", "variables", "rows", "values", "slopes", "linear", "duals", "plain")
+            for name in ("stages", "variables", "rows", "values", "slopes", "linear", "duals", "plain", "most")
         ),
         *(
             (name, ctypes.c_void_p)
@@ -271,7 +272,7 @@ class NativeSolver(_Kept):
         return "NativeSolver"
 
     def stats(self) -> dict[str, Any]:
-        """The word, success and iterations of the last solve."""
+        """The word, success and iterations of the last solve, and whether the cost curves downwards somewhere there."""
         return self._stats
 
     # ---- the parts of the program that stay ----
@@ -306,6 +307,7 @@ class NativeSolver(_Kept):
             values=tables.counts[VALUE],
             slopes=tables.counts[GRADIENT],
             plain=tables.plain,
+            most=int(own.max()),
             nx=self.keep(tables.nx),
             nu=self.keep(tables.nu),
             nz=self.keep(tables.nz),
@@ -429,7 +431,15 @@ class NativeSolver(_Kept):
             raise self._error
         flag, iterations = (int(value) for value in told)
         word = WORDS.get(flag, "Error_In_Step_Computation")
-        self._stats = {"return_status": word, "success": flag == 0, "iter_count": iterations}
+        upwards = flag == 0 and self.library.stages_curve_upwards(
+            ctypes.byref(program), primal.ctypes.data, dual.ctypes.data
+        )
+        self._stats = {
+            "return_status": word,
+            "success": flag == 0,
+            "iter_count": iterations,
+            "regularised": flag == 0 and not upwards,
+        }
         return {"x": self._x / a, "f": np.array(cost.value), "g": self._g[:m] / b, "lam_g": self._lam[:m] * b}
 
 

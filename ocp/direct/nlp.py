@@ -259,7 +259,9 @@ def tell(words: str) -> None:
 
 
 def regularised(stats: dict[str, Any]) -> bool:
-    """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
+    """Whether ipopt changed the Hessian in its last step, or made no step; native looks, and fatrop does not tell."""
+    if "regularised" in stats:
+        return bool(stats["regularised"])
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 

@@ -24,7 +24,7 @@ from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, later, names_told
-from ocp.direct.kkt import curves_upwards, held_by
+from ocp.direct.kkt import held_by
 from ocp.direct.known import Known
 from ocp.direct.native import NativeSolver, why_not
 from ocp.direct.nlp import (
@@ -387,9 +387,7 @@ class Prepared:
         outcome = first.outcome
         out_of_time = outcome.status.startswith(OUT_OF_TIME)
         asked = "max_iter" in self._own_options and outcome.status.startswith("Maximum_Iterations_Exceeded")
-        if outcome.status == "Solve_Succeeded":
-            return first.with_curvature(not curves_upwards(self.program, outcome, first.arguments, first.scales))
-        if out_of_time or asked:
+        if outcome.status == "Solve_Succeeded" or out_of_time or asked:
             return first
         second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
         return second if second.found is not None or first.found is None else first
@@ -608,12 +606,6 @@ class Attempt:
     def is_final(self) -> bool:
         """Whether no other start is to be tried: it succeeded, or there is no time left."""
         return self.found is not None or self.outcome.status.startswith(OUT_OF_TIME)
-
-    def with_curvature(self, regularised: bool) -> Attempt:
-        """The same, and whether the cost does not curve upwards there."""
-        outcome = dataclasses.replace(self.outcome, regularised=regularised)
-        found = None if self.solution is None else dataclasses.replace(self.solution, regularised=regularised)
-        return dataclasses.replace(self, outcome=outcome, solution=found)
 
     @property
     def is_broken(self) -> bool:
