@@ -24,7 +24,7 @@ from typing import Any, TypedDict, Unpack
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Thruster, wheels_of
+from models import FreeFloating, Thruster, center_of_mass, wheels_of
 from models.arrays import Array
 from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
@@ -86,7 +86,8 @@ def capture_problem(
     """Approach, grasp and detumbling at the least effort of both together.
 
     Phases "approach" and "detumble", with the states and controls of `dynamics_problem`; the configuration of the
-    target is the state "target" of the first, and follows from that of the chaser in the second.
+    target is the state "target" of the first, and follows from that of the chaser in the second. Angles of wheels are
+    counted from the start of each phase.
 
     Args:
         chaser: With its arm, and wheels among its joints (`models.with_wheels`); its momentum is that at the start.
@@ -115,12 +116,19 @@ def capture_problem(
     given.guess_approach(begin)
     guess_braking(after, given.pair, *_end_of(begin))
     problem = Phases("capture", {APPROACH: begin, DETUMBLE: after})
-    momentum = {}
+    one, other = problem[APPROACH], problem[DETUMBLE]
+    end = {name: one.at_end(name) for name in ("base", "target", "joints")}
+    base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
+    begins = {"joints": ca.DM(given.arm) * end["joints"]}
     if given.thrusters:
-        one = problem[APPROACH]
-        states = [one.at_end(name) for name in ("base", "target", "joints", "momentum")]
-        momentum = {"momentum": pair_momentum(chaser, target, *states)}
-    problem.join(APPROACH, DETUMBLE, momentum)
+        base = ca.vertcat(base, one.at_end("momentum"))
+        begins["momentum"] = pair_momentum(
+            chaser, target, end["base"], end["target"], end["joints"], one.at_end("momentum")
+        )
+    else:
+        begins["base"] = given.base_after(end["base"], end["joints"], one.duration)
+    problem.join(APPROACH, DETUMBLE, begins)
+    given.grasp(problem, base, joints, rates, end["target"])
     return problem
 
 
@@ -188,13 +196,13 @@ def chained_capture(
 
     def first(clear: Clear | None) -> Problem:
         problem = replace(given, asked={**given.asked, "clear": clear}).approach(approach)
+        given.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
         given.guess_approach(problem)
         return problem
 
     one = within_limits(first, asked.get("clear"), mesh, (), options, tolerances, {"": (chaser, limits)})
     end = dict(one.at_fraction(1.0))
-    turning = np.isin(chaser.robot.joint_names, list(wheels_of(chaser.robot)))
-    end["joints"] = np.where(turning, 0.0, end["joints"])  # wheels wind on; their angles do not matter
+    end["joints"] = given.arm * end["joints"]
     end["base"] = _of_unit_length(chaser, end["base"])
 
     def second(_: Clear | None) -> Problem:
@@ -237,6 +245,12 @@ class _Capture:
         return cls(chaser, target, pair, joints, base, there, thrusters, asked)
 
     @property
+    def arm(self) -> Array:
+        """1 of joints, 0 of wheels, whose angles do not matter: each phase counts them from zero. Shape (n,)."""
+        wheels = wheels_of(self.chaser.robot)
+        return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
+
+    @property
     def shared(self) -> dict[str, Any]:
         """Options of both phases."""
         asked: Mapping[str, Any] = self.asked
@@ -250,21 +264,14 @@ class _Capture:
             chaser, self.joints, duration, start_base=self.base, end="free", clear=asked.get("clear"),
             start="rest" if start is None else start, **self.shared,
         )  # fmt: skip
-        base, joints, rates = motion_of(problem)
+        base, joints, _ = motion_of(problem)
         none = ca.DM(0, 1)
         goal = problem.state(
             "target", target.base_size, initial=self.target_base, guess=self.target_base, unit="m, rad"
         )
         problem.dynamics(goal, target.base_rate(goal, none, none))
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
-        turned = ca.mtimes(grasped.rotation.T, tip.rotation)
-        half = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]) / 2
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        rows = chaser.twist_rows
-        problem.end("grasp pose", ca.vertcat(half, place)[rows], 0.0, 0.0, unit="rad, m")
-        problem.end("grasp side", ca.trace(turned), lower=1.0)  # and not half a turn off
-        twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
-        problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
         cone, near = asked.get("cone"), asked.get("clearance")
         if cone is not None:
             self._require_inside(cone)
@@ -309,6 +316,33 @@ class _Capture:
             angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
             problem.end("base turns", pair.base_twist(*motion_of(problem))[angular], 0.0, 0.0, unit="rad/s")
         return problem
+
+    def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
+        """The tip of a chaser in some state on the frame that is grasped, with the same twist, when a problem ends."""
+        chaser, target, none = self.chaser, self.target, ca.DM(0, 1)
+        tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
+        turned = ca.mtimes(grasped.rotation.T, tip.rotation)
+        half = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]) / 2
+        place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
+        rows = chaser.twist_rows
+        problem.end("grasp pose", ca.vertcat(half, place)[rows], 0.0, 0.0, unit="rad, m")
+        problem.end("grasp side", ca.trace(turned), lower=1.0)  # and not half a turn off
+        twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
+        problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
+
+    def base_after(self, base: Any, joints: Any, time: Any) -> Any:
+        """The base at a time by its attitude and the joints alone: nothing pushes the chaser's centre of mass.
+
+        A plan keeps that, and the length of a quaternion, up to its own error. Told once more at the grasp, they would
+        be conditions that no control moves, but for that error, and beside which no curvature is decided.
+        """
+        chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
+        attitude = base[size:] if chaser.base == "planar" else base[size:] / ca.norm_2(base[size:])
+        there = chaser.world_from_base(ca.vertcat(ca.DM(size, 1), attitude))
+        begin = center_of_mass(chaser.robot, ca.DM(self.joints), chaser.world_from_base(ca.DM(self.base)))
+        drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
+        place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
+        return ca.vertcat(place, attitude)
 
     def pair_after(self, end: Mapping[str, Array]) -> FreeFloating:
         """Both as one machine, with their momentum after an approach."""

@@ -457,7 +457,7 @@ class Sampler:
             inner = ca.Function("inner", symbols, [found], {"cse": True})
             packed = ca.MX.sym("packed", sum(self._inputs))
             found = inner(*ca.vertsplit(packed, np.cumsum([0, *self._inputs]).tolist()))
-        self._function = ca.Function("sampled", [packed], [found], {"cse": True})
+        self._function = ca.Function("sampled", [packed], [found])
         self._filled = np.array(self._function.sparsity_out(0).row(), dtype=int)  # CasADi drops constants that are zero
         self._maps: dict[int, Any] = {}
 
