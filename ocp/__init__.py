@@ -29,7 +29,17 @@ from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.local.laws import Layer, Stabiliser
 from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
-from ocp.planning import Candidate, DeadEnd, Plan, WaypointPlan, plan, plan_waypoints
+from ocp.planning import (
+    Candidate,
+    DeadEnd,
+    Plan,
+    PlanInPieces,
+    Reconfiguration,
+    WaypointPlan,
+    plan,
+    plan_in_pieces,
+    plan_waypoints,
+)
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
@@ -67,8 +77,10 @@ __all__ = [
     "Phases",
     "Pinned",
     "Plan",
+    "PlanInPieces",
     "Problem",
     "ProblemError",
+    "Reconfiguration",
     "RefinementWarning",
     "Sensitivity",
     "Solution",
@@ -95,6 +107,7 @@ __all__ = [
     "plan",
     "plan_capture",
     "plan_dynamics",
+    "plan_in_pieces",
     "plan_minimum_time",
     "plan_minimum_velocity",
     "plan_standing",

@@ -2,7 +2,19 @@
 
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.motion import Candidate, Plan, PlanSample
+from ocp.planning.piecewise import PlanInPieces, Reconfiguration, plan_in_pieces
 from ocp.planning.planner import plan
 from ocp.planning.waypoints import WaypointPlan, plan_waypoints
 
-__all__ = ["Candidate", "DeadEnd", "Plan", "PlanSample", "WaypointPlan", "plan", "plan_waypoints"]
+__all__ = [
+    "Candidate",
+    "DeadEnd",
+    "Plan",
+    "PlanInPieces",
+    "PlanSample",
+    "Reconfiguration",
+    "WaypointPlan",
+    "plan",
+    "plan_in_pieces",
+    "plan_waypoints",
+]

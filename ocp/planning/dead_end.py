@@ -101,11 +101,13 @@ class DeadEnd(SolveError):
             there in any attitude, of the joint whose limit stops most, where it is, and that limit, else "task".
         stops: What stops motions there, each where it does so by the least, the least first.
         gives: Motions that would do if the task gave way, the least that was found of each kind.
+        pieces: In how few pieces it may be done, see `plan_in_pieces`; None where that is not known.
     """
 
     until: float
     stops: tuple[Stop, ...]
     gives: tuple[Give, ...]
+    pieces: int | None
 
     def __init__(
         self,
@@ -113,22 +115,24 @@ class DeadEnd(SolveError):
         until: float = np.nan,
         stops: tuple[Stop, ...] = (),
         gives: tuple[Give, ...] = (),
+        pieces: int | None = None,
         **details: Any,
     ) -> None:
         super().__init__(words, **details)
-        self.until, self.stops, self.gives = until, stops, gives
+        self.until, self.stops, self.gives, self.pieces = until, stops, gives, pieces
 
     def __reduce__(self) -> Any:
         """Pickled with what it is made from, and with its fields."""
-        return type(self), (*self.args, self.until, self.stops, self.gives), self.__dict__
+        return type(self), (*self.args, self.until, self.stops, self.gives, self.pieces), self.__dict__
 
 
-def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True) -> DeadEnd | None:
+def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True, pieces: int | None = None) -> DeadEnd | None:
     """Where the motions of a search end; None where one comes through.
 
     Args:
         unit: How its times are told.
         proven: Whether the search shows that there is none, under its assumptions.
+        pieces: As of `DeadEnd`.
     """
     front = _Walk(search)
     last = front.last
@@ -152,8 +156,11 @@ def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True) -> Dea
     words = f"{first}: {where}; {'; '.join(map(str, stops[:TRIED]))}"
     if gives:
         words += f"; one does if {', or '.join(map(str, gives))}"
+    if pieces is not None:
+        many = "a reconfiguration" if pieces == 2 else f"{pieces - 1} reconfigurations"
+        words += f"; with {many} on the way one may: plan_in_pieces"
     told = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": float(search.times[max(last, 0)])}
-    return DeadEnd(words, float(search.times[last + 1]), tuple(stops), tuple(gives), **told)
+    return DeadEnd(words, float(search.times[last + 1]), tuple(stops), tuple(gives), pieces, **told)
 
 
 class _Walk:

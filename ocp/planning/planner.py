@@ -45,7 +45,7 @@ from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["SearchKind", "plan"]
+__all__ = ["SearchKind", "checked_asked", "clear_of", "plan", "planned"]
 
 SearchKind: TypeAlias = Literal["start", "postures", "global"]
 
@@ -115,7 +115,8 @@ def plan(
         ProblemError: What is asked does not fit the machine, or cannot be asked at once; Unreachable, which is one,
             names the time and the place that is out of reach.
         SolveError: No motion passes its audit; says what became of each posture. DeadEnd, which is one: the search over
-            all motions says from where on none goes on, what stops it, and how far the tasks would have to give way.
+            all motions says from where on none goes on, what stops it, and how far the tasks would have to give way, or
+            in how few pieces they may be done (`plan_in_pieces`).
     """
     if isinstance(machine, Standing):
         return plan_to_stand(
@@ -130,8 +131,17 @@ def plan(
             seed=seed,
             clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits),
         )
-    asked = _checked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
+    asked = checked_asked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
     asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits))
+    return planned(asked, search, limits)
+
+
+def planned(asked: Asked, search: SearchKind, limits: Limits | None) -> Plan:
+    """As `plan`, of what is asked, under the `limits` that it was given.
+
+    Raises:
+        ProblemError, SolveError: As `plan`.
+    """
     maker, made = _planned(asked, search)
     if limits is None or not limits_drives(limits):
         return made
@@ -268,7 +278,7 @@ def _empty(value: Any) -> bool:
     return value is None or (isinstance(value, tuple | list) and not len(value))
 
 
-def _checked(
+def checked_asked(
     machine: Machine,
     tasks: Any,
     horizon: Any,
@@ -281,6 +291,11 @@ def _checked(
     seed: Any,
     time_cost: Any,
 ) -> Asked:
+    """What `plan` is asked, but for what has to be clear.
+
+    Raises:
+        ProblemError: As `plan`.
+    """
     checked_choice("search", search, get_args(SearchKind))
     checked_flag("cyclic", cyclic)
     checked_count("seed", seed, 0, LARGEST_SEED)

@@ -1,14 +1,16 @@
 """Ways with the fewest reconfigurations: in how few pieces motions come through all instants, and which are cheapest.
 
-Where no motion goes on the arm has to leave the way, and to come back to the next instant in any posture that does the
-task there. What can be done in one piece can be done from a later instant on, too, and until an earlier one; so pieces
-that each go as far as they can are the fewest, and those followed back from the end tell how early each may begin. Of
-all places between, the cheapest are found best first: pieces cost at least what values on charts say, and are searched
-one by one until none that is left can be cheaper. Fewest first, then cheapest, as of IKLink (Wang and others 2024).
+Where no motion goes on the arm has to leave the way, and to come back to it in any posture that does the task there: to
+the next instant, where the instants are all there is, or to that which it left, where they stand for a time that runs
+on. What can be done in one piece can be done from a later instant on, too, and until an earlier one; so pieces that
+each go as far as they can are the fewest, and those followed back from the end tell how early each may begin. Of all
+places between, the cheapest are found best first: pieces cost at least what values on charts say, and are searched one
+by one until none that is left can be cheaper. Fewest first, then cheapest, as of IKLink (Wang and others 2024).
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +18,10 @@ import numpy as np
 from models.arrays import Array
 from ocp.planning.search import Search
 
-__all__ = ["Piece", "fewest_pieces"]
+__all__ = ["Piece", "Span", "farthest", "fewest_pieces"]
+
+Span = tuple[int, int]
+"""First and last instant of a piece."""
 
 SEARCHED = 40
 """Pieces at most: beyond that the best that is known is taken, and the bound stays what it is."""
@@ -39,43 +44,69 @@ class Piece(NamedTuple):
     bound: float
 
 
-def fewest_pieces(search: Search) -> tuple[list[Piece], float] | None:
+def fewest_pieces(search: Search, gap: int = 1, barred: Collection[Span] = ()) -> tuple[list[Piece], float] | None:
     """The cheapest of the fewest pieces through all instants, one after the other, and what none cost less than.
 
+    Args:
+        gap: From the last instant of a piece to the first of the next: 1; or 0, of instants of a time that runs on.
+        barred: What is known not to be done in one piece, nor is what it is a part of.
+
     Returns:
-        None where some instant has no posture that is found, in a piece of its own.
+        None where nothing goes on somewhere: with a gap where an instant has no posture that is found, in a piece of
+        its own.
     """
     last = len(search.times) - 1
-    ends, starts = list[int](), list[int]()
-    while not ends or ends[-1] < last:
-        end = _farthest(search, ends[-1] + 1 if ends else 0)
-        if end is None:
-            return None
-        ends.append(end)
+    ends, starts = farthest(search, gap, barred), list[int]()
+    if not ends or ends[-1] < last:
+        return None
     while not starts or starts[-1] > 0:
-        start = _farthest(search, starts[-1] - 1 if starts else last, back=True)
+        start = _farthest(search, starts[-1] - gap if starts else last, barred, back=True)
         if start is None or len(starts) > len(ends):
             return None
         starts.append(start)
     # where each piece may begin and end; the other way round fewer could only have been missed
-    first = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + 1 for end in ends[:-1])]
-    begins = [range(first[m], (ends[m - 1] + 1 if m else 0) + 1) for m in range(len(ends))]
-    stops = [range(begins[m + 1][0] - 1, ends[m] + 1) for m in range(len(ends) - 1)] + [range(last, last + 1)]
-    least = _bounds(search, begins, stops)
-    known = dict[tuple[int, int], Piece | None]()
+    first = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + gap for end in ends[:-1])]
+    begins = [range(first[m], (ends[m - 1] + gap if m else 0) + 1) for m in range(len(ends))]
+    stops = [range(begins[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)] + [range(last, last + 1)]
+    least = {span: cost for span, cost in _bounds(search, begins, stops).items() if not _without(span, gap, barred)}
+    known = dict[Span, Piece | None]()
     for _ in range(SEARCHED):
-        chain, total = _cheapest(begins, stops, {**least, **{key: _cost(one) for key, one in known.items()}})
-        found = _cheapest(begins, stops, {key: _cost(one) for key, one in known.items()})[1]
+        chain, total = _cheapest(begins, stops, gap, {**least, **{key: _cost(one) for key, one in known.items()}})
+        found = _cheapest(begins, stops, gap, {key: _cost(one) for key, one in known.items()})[1]
         missing = [key for key in chain if key not in known]
         if not missing or total >= (1 - NEAR) * found:
             break
         for key in missing:
             known[key] = _piece(search, *key)
-    chain, total = _cheapest(begins, stops, {key: _cost(one) for key, one in known.items()})
+    chain, total = _cheapest(begins, stops, gap, {key: _cost(one) for key, one in known.items()})
     if not np.isfinite(total):
         return None
     told = {key: (np.inf if one is None else one.bound) for key, one in known.items()}
-    return [one for key in chain if (one := known[key]) is not None], _cheapest(begins, stops, {**least, **told})[1]
+    bound = _cheapest(begins, stops, gap, {**least, **told})[1]
+    return [one for key in chain if (one := known[key]) is not None], bound
+
+
+def farthest(search: Search, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False) -> list[int]:
+    """The last instants of pieces that each go as far as they can: the last of all, or where nothing goes on.
+
+    Args:
+        gap, barred: As of `fewest_pieces`.
+        ruled_out: Whether a piece ends only where the search shows that no motion goes on, under its assumptions;
+            else where it finds none. So none are fewer.
+    """
+    last, ends = len(search.times) - 1, list[int]()
+    while not ends or ends[-1] < last:
+        start = ends[-1] + gap if ends else 0
+        end = _farthest(search, start, barred, ruled_out=ruled_out)
+        if end is None or (end == start and not gap and last):
+            break
+        ends.append(end)
+    return ends
+
+
+def _without(span: Span, gap: int, barred: Collection[Span]) -> bool:
+    """Whether there is no such piece: it goes nowhere, or a part of it is barred."""
+    return (span[0] == span[1] and not gap) or any(span[0] <= one[0] and one[1] <= span[1] for one in barred)
 
 
 def _cost(piece: Piece | None) -> float:
@@ -89,11 +120,17 @@ def _piece(search: Search, first: int, last: int) -> Piece | None:
     return None if joints is None else Piece(first, last, joints, part.steps(joints), bound)
 
 
-def _farthest(search: Search, start: int, back: bool = False) -> int | None:
+def _farthest(
+    search: Search, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
+) -> int | None:
     """The last instant, or the first one, that motions from one lead to; None where not even that one is kept."""
 
     def leads(other: int) -> bool:
-        return search.part(min(start, other), max(start, other)).first(np.inf)[1] is not None
+        span = min(start, other), max(start, other)
+        if _without(span, 1, barred):
+            return False
+        layers, path = search.part(*span).first(np.inf)
+        return bool(layers) if ruled_out else path is not None
 
     way = -1 if back else 1
     most = (start if back else len(search.times) - 1 - start) if len(search.times) > 1 else 0
@@ -110,9 +147,9 @@ def _farthest(search: Search, start: int, back: bool = False) -> int | None:
     return None if good < 0 else start + way * good
 
 
-def _bounds(search: Search, begins: list[range], stops: list[range]) -> dict[tuple[int, int], float]:
+def _bounds(search: Search, begins: list[range], stops: list[range]) -> dict[Span, float]:
     """What pieces cost at least, by their first and last instants; those that cannot be left out."""
-    found = dict[tuple[int, int], float]()
+    found = dict[Span, float]()
     for own, ends in zip(begins, stops, strict=True):
         if len(ends) == 1:  # from the end
             graph = search.part(own[0], ends[0]).whole_graph()
@@ -126,19 +163,17 @@ def _bounds(search: Search, begins: list[range], stops: list[range]) -> dict[tup
     return found
 
 
-def _cheapest(
-    begins: list[range], stops: list[range], costs: dict[tuple[int, int], float]
-) -> tuple[list[tuple[int, int]], float]:
+def _cheapest(begins: list[range], stops: list[range], gap: int, costs: dict[Span, float]) -> tuple[list[Span], float]:
     """The chain of pieces of least cost, and that cost; none and inf where there is no chain."""
-    best: dict[int, tuple[float, list[tuple[int, int]]]] = {begins[0][0]: (0.0, [])}
+    best: dict[int, tuple[float, list[Span]]] = {begins[0][0]: (0.0, [])}
     for own, ends in zip(begins, stops, strict=True):
-        after: dict[int, tuple[float, list[tuple[int, int]]]] = {}
+        after: dict[int, tuple[float, list[Span]]] = {}
         for first in own:
             for last in ends:
                 if first in best and np.isfinite(cost := costs.get((first, last), np.inf)):
                     total = best[first][0] + cost
-                    if total < after.get(last + 1, (np.inf,))[0]:
-                        after[last + 1] = total, [*best[first][1], (first, last)]
+                    if total < after.get(last + gap, (np.inf,))[0]:
+                        after[last + gap] = total, [*best[first][1], (first, last)]
         best = after
     total, chain = min(best.values(), key=lambda one: one[0], default=(np.inf, []))
     return chain, total

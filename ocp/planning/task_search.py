@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.errors import ProblemError
@@ -14,6 +16,7 @@ from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import DeadEnd, dead_end
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.planning.reconfigurations import farthest, fewest_pieces
 from ocp.planning.search import FREE, GAPS, Search
 from ocp.planning.steps import Squares
 from ocp.tasks.equations import TaskEquations
@@ -28,6 +31,8 @@ TIGHT, AT_LIMIT = 0.9, 1e-3
 """Share of its greatest speed, and rad or m from the limit of its position, where a joint has hardly any room."""
 CLOSEST = 1e-3
 """Share of the horizon: instants do not come closer."""
+CUT = 4
+"""Parts of a step between two instants where pieces of a motion end that might have to be fewer."""
 TOLD = 64
 """Times of the motions that are told, beside the breaks of the tasks."""
 
@@ -77,10 +82,21 @@ class TaskSearch:
             steps = int(np.ceil(INSTANTS * stretch.duration / asked.horizon))
             own = instants_of(part.t, part.joints[best], asked.weights, GAPS[max(size, 0)] / 3, steps)
             times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
+        if not times:
+            words = f"the tasks have no part of {asked.horizon:g} s: the horizon is that much longer"
+            raise ProblemError(words, name="horizon", value=asked.horizon)
         self._look(times)
 
     def _look(self, times: list[Array]) -> None:
         """Search the postures at the times of each stretch that has tasks."""
+        self._place(times)
+        self._best, bound = self._search.best(self._known)
+        self.bound = max(self.bound, bound)  # of fewer instants it holds as well
+        if self._best is not None:
+            self._known = max(self._known, self._search.steps(self._best))
+
+    def _place(self, times: list[Array]) -> None:
+        """Cover the postures at the times of each stretch that has tasks."""
         asked, instants = self.asked, list[Instant]()
         for equations, own in zip(self._equations, times, strict=True):
             targets = np.array(equations.target_function().map(len(own))(own[None, :])).T
@@ -91,10 +107,6 @@ class TaskSearch:
         limits = asked.bounds.velocity * np.diff(self.times)[:, None]
         told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "surroundings": clear}
         self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
-        self._best, bound = self._search.best(self._known)
-        self.bound = max(self.bound, bound)  # of fewer instants it holds as well
-        if self._best is not None:
-            self._known = max(self._known, self._search.steps(self._best))
 
     @property
     def _equations(self) -> list[TaskEquations]:
@@ -102,7 +114,48 @@ class TaskSearch:
 
     def dead_end(self) -> DeadEnd | None:
         """Where motions end, and why; None where one does not."""
-        return dead_end(self._search, proven=not np.isfinite(self.bound)) if self._best is None else None
+        if self._best is not None:
+            return None
+        ends = farthest(self._search, 0)
+        through = len(ends) > 1 and ends[-1] == len(self.times) - 1
+        return dead_end(self._search, proven=not np.isfinite(self.bound), pieces=len(ends) if through else None)
+
+    def pieces(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
+        """Begin and end of pieces in which motions do the tasks, the cheapest of the fewest, and how few any are.
+
+        Args:
+            barred: What is known not to be done in one piece, from and until which of the instants, s.
+
+        Returns:
+            None where nothing goes on somewhere, however the tasks are cut.
+        """
+        while True:
+            spans = [(int(first), int(last)) for first, last in np.searchsorted(self.times, [*barred]).tolist()]
+            ends, last = farthest(self._search, 0, spans), len(self.times) - 1
+            through = bool(ends) and ends[-1] == last
+            # a piece of any motion ends between two instants, and the next one begins there
+            least = len(farthest(self._search, ruled_out=True))
+            if not through or len(ends) > least:
+                wide = [end for end in ends if end < last and self._wide[end]]
+                if wide:
+                    inside = (np.arange(1, CUT) / CUT)[:, None]
+                    closer = self.times[wide] + inside * np.diff(self.times)[wide]
+                    self._place(self._closer(closer.ravel()))
+                    continue
+            found = fewest_pieces(self._search, 0, spans) if through else None
+            if found is None:
+                return None
+            times = self.times.tolist()
+            return [(times[piece.first], times[piece.last]) for piece in found[0]], least
+
+    @property
+    def _wide(self) -> NDArray[np.bool_]:
+        """Between which instants others can be put."""
+        return np.asarray(np.diff(self.times) > CLOSEST * self.asked.horizon)
+
+    def _closer(self, times: Array) -> list[Array]:
+        """The instants of each stretch with others between them."""
+        return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._parts]
 
     def looked_closer(self) -> bool:
         """Search again with instants between those at which the best motion has hardly any room; False where it has."""
@@ -111,11 +164,10 @@ class TaskSearch:
         bounds, steps = self.asked.bounds, np.abs(np.diff(self._best, axis=0))
         at_limit = np.minimum(self._best - bounds.lower, bounds.upper - self._best).min(axis=1) < AT_LIMIT
         tight = (steps >= TIGHT * self._search.limits).any(axis=1) | at_limit[1:] | at_limit[:-1]
-        tight &= np.diff(self.times) > CLOSEST * self.asked.horizon
+        tight &= self._wide
         if not tight.any():
             return False
-        middles = (self.times[:-1] + self.times[1:])[tight] / 2
-        self._look([np.union1d(own, middles[(middles > own[0]) & (middles < own[-1])]) for own in self._parts])
+        self._look(self._closer((self.times[:-1] + self.times[1:])[tight] / 2))
         return True
 
     def _seeds(self, k: int) -> Array:

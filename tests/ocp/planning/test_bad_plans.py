@@ -15,7 +15,7 @@ import pytest
 from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
 from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.files import log_rerun, write_mcap
-from ocp.planning import Plan, plan, plan_waypoints
+from ocp.planning import Plan, plan, plan_in_pieces, plan_waypoints
 from ocp.schedule import LineLimits, schedule
 from ocp.tasks.tracks import along
 from tests.bad_values import (
@@ -86,6 +86,24 @@ CASES = [
             "search": CHOICE,
             "seed": WHOLE,
             "time_cost": POSITIVE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case(
+        "plan_in_pieces",
+        plan_in_pieces,
+        {"machine": ARM, "tasks": GOOD, "start": START, "clearance": None},
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
+            "horizon": but(POSITIVE, "word") | {"word": "a", "free": "free", "too short": 0.1},
+            "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
+            "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
+            "limits": but(INSTANCE, "None") | {"class": Limits, "too many": Limits(velocity=[1.0, 2.0])},
+            "seed": WHOLE,
             "obstacles": SEQUENCE | {"array": np.ones(3)},
             "clearance": but(NONNEGATIVE, "None"),
             "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},

@@ -14,7 +14,7 @@ from models.papers import paper_example
 from ocp import Plan, TipTask, Unreachable, plan
 from ocp.planning.cells import CellSearch
 from ocp.planning.dead_end import DeadEnd
-from ocp.planning.planner import _checked
+from ocp.planning.planner import checked_asked
 from ocp.tasks.equations import task_errors
 from tests.sweep.passages import passage, planned
 
@@ -96,7 +96,7 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
     way = np.array([-0.5, -0.5, 0.0])
     place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(way), rows=[3, 4], duration=4.0)
     task = TipTask(velocity=way[:2], rows=[3, 4], duration=4.0) if told == "velocity" else place
-    asked = _checked(machine, task, None, START, None, False, None, None, "global", 0, 1.0)
+    asked = checked_asked(machine, task, None, START, None, False, None, None, "global", 0, 1.0)
     b, q, u = (ca.SX.sym(name, 3) for name in "bqu")
     center = ca.Function("center", [b, q], [center_of_mass(machine.robot, q, machine.world_from_base(b))])
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])

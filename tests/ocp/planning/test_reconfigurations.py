@@ -17,7 +17,7 @@ from models.robot.rebuild import locked
 from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
 from ocp.local.closed_forms import closed_forms
 from ocp.planning.charts import Instant, JointSpace, SelfMotions
-from ocp.planning.reconfigurations import fewest_pieces
+from ocp.planning.reconfigurations import farthest, fewest_pieces
 from ocp.planning.search import Search
 from ocp.planning.steps import Length
 from ocp.tasks.equations import bind
@@ -30,13 +30,18 @@ COUNT = 9
 TURN = 2 * np.pi
 
 
-def fewest(nodes: list[Array], step: Any) -> tuple[int, float]:
-    """The fewest reconfigurations, and the least length with these, over all sequences of nodes, the first first."""
+def fewest(nodes: list[Array], step: Any, gap: int = 1) -> tuple[int, float]:
+    """The fewest reconfigurations, and the least length with these, over all sequences of nodes, the first first.
+
+    They lead to the next instant, or, without a gap, to another posture of the same one.
+    """
     best = [(0, 0.0)] * len(nodes[0])
     for here, there in pairwise(nodes):
         ways = np.abs(there[:, None] - here)
         near, length = (ways <= step).all(axis=2), ways.sum(axis=2)
         jump = (min(best)[0] + 1, min(best)[1])
+        if not gap:
+            best, jump = [min(one, jump) for one in best], (10**6, np.inf)
         counts, lengths = (np.array(part) for part in zip(*best, strict=True))
         after = []
         for row, own in zip(near, length, strict=True):
@@ -114,8 +119,12 @@ def search_of(seed: int) -> tuple[Search, list[Array], Array]:
     machine = planar(lengths, limit)
     poses = [machine.tip_pose((), rng.uniform(-limit, limit, 3)) for _ in range(2)]
     ends = np.array([np.array(ca.DM(pose.position)).ravel() for pose in poses])
-    s = np.linspace(0, 1, COUNT)[:, None]
-    places = ends[0, :2] + s * (ends[1, :2] - ends[0, :2])
+    places = np.linspace(ends[0, :2], ends[1, :2], COUNT)
+    return searched(machine, places, 0.3), [reached(lengths, place, limit, 700) for place in places], np.full(3, 0.3)
+
+
+def searched(machine: FixedBase, places: Array, step: float) -> Search:
+    """Of ways of three joints through places in a plane."""
     space = JointSpace(machine, machine.robot.lower, machine.robot.upper, np.ones(3))
     sets = SelfMotions(
         space,
@@ -127,10 +136,34 @@ def search_of(seed: int) -> tuple[Search, list[Array], Array]:
         task = TipTask(position=[*places[k]], rows=[3, 4])
         return np.array([one.joints for one in inverse_kinematics(machine, task, starts=16, seed=k)])
 
-    far = np.repeat(np.full((1, 3), 0.3), COUNT - 1, axis=0)
-    instants = [Instant(sets, k) for k in range(COUNT)]
-    search = Search(space, instants, np.linspace(0, 1, COUNT), Length(np.ones(3)), far, seeds=seeds)
-    return search, [reached(lengths, place, limit, 700) for place in places], far[0]
+    far = np.full((len(places) - 1, 3), step)
+    instants, times = [Instant(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
+    return Search(space, instants, times, Length(np.ones(3)), far, seeds=seeds)
+
+
+@pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])
+def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_shorter(reach: float, count: int) -> None:
+    lengths, high, step = np.array([0.5, 0.3, 0.1]), np.array([0.9, 1.8, 0.3]), 0.4
+    machine = limited(planar(lengths), -high, high)
+    places = np.column_stack([np.full(COUNT, 0.6), np.linspace(-reach, reach, COUNT)])
+    nodes = [reached(lengths, place, 1.8, 900) for place in places]
+    nodes = [own[(np.abs(own) <= high).all(axis=1)] for own in nodes]
+    search = searched(machine, places, step)
+    found = fewest_pieces(search, 0)
+    assert found is not None
+    pieces, bound = found
+    expected = fewest(nodes, step, 0)
+    assert (len(pieces) - 1, expected[0]) == (count, count)
+    assert [piece.first for piece in pieces] == [0, *(piece.last for piece in pieces[:-1])]
+    assert pieces[-1].last == COUNT - 1
+    cost = sum(piece.cost for piece in pieces)
+    assert bound <= min(cost, expected[1] + 1e-9)
+    assert cost <= 1.002 * expected[1]
+    for gap in (0, 1):
+        assert len(farthest(search, gap, ruled_out=bool(gap))) == len(pieces)
+    first, last = pieces[0].first, pieces[0].last
+    again = fewest_pieces(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
+    assert again is None or not any(piece.first <= first and last <= piece.last for piece in again[0])
 
 
 @pytest.mark.parametrize(("seed", "count"), [(2, 1), (18, 1), (26, 8), (35, 1)])
