@@ -99,7 +99,8 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
 
     An ignorable coordinate, by whose value nothing that is asked changes but the joint itself (the last joint of an arm
     whose roll is free turns about the tool's axis), has the middle of its range: with it free, every motion would be
-    one of a family of the same cost.
+    one of a family of the same cost. Where every posture touches something with that, it has the value that it has in
+    the one with whose values the most are clear.
     """
     bounds = asked.bounds
     start = np.full(asked.machine.joint_size, np.nan)
@@ -110,7 +111,13 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
         if stretch.equations is not None:
             ignorable &= ignorable_joints(stretch.equations, asked.base)
     start[ignorable] = np.where(np.isfinite(middle), middle, postures[0])[ignorable]
-    return start, np.where(np.isnan(start), postures, start)
+
+    def clear(values: Array) -> int:
+        return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
+
+    if ignorable.any() and not clear(start):
+        start[ignorable] = max((start, *postures), key=clear)[ignorable]
+    return start, np.where(ignorable, start, postures)
 
 
 def followed_from(asked: Asked, postures: Array) -> list[Followed]:

@@ -144,6 +144,8 @@ def by_postures(given: Crowd, count: int) -> Plan | None:
         result = planned(given, start=posture.joints, search="start")
         if isinstance(result, Plan):
             return result
+        if "no joint positions put" in result:  # on the way, from wherever it comes
+            break
     return None
 
 

@@ -12,7 +12,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import Box, CollisionShape, FixedBase, FreeFloating, Moving, Sphere, Surroundings, link_frames
+from models import (
+    Box,
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    Joint,
+    Link,
+    Moving,
+    Robot,
+    Sphere,
+    Surroundings,
+    link_frames,
+)
 from ocp import (
     Clear,
     Collocation,
@@ -32,6 +44,7 @@ from ocp import (
 from ocp.local.touching import distances_along
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.planning.motions import DOWN, bent_seam
+from tests.ocp.planning.test_charts import planar
 from tests.ocp.tasks.space_tasks import ur5
 
 pytestmark = pytest.mark.xdist_group("clear plans")  # one process, so that every motion is planned once
@@ -127,6 +140,22 @@ def test_the_search_finds_a_posture_that_is_clear() -> None:
     assert result.audit().passed
     assert least_apart(result, [POST]) >= 0.02 - 1e-6
     assert result.cost < planned(POST, clearance=0.02).cost
+
+
+def test_what_no_task_moves_stands_in_the_middle_of_its_range_or_where_it_is_clear() -> None:
+    """A flag beside a planar arm, whose middle is in a ball: the arm moves as it does without the ball."""
+    arm = planar(np.array([0.4, 0.3, 0.3])).robot
+    pole = CollisionShape("capsule", (0.03, 0.2), translation=(0, 0.15, 0), rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    flag = Joint("flag", "revolute", "base", "pole", (-0.5, 0, 0), axis=(0, 0, 1), lower=-1.0, upper=2.0, velocity=1.0)
+    robot = Robot((*arm.links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
+    ball = Sphere(0.05, (-0.5 - 0.15 * np.sin(0.5), 0.15 * np.cos(0.5), 0))
+    task = TipTask(position=lambda t: [0.6 - 0.1 * t, 0.2 + 0.1 * t], rows=[3, 4], duration=1.0)
+    free, beside = (plan(FixedBase(robot), task, obstacles=each) for each in ((), [ball]))
+    place = robot.joint_names.index("flag")
+    assert_allclose(free.at(0.0)["joints"][place], 0.5)
+    assert abs(beside.at(0.0)["joints"][place] - 0.5) > 0.3
+    assert least_apart(beside, [ball]) >= 0
+    assert_allclose(beside.cost, free.cost, rtol=1e-6)
 
 
 def space_arm(panel: bool) -> FreeFloating:
