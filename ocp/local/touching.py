@@ -5,18 +5,23 @@ Between the samples nothing is said: a plan's audit proves what holds there (:mo
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from models import Machine, Surroundings
+from models import HalfSpace, Machine, Surroundings
 from models.arrays import Array
+from models.shapes.distance import COLUMNS, VECTORS, column, pair_function
 from ocp.errors import ProblemError, checked_instance
 from ocp.problem.formulation import Sampler
-from ocp.problem.hulls import Hull, HullPairs, frames_of, grouped
+from ocp.problem.hulls import Frames, Hull, frames_of, grouped
 
 __all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
+
+Measure: TypeAlias = Callable[[Frames, Array, Array], Array]
+"""(frames, samples (K,), places (K,) of pairs among those of a lot) -> their distances there (K,), m."""
 
 
 class Touch(NamedTuple):
@@ -48,7 +53,9 @@ def hulls_of(surroundings: Surroundings) -> dict[str, Hull]:
 def distances_along(
     surroundings: Surroundings, base: Array, joints: Array, times: Array, near: float = np.inf
 ) -> Array:
-    """Distances of all pairs at samples of a motion; where they overlap, about how deep. Shape (M, n), m.
+    """Distances of all pairs at samples of a motion; how deep those with a mesh or a cylinder overlap is told about.
+
+    Shape (M, n), m.
 
     Args:
         surroundings: Of the machine that moves.
@@ -77,33 +84,103 @@ def touches(surroundings: Surroundings, base: Array, joints: Array, times: Array
 def _measured(surroundings: Surroundings, base: Array, joints: Array, times: Array, near: float) -> Array:
     """Distances of all pairs (M, n), of those that are no nearer than `near` some number that is no less."""
     count, n = len(joints), len(surroundings.pairs)
-    apart = np.full((count, n), -np.inf)
     if not n:
-        return apart
-    placements, lots = _prepared(surroundings)
+        return np.zeros((count, 0))
+    pairs = _prepared(surroundings)
     places = np.broadcast_to(base, (count, surroundings.machine.base_size))
-    frames = frames_of(placements(places, joints, np.reshape(times, (-1, 1)))[0])
-    sample, pair = (part.ravel() for part in np.meshgrid(np.arange(count), np.arange(n), indexing="ij"))
-    for lot in lots:
-        chosen = np.flatnonzero(lot.has[pair])
-        row = lot.row[pair[chosen]]
-        ball = lot.balls(frames, sample[chosen], row)
-        apart[sample[chosen], pair[chosen]] = ball
-        chosen, row = chosen[~(ball >= near)], row[~(ball >= near)]
-        apart[sample[chosen], pair[chosen]] = lot.nearest(frames, sample[chosen], row)[1]
+    frames = frames_of(pairs.placements(places, joints, np.reshape(times, (-1, 1)))[0])
+    apart = pairs.balls(frames)
+    sample, pair = np.nonzero(~(apart >= near))
+    for lot in pairs.lots:
+        chosen = lot.has[pair]
+        at, which = sample[chosen], pair[chosen]
+        if at.size:
+            apart[at, which] = lot.measure(frames, at, np.cumsum(lot.has)[which] - 1)
     return np.where(np.isfinite(apart), apart, -np.inf)
 
 
-def _prepared(surroundings: Surroundings) -> tuple[Sampler, list[HullPairs]]:
-    """The function (base, joints, time) -> placements and the pairs by kind, kept with the surroundings."""
-    kept: tuple[Sampler, list[HullPairs]] | None = surroundings.__dict__.get("_prepared")
-    if kept is None:
-        machine = surroundings.machine
+class _Lot(NamedTuple):
+    """Pairs that are measured alike: whether a pair is one of them, shape (n,), and how."""
+
+    has: Array
+    measure: Measure
+
+
+class _Pairs:
+    """All pairs of surroundings.
+
+    Attributes:
+        placements: Function (base, joints, time) -> placements. lots: The pairs by kind.
+    """
+
+    def __init__(self, surroundings: Surroundings) -> None:
+        machine, pairs, bodies = surroundings.machine, surroundings.pairs, surroundings.bodies
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
-        sampler = Sampler([base, joints, time], [ca.SX(surroundings.placements(base, joints, time))])
-        kept = sampler, grouped(tuple(hulls_of(surroundings).values()), surroundings.pairs)
-        surroundings.__dict__["_prepared"] = kept
+        self.placements = Sampler([base, joints, time], [ca.SX(surroundings.placements(base, joints, time))])
+        hulls = tuple(hulls_of(surroundings).values())
+        self._one, self._other = pairs[:, 0], pairs[:, 1]
+        self._riding = np.array([hull.frame for hull in hulls])
+        self._middles = np.array([hull.core.mean(axis=0) for hull in hulls])
+        reach = [
+            np.linalg.norm(hull.core - middle, axis=1).max() + hull.radius
+            for hull, middle in zip(hulls, self._middles, strict=True)
+        ]
+        self._reach = np.array(reach)
+        self._grounds = [k for k, body in enumerate(bodies) if isinstance(body.shape, HalfSpace)]
+        self._normals = {k: hulls[k].normal for k in self._grounds}
+        kinds = [tuple(type(bodies[k].shape) for k in pair[:2]) for pair in pairs]
+        simple = np.array([set(both) <= COLUMNS.keys() for both in kinds])
+        self.lots = []
+        for both in dict.fromkeys(both for both, known in zip(kinds, simple, strict=True) if known):
+            has = np.array([one == both for one in kinds])
+            self.lots.append(_Lot(has, _by_formula(surroundings, np.flatnonzero(has), both)))
+        others = np.flatnonzero(~simple)
+        for group in grouped(hulls, pairs[others]):
+            has = np.zeros(len(pairs), dtype=bool)
+            has[others[group.has]] = True
+            self.lots.append(_Lot(has, lambda *given, group=group: group.nearest(*given)[1]))
+
+    def balls(self, frames: Frames) -> Array:
+        """How far balls about the middles of both bodies, which hold them, are apart. Shape (M, n), m."""
+        rotations, positions = frames
+        middles = np.einsum("mbij,bj->mbi", rotations[:, self._riding], self._middles) + positions[:, self._riding]
+        apart = np.linalg.norm(middles[:, self._other] - middles[:, self._one], axis=2)
+        for k in self._grounds:
+            beside = (self._one == k) | (self._other == k)
+            bodies = np.where(self._one[beside] == k, self._other[beside], self._one[beside])
+            apart[:, beside] = (middles[:, bodies] - middles[:, k, None]) @ self._normals[k]
+        return np.asarray(apart - self._reach[self._one] - self._reach[self._other])
+
+
+def _by_formula(surroundings: Surroundings, members: np.ndarray, kinds: tuple[Any, ...]) -> Measure:
+    """Distances of pairs of two kinds of shapes that have columns, see `models.shapes.distance`."""
+    distance = pair_function(*kinds)
+    placed = [[surroundings.bodies[k] for k in surroundings.pairs[members, side]] for side in (0, 1)]
+    columns = [np.array([np.array(column(body.shape)).ravel() for body in side]) for side in placed]
+    riding = [np.array([body.frame for body in side]) for side in placed]
+
+    def measured(frames: Frames, at: Array, row: Array) -> Array:
+        sides = []
+        for kind, own, frame in zip(kinds, columns, riding, strict=True):
+            turn, shift = (part[at, frame[row]] for part in frames)
+            moved = own[row]
+            points, directions = VECTORS[kind]
+            width = 3 * (points + directions)
+            vectors = moved[:, :width].reshape(len(row), -1, 3) @ np.swapaxes(turn, 1, 2)
+            vectors[:, :points] += shift[:, None]
+            moved[:, :width] = vectors.reshape(len(row), width)
+            sides.append(moved.T)
+        return np.array(distance(*sides)).ravel()
+
+    return measured
+
+
+def _prepared(surroundings: Surroundings) -> _Pairs:
+    """The pairs, kept with the surroundings."""
+    kept: _Pairs | None = surroundings.__dict__.get("_prepared")
+    if kept is None:
+        kept = surroundings.__dict__["_prepared"] = _Pairs(surroundings)
     return kept
 
 

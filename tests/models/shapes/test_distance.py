@@ -98,6 +98,28 @@ def _has_length(shapes: tuple[Any, ...]) -> bool:
     return all(not isinstance(shape, Capsule) or (shape.start != shape.end).any() for shape in shapes)
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 10.0])
+def test_a_capsule_nearly_along_an_edge_is_as_near_as_its_nearest_point(scale: float) -> None:
+    """Tilted by 1e-15 to .1, most of them by less than 1e-12: no point is nearer than is told, and one is as near."""
+    rng = np.random.default_rng(18)
+    count = 600
+    box = Box(scale * np.array([0.4, 0.7, 1.1]))
+    tilts = rng.normal(size=(count, 3)) * 10.0 ** np.where(
+        rng.random((count, 1)) < 0.7, rng.uniform(-15, -12, size=(count, 1)), rng.uniform(-12, -1, size=(count, 1))
+    )
+    middles = scale * rng.normal(size=(count, 3))
+    ways = scale * (np.eye(3)[rng.integers(3, size=count)] * rng.uniform(0.1, 2.0, size=(count, 1)) + tilts)
+    s = np.linspace(-0.5, 0.5, 1001)
+    over = np.maximum(np.abs(middles[:, None] + s[:, None] * ways[:, None]) - box.size / 2, 0.0)
+    known = np.linalg.norm(over, axis=2).min(axis=1)
+    found = in_bulk([(Capsule(0.1 * scale, m - w / 2, m + w / 2), box) for m, w in zip(middles, ways, strict=True)])
+    apart = known > 1e-3 * scale
+    assert apart.sum() > count / 2
+    missed = (known - 0.1 * scale - found)[apart] / scale
+    assert missed.min() > -1e-9
+    assert missed.max() < 2.0 / 1000
+
+
 def test_a_capsule_without_length_is_a_sphere() -> None:
     rng = np.random.default_rng(4)
     for kind in (Sphere, Capsule, Box, HalfSpace, Mesh):
