@@ -15,6 +15,8 @@
 #include "fatrop/ocp/OCPCInterface.h"
 
 #define VAST 1e20
+#define WILD 1e15 /* derivatives from which on nothing is sure */
+#define GROWTH 60 /* powers of ten along the horizon: their squares' squares overflow, and fatrop loops for ever */
 #define SETTLED 1e-13 /* of the inner rows */
 #define ROUNDING 1e-9 /* below which inner rows that fall no more stand at their rounding */
 #define CHORDS 8      /* steps with the factors of an earlier point */
@@ -58,6 +60,8 @@ typedef struct {
   int known, found, ready, sloped, factored; /* of the point seen: its values, z; E, slopes; an E of some point */
 } program;
 
+static int wild(double v) { return !(fabs(v) < WILD); }
+
 static double tame(double v) { return isnan(v) ? VAST : v > VAST ? VAST : v < -VAST ? -VAST : v; }
 
 static int own(const program *s, int k) { return s->nu[k] + s->nx[k]; }
@@ -65,6 +69,11 @@ static int own(const program *s, int k) { return s->nu[k] + s->nx[k]; }
 static void end(program *s) {
   if (!s->stopped) fatrop_ocp_c_set_option_int(s->solver, "max_iter", 0);
   s->stopped = 1;
+}
+
+static void give_up(program *s) {
+  s->lost = 1;
+  end(s);
 }
 
 static int must_end(program *s) {

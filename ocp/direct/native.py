@@ -290,7 +290,7 @@ class NativeSolver(_Kept):
         }
         sums = {name: np.concatenate([[0], np.cumsum(part)]) for name, part in first.items()}
         last = {name: int(part[-1]) for name, part in sums.items()}
-        scratch = int(((own + tables.nz) * own).max())
+        scratch = int(max(((own + tables.nz) * own).max(), 2 * own.max()))
         sizes = {
             "seen": last["primal_first"],
             "before": last["primal_first"] + last["inner_first"],

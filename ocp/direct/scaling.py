@@ -138,7 +138,8 @@ def scaled_program(program: Program) -> Program:
     value, rows = program.values(v, p)
     row, column = jacobian.sparsity().get_triplet()
     first, second = hessian.sparsity().get_triplet()
-    scaled_jacobian = ca.MX(jacobian.sparsity(), jacobian.nz[:] * a[column] / b[row])
+    of_rows, by_row = map(ca.vec, (jacobian.nz[:], b[row]))  # of a single row casadi makes rows
+    scaled_jacobian = ca.MX(jacobian.sparsity(), of_rows * a[column] / by_row)
     scaled_hessian = ca.MX(hessian.sparsity(), hessian.nz[:] * a[first] * a[second])
     names = ["x", "p", "lam_f", "lam_g"]
     return replace(

@@ -19,7 +19,7 @@ static int slope(double scale, const double *primal, const double *u0, const dou
   int i, j, k, q;
   memset(out, 0, sizeof(double) * (size_t)s->primal_first[s->stages]);
   if (!slopes_at(s, primal)) {
-    s->lost = 1, end(s);
+    give_up(s);
     return 1;
   }
   slope_of_cost(s);
@@ -50,6 +50,25 @@ static int violation(const double *primal, const double *u0, const double *u1, d
 
 static void clear(struct blasfeo_dmat *of, int rows, int columns) { blasfeo_dgese(rows, columns, 0.0, of, 0, 0); }
 
+/* Powers of ten by which what the first stage does grows along the horizon, without the controls. */
+static double growth(const program *s, struct blasfeo_dmat *dynamics) {
+  double *x = s->scratch, *next = x + s->most, powers = 0.0;
+  int i, j, k;
+  for (i = 0; i < s->nx[0]; ++i) x[i] = 1.0 + 0.1 * (i % 7);
+  for (k = 0; k + 1 < s->stages; ++k) {
+    double size = 0.0;
+    for (j = 0; j < s->nx[k + 1]; ++j) {
+      next[j] = 0.0;
+      for (i = 0; i < s->nx[k]; ++i) next[j] += BLASFEO_DMATEL(dynamics + k, s->nu[k] + i, j) * x[i];
+      size = fmax(size, fabs(next[j]));
+    }
+    if (size == 0.0) return powers;
+    powers += log10(size);
+    for (j = 0; j < s->nx[k + 1]; ++j) x[j] = next[j] / size;
+  }
+  return powers;
+}
+
 static int slopes_of_rows(const double *primal, const double *u0, const double *u1, struct blasfeo_dmat *dynamics,
                           struct blasfeo_dmat *equal, struct blasfeo_dmat *unequal, const struct FatropOcpCDims *d,
                           void *data) {
@@ -57,25 +76,35 @@ static int slopes_of_rows(const double *primal, const double *u0, const double *
   const entries *e = &s->jacobian;
   int i, k, q;
   must_end(s);
-  if (!slopes_at(s, primal)) s->lost = 1, end(s);
+  if (!slopes_at(s, primal)) give_up(s);
   for (k = 0; k < s->stages; ++k) {
     const int w = own(s, k);
     struct blasfeo_dmat *of[3] = {dynamics + k, equal + k, unequal + k};
     if (k + 1 < s->stages) clear(dynamics + k, w, s->nx[k + 1]);
     clear(equal + k, w, s->ng[k]);
     clear(unequal + k, w, s->ni[k]);
-    if (s->lost) continue;
-    for (i = e->first[k]; i < e->first[k + 1]; ++i) {
-      const double v = tame(s->numbers[JACOBIAN][e->source[i]]) * s->factor[e->row[i]] * s->a[e->column[i]];
+    for (i = e->first[k]; i < e->first[k + 1] && !s->lost; ++i) {
+      const double v = s->numbers[JACOBIAN][e->source[i]] * s->factor[e->row[i]] * s->a[e->column[i]];
       struct blasfeo_dmat *m = of[s->kind[e->row[i]]];
       const int at = s->position[e->row[i]], c = s->local[e->column[i]];
+      if (wild(v)) give_up(s);
       if (c < w) {
         BLASFEO_DMATEL(m, c, at) += v;
       } else {
         const double *along = s->sensitivity + s->sensitivity_first[k] + (c - w) * w;
-        for (q = 0; q < w; ++q) BLASFEO_DMATEL(m, q, at) += v * along[q];
+        for (q = 0; q < w; ++q) {
+          if (wild(v * along[q])) give_up(s);
+          BLASFEO_DMATEL(m, q, at) += v * along[q];
+        }
       }
     }
+  }
+  if (!s->lost && growth(s, dynamics) > GROWTH) give_up(s);
+  for (k = 0; k < s->stages && s->lost; ++k) { /* what lets its step end */
+    if (k + 1 < s->stages) clear(dynamics + k, own(s, k), s->nx[k + 1]);
+    clear(equal + k, own(s, k), s->ng[k]);
+    clear(unequal + k, own(s, k), s->ni[k]);
+    for (i = 0; i < s->ng[k]; ++i) BLASFEO_DMATEL(equal + k, i, i) = 1.0;
   }
   return 1;
 }
@@ -112,17 +141,26 @@ static int curvature(double scale, const double *primal, const double *dual, con
                      struct blasfeo_dmat *out, const struct FatropOcpCDims *d, void *data) {
   program *s = data;
   int k, q, r;
-  for (k = 0; k < s->stages; ++k) clear(out + k, own(s, k), own(s, k));
-  if (!slopes_at(s, primal)) s->lost = 1, end(s);
-  if (s->lost) return 1;
-  s->sigma = scale / s->cost_scale;
-  multipliers(s, scale, dual);
-  s->evaluate(HESSIAN);
+  if (!s->lost && !slopes_at(s, primal)) give_up(s);
+  if (!s->lost) {
+    s->sigma = scale / s->cost_scale;
+    multipliers(s, scale, dual);
+    s->evaluate(HESSIAN);
+  }
   for (k = 0; k < s->stages; ++k) {
     const int w = own(s, k);
-    const double *half = half_curvature(s, k);
-    for (r = 0; r < w; ++r)
-      for (q = 0; q < w; ++q) BLASFEO_DMATEL(out + k, r, q) = half[r * w + q] + half[q * w + r];
+    const double *half = s->lost ? 0 : half_curvature(s, k);
+    clear(out + k, w, w);
+    for (r = 0; r < w && !s->lost; ++r)
+      for (q = 0; q < w; ++q) {
+        const double v = half[r * w + q] + half[q * w + r];
+        if (wild(v)) give_up(s);
+        BLASFEO_DMATEL(out + k, r, q) = v;
+      }
+  }
+  for (k = 0; k < s->stages && s->lost; ++k) {
+    clear(out + k, own(s, k), own(s, k));
+    for (r = 0; r < own(s, k); ++r) BLASFEO_DMATEL(out + k, r, r) = 1.0;
   }
   return 1;
 }

@@ -240,18 +240,40 @@ def test_infeasible_problems_are_refused_as_by_ipopt(method: str) -> None:
     assert names["native"]
 
 
-def test_functions_that_are_not_finite_are_told() -> None:
-    """In a process of its own, because fatrop loops for ever on what is not a number."""
+def test_what_is_no_number_is_told_and_what_grows_beyond_all_numbers_is_left_to_ipopt() -> None:
+    """In a process of its own, because fatrop loops for ever on both."""
     code = """
-    from ocp import Collocation, SolveError, solve
+    import casadi as ca
+    from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
     from tests.ocp.direct.test_nlp import rooted
     try:
         solve(rooted(), Collocation(3), solver="native")
     except SolveError as error:
         print("told:", error)
+    problem = Problem("stiff")
+    x, u = problem.state("x", initial=1.0), problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, u - 1000 * (x - ca.cos(problem.time)))
+    problem.horizon(1.0)
+    problem.minimize(running=x**2 + u**2)
+    # far beyond where the steps of Runge and Kutta are stable
+    plan = solve(problem, MultipleShooting(10, steps=2), solver="native", time_limit=20.0)
+    print(plan.solver, plan.success)
     """
-    done = run(code, timeout=30)
+    done = run(code, timeout=60)
     assert "told: problem 'rooted'" in done.stdout, done.stderr
+    assert "ipopt True" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "native"])
+def test_one_interval_of_one_state(solver: str) -> None:
+    """From .1 to 0 in 1 s by a force that is held: exp(-1) / 10 + (1 - exp(-1)) u = 0."""
+    problem = Problem("one")
+    x, u = problem.state("x", initial=0.1, terminal=0.0), problem.control("u", lower=-3.0, upper=3.0)
+    problem.dynamics(x, u - x)
+    problem.horizon(1.0)
+    problem.minimize(running=u**2)
+    plan = solve(problem, MultipleShooting(1, steps=20), solver=solver)
+    assert plan["u"][0] == pytest.approx(-0.1 / (np.e - 1), rel=1e-6)
 
 
 @every_method
