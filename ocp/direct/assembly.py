@@ -89,7 +89,8 @@ class Numbers:
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> sp.csc_array:
         """Upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
-        return sp.csc_array(self._hessian(x, p, np.array([sigma]), lam)[0])
+        found: sp.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
+        return found
 
     def inside(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Gradient of the cost inside the horizon. Shape (n,)."""

@@ -1,4 +1,4 @@
-"""The conditions of first order at an optimum as a linear system: which limits push, and does the cost curve upwards.
+"""The conditions of first order at an optimum as a linear system: which limits push.
 
 Nocedal, Wright 2006, Numerical Optimization, chapters 12 and 16.
 """
@@ -10,13 +10,12 @@ from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as sla
 
 from ocp.direct.assembly import Program
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "Sides", "conditions", "corrected", "curves_upwards", "held_by", "scaled"]
+__all__ = ["Conditions", "Sides", "conditions", "corrected", "held_by", "scaled"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
 """On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""
@@ -24,8 +23,6 @@ PUSHES = 1e-8
 """Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
 FLAT = 1e-7
 """Largest slope, in units of the solver, along what no limit holds; a plan costs the square of it too much."""
-PRICES = (1e3, 1e6)
-"""Of what misses the constraints, against the largest curvature, where it is asked whether the rest curves upwards."""
 
 
 @dataclass(frozen=True)
@@ -111,37 +108,6 @@ def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.n
         below = (push < -PUSHES) & (value - lower < -push)
         above = (push > PUSHES) & (upper - value < push)
     return np.asarray((lower == upper) | below | above)
-
-
-def curves_upwards(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> bool:
-    """Whether the cost curves upwards along all that the limits at which a plan stands leave free.
-
-    That is so exactly if the Hessian is positive definite once missing these limits costs enough (Finsler). No is said
-    too where it is so only at a price beyond what rounding allows.
-    """
-    at = conditions(program, outcome, arguments, scales)
-    largest = max(float(np.abs(at.hessian.data).max(initial=0.0)), np.finfo(float).tiny)
-    if not np.all(np.isfinite(at.hessian.data)) or not np.all(np.isfinite(at.jacobian.data)):
-        return False
-    free = np.flatnonzero(~at.fixed)
-    rows = at.jacobian[np.flatnonzero(at.held)][:, free]
-    size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
-    rows = sp.diags_array(1 / np.where(size > 0, size, 1.0)) @ rows
-    missing, own = sp.csc_array(rows.T @ rows), at.hessian[free][:, free] / largest
-    return any(positive_definite(sp.csc_array(own + price * missing)) for price in PRICES)
-
-
-def positive_definite(symmetric: sp.csc_array) -> bool:
-    """Whether a matrix is that is given in an order in which it fills little: all its pivots on the diagonal are."""
-    options = {"SymmetricMode": True, "Equil": False}
-    try:
-        factors = sla.splu(
-            symmetric, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=4, options=options
-        )
-    except RuntimeError:  # a pivot is zero
-        return False
-    moved = np.any(factors.perm_r != np.arange(symmetric.shape[0]))
-    return bool(not moved and np.all(factors.U.diagonal() > 0))
 
 
 def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:

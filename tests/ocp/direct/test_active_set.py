@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -106,6 +108,41 @@ def test_units_of_states_controls_and_cost_do_not_matter() -> None:
         assert relative(again["x"], plan["x"]) < 1e-7
         found[scale] = again.iterations
     assert len(set(found.values())) == 1, found
+
+
+def test_where_other_plans_are_as_good_one_is_found() -> None:
+    """Two motors of which the sum counts alone: rounding says whether the cost curves along their difference."""
+    problem = Problem("two motors")
+    x = problem.state("x", initial=[0.0], terminal=problem.parameter("end"))
+    one, other = problem.control("one"), problem.control("other")
+    problem.dynamics(x, one + other)
+    problem.horizon(1.0)
+    problem.minimize(running=(one + other) ** 2 + 0.1 * x**4)
+    prepared = ready(problem, Collocation(15))
+    plan = prepared.solve({"end": 1.0})
+    plan = dataclasses.replace(plan, regularised=False)  # which ipopt says of a plan beside others as good
+    for end in np.linspace(1.0, 1.5, 6):
+        plan = prepared.solve({"end": float(end)}, plan)
+        assert plan.solver == "newton"
+        assert plan.cost == pytest.approx(prepared.solve({"end": float(end)}).cost, rel=1e-9)
+
+
+def test_limits_that_hardly_differ_are_no_matter() -> None:
+    """A speed that is limited twice, by rows that differ by a thousandth."""
+    problem = Problem("nearly the same")
+    fast = problem.parameter("fast")
+    x, u = problem.state("x", 2, initial=[0.0, 0.0], terminal=[1.0, 0.0]), problem.control("u")
+    problem.dynamics(x, ca.vertcat(x[1], u))
+    problem.horizon(1.0)
+    problem.path("speed", x[1], upper=fast)
+    problem.path("nearly speed", x[1] + 1e-3 * (x[1] - fast) * ca.cos(5 * x[0]), upper=fast)
+    problem.minimize(running=u**2)
+    prepared = ready(problem, Collocation(10))
+    plan = prepared.solve({"fast": 1.3})
+    for fast_now in (1.29, 1.25, 1.2):
+        again, cold = prepared.solve({"fast": fast_now}, plan), prepared.solve({"fast": fast_now})
+        assert again.solver == "newton"
+        assert again.cost == pytest.approx(cold.cost, rel=1e-8)
 
 
 def test_rows_are_met_so_well_that_the_cost_is_that_of_the_optimum() -> None:
