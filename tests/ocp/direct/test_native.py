@@ -141,19 +141,47 @@ def test_a_stage_has_its_states_and_controls_and_what_its_dynamics_define_is_ins
     assert tables.nz[-1] == 0
 
 
-def test_units_of_states_controls_and_cost_do_not_matter() -> None:
-    rng = np.random.default_rng(0)
+def test_units_of_states_controls_rows_and_cost_do_not_matter() -> None:
+    rng, by_native = np.random.default_rng(0), 0
     for scale, strength, price in 10.0 ** rng.uniform(-5, 5, (6, 3)):
         problem = Problem("in units")
         q, w = problem.state("q", initial=0.0, terminal=scale), problem.state("w", initial=0.0, terminal=0.0)
         u = problem.control("u", lower=-5 * strength, upper=5 * strength)
         problem.dynamics(q, w)
         problem.dynamics(w, u * scale / strength)
+        problem.path("effort", w + u * scale / strength, upper=8 * scale)
         problem.horizon(1.0)
         problem.minimize(running=price * (u / strength) ** 2)
-        a, b = (solve(problem, Collocation(8), solver=s) for s in ("ipopt", "native"))
+        a, prepared = solve(problem, Collocation(8)), built(problem, Collocation(8))
+        b = prepared.solve()
         assert b.cost == pytest.approx(a.cost, rel=1e-7)
         assert relative(b.costates["q"], a.costates["q"]) < 1e-5
+        for name in ("q", "w", "u"):
+            assert relative(b[name], a[name]) < 1e-5
+        if b.solver == "ipopt":  # its tolerance is absolute, and missed by little in some units
+            continue
+        by_native += 1
+        p = np.zeros(0)
+        bounds = prepared.formulation.bound_values(p)
+        found = prepared._attempt("", b.variables, set(), prepared._arguments(p, bounds), bounds).outcome
+        rows = prepared.program.numbers.values(found.variables, p)[1]
+        assert float(np.abs(rows).max()) > scale
+        np.testing.assert_allclose(found.rows, rows, rtol=1e-9, atol=1e-9 * scale)
+    assert by_native >= 3
+
+
+@pytest.mark.parametrize("end", [0.2, 0.8])
+def test_states_inside_intervals_are_sought_from_the_guess(end: float) -> None:
+    """One step of Euler backwards along x' = x^2 / s has two ends, x = x0 + x^2 / s: s / 5 and 4 s / 5."""
+    size = 1e6
+    problem = Problem("two ends")
+    x, u = problem.state("x", initial=0.16 * size), problem.control("u")
+    problem.dynamics(x, x**2 / size + u)
+    problem.horizon(1.0)
+    problem.minimize(running=(u / size) ** 2)
+    plan = built(problem, Collocation(1, 1)).solve(guess={"x": 1.01 * end * size}, check=False)
+    assert plan.solver == "native"
+    assert plan["x"][-1] == pytest.approx(end * size, rel=1e-9)
 
 
 def test_other_parameters_may_make_equalities_of_limits() -> None:
