@@ -27,6 +27,7 @@ EXAMPLES: Mapping[str, str] = {
     "mobile_manipulator": "example-robot-data",
     "pushing": "example-robot-data",
     "pick_and_place": PANDA.package,
+    "capture": SPACE_ARM.package,
     "steps": "selfmotion",
 }
 """Modules of this folder, each with `plan(coarse)`, which gives what its `draw(example, folder, animation=)` draws and

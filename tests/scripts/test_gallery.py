@@ -15,16 +15,18 @@ import pinocchio
 import pytest
 from PIL import Image
 
-from models import FixedBase, FreeFloating
+from models import FixedBase, FreeFloating, with_wheels
 from models.arrays import Array
 from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.files import read_trajectory
 from scripts import gallery
-from scripts.robots import panda, pick_and_place, posture_set, pushing, robots, steps, ur5
+from scripts.robots import capture, capture_family, panda, pick_and_place, posture_set, pushing, robots, steps, ur5
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
+from tests.ocp.builders.captures import replayed_momentum
+from tests.ocp.builders.test_capture import gaps
 
 pytestmark = [pytest.mark.xdist_group("gallery"), pytest.mark.long]
 
@@ -227,6 +229,27 @@ def test_the_load_that_is_known_stays_within_the_torques_of_another_library(tmp_
     pick_and_place.draw(example, tmp_path, animation=False)
     with Image.open(tmp_path / "pick_and_place.png") as picture:
         assert min(picture.size) > 500
+
+
+def test_a_tumbling_body_is_caught_and_its_momentum_stays_in_another_simulation() -> None:
+    """MuJoCo's momentum of both, before and after the grasp; its wheels have a mass, of 1e-9 kg."""
+    example = capture.plan(coarse=True)
+    assert example.audit.passed
+    assert max(gaps(example.asked, example.plan)) < 1e-6
+    rotors: dict[str, Any] = {"momentum": capture.MOMENTUM, "torque": capture.TORQUE, "mass": 1e-9}
+    weighed = FreeFloating(with_wheels(robots.SPACE_ARM.read(), np.eye(3), capture.WHEEL, **rotors))
+    before, after = replayed_momentum(example.asked | {"chaser": weighed}, example.plan)
+    assert np.abs(np.vstack([before, after]) - before[0]).max() < 1e-9
+    assert np.linalg.norm(before[0, :3]) == pytest.approx(example.summary()["target_momentum_Nms"], rel=1e-9)
+    assert np.abs(example.plan.phase("detumble")["velocities"][-1, :7]).max() < 1e-9
+    assert np.abs(example.wheels("detumble")).max() <= capture.MOMENTUM * (1 + 1e-6)
+
+
+def test_a_chain_of_two_plans_costs_more_where_a_wheel_takes_the_momentum() -> None:
+    found = capture_family.planned(0.1, "wheel")
+    assert found.passed
+    assert found.chain == pytest.approx(found.approach + found.detumble)
+    assert found.together < 0.95 * found.chain
 
 
 def test_the_summary_holds_every_example(coarse: Gallery) -> None:

@@ -90,9 +90,9 @@ def turned(axis: Any, angle: float) -> Array:
 
 
 def replayed_momentum(asked: dict[str, Any], plan: Solution, samples: int = 41) -> tuple[Array, Array]:
-    """Momentum of chaser and target in MuJoCo along a plan: (moment about the world's origin, linear), (M, 6) each.
+    """Momentum of chaser and target in MuJoCo along a plan, about their common centre of mass: (M, 6) in each phase.
 
-    Before the grasp two robots that move beside each other, after it one.
+    (Angular, linear). Before the grasp two robots that move beside each other, after it one.
     """
     one, other = asked["chaser"], asked["target"]
     begin, after = (plan.phase(name).at_fraction(np.linspace(0, 1, samples)) for name in ("approach", "detumble"))
@@ -100,19 +100,31 @@ def replayed_momentum(asked: dict[str, Any], plan: Solution, samples: int = 41) 
     carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
     pair = FreeFloating(joined(one.robot, other.robot), one.base, conserved_momentum=carried)
     nothing = np.zeros((samples, 0))
-    before = _momenta(one, begin["base"], begin["joints"], begin["velocities"])
-    before += _momenta(other, begin["target"], nothing, nothing)
-    return before, _momenta(pair, after["base"], after["joints"], after["velocities"])
+    parts = [
+        _momenta(one, begin["base"], begin["joints"], begin["velocities"]),
+        _momenta(other, begin["target"], nothing, nothing),
+    ]
+    return _together(parts), _together([_momenta(pair, after["base"], after["joints"], after["velocities"])])
 
 
-def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -> Array:
+def _together(parts: list[tuple[Array, Array, float]]) -> Array:
+    """Of momenta (M, 6) about centres (M, 3) of masses."""
+    middle = sum(mass * center for _, center, mass in parts) / sum(mass for *_, mass in parts)
+    found = np.sum([momentum for momentum, *_ in parts], axis=0)
+    for momentum, center, _ in parts:
+        found[:, :3] += np.cross(center - middle, momentum[:, 3:])
+    return np.asarray(found)
+
+
+def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -> tuple[Array, Array, float]:
+    """Of one machine: momentum about its own centre of mass, (M, 6), that centre, (M, 3), and its mass."""
     model = mujoco_model(machine.robot)
     data = mujoco.MjData(model)
     names = machine.robot.joint_names
     order = [model.joint(name).dofadr[0] for name in names]
     places = [model.joint(name).qposadr[0] for name in names]
     spatial = np.eye(6)[:, machine.twist_rows]
-    found = []
+    found, centers = [], []
     for base, angles, speeds in zip(bases, joints, rates, strict=True):
         frame = machine.world_from_base(base)
         twist = spatial @ np.array(ca.DM(machine.base_twist(base, angles, speeds))).ravel()
@@ -123,6 +135,6 @@ def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -
         data.qvel[:3], data.qvel[3:6], data.qvel[order] = twist[3:], turn.T @ twist[:3], speeds
         mujoco.mj_forward(model, data)
         mujoco.mj_subtreeVel(model, data)
-        linear = machine.robot.total_mass * data.subtree_linvel[1]
-        found.append([*(data.subtree_angmom[1] + np.cross(data.subtree_com[1], linear)), *linear])
-    return np.array(found)
+        found.append([*data.subtree_angmom[1], *(machine.robot.total_mass * data.subtree_linvel[1])])
+        centers.append(data.subtree_com[1].copy())
+    return np.array(found), np.array(centers), float(machine.robot.total_mass)
