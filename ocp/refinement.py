@@ -239,6 +239,9 @@ def _rows(
         for name in (asked.name, "integration error, relative", "integration error of one interval")
     }
     parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
+    costates = audit.optimality.adjoint
+    parts["costate equation, relative"] = _Parts("other", costates.error, order, summed=True)
+    parts["costates between the nodes, relative"] = _Parts("other", costates.between, order)
     for name, (equal, misses) in _missed(form, p, solution, audit).items():
         parts[name] = _Parts("equalities" if equal else "limits", misses, order)
     rows = []

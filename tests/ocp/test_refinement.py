@@ -482,6 +482,24 @@ def test_intervals_gather_where_the_solution_is_sharp(method: Method) -> None:
     assert even.audit().integration_error > 3 * solution.audit().integration_error
 
 
+def test_intervals_gather_where_the_costates_are_wrong() -> None:
+    """x' = u, x^2 + (width u)^2: states and costates fall as exp(-t / width), and lie still after."""
+    width, asked = 0.02, 1e-6
+    problem, x, u = plant("falls", initial=1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=(x**2 + width**2 * u**2) / 2)
+    solution = refine(problem, Collocation(6, 3), tolerance=1.0, limits={"costates": asked})
+    assert solution.refinement is not None
+    assert solution.refinement.reached
+    count, mesh = solution.refinement.intervals[-1], solution.control_interpolant.breaks
+    assert np.sum(mesh < 10 * width) > 0.8 * count
+    row = "costates between the nodes, relative"
+    even = solve(problem, Collocation(count, 3)).audit()[row].value
+    assert solution.audit()[row].value <= asked < even / 30
+    t = np.linspace(0.0, 0.2, 101)
+    np.testing.assert_allclose(solution.costate_interpolant(t)[:, 0], width * np.exp(-t / width), atol=1e-3 * width)
+
+
 def test_a_stop_at_the_cap_is_warned_of_and_told() -> None:
     with pytest.warns(RefinementWarning, match=r"'layer' stopped at \d+ of at most 12 intervals .*raise max_intervals"):
         solution = refine(layer(), Collocation(4), tolerance=1e-10, max_intervals=12)
