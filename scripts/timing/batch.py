@@ -1,9 +1,14 @@
-"""Many plans: two workers beside one, a Dask cluster beside one, and what 10 000 tasks cost that do nothing."""
+"""Many plans: two workers beside one, a Dask cluster beside one, and what 10 000 tasks cost that do nothing.
+
+Two cores that share their units, or that others use too, give no two processes twice the work of one: so the same plans
+are also made by plain processes that know of no batch, one and two of them, and gains are told as shares of theirs.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import tempfile
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +24,14 @@ PLANS = 64
 SHORT = 10_000
 CUT = 1000
 """Of the short tasks, the first and the last, whose pace is compared."""
-GOALS = {"two workers": (1.8, "times one"), "Dask, two workers": (1.6, "times one"), "overhead": (5.0, "ms at most")}
+GOALS = {
+    "two workers": (1.8, "times one"),
+    "Dask, two workers": (1.6, "times one"),
+    "two workers, share": (0.9, "of the gain of two plain processes, at least"),
+    "Dask, two workers, share": (0.8, "of the gain of two plain processes, at least"),
+    "overhead": (5.0, "ms at most"),
+}
+PLAIN = {1: "one plain process", 2: "two plain processes"}
 
 
 def places(count: int) -> list[dict[str, float]]:
@@ -33,6 +45,28 @@ def plans(workers: int | str, count: int, folder: Path) -> tuple[Batch, float]:
     """Plans by so many workers, or by a cluster at an address, and the wall time, s."""
     engine: dict[str, Any] = {"cluster": workers} if isinstance(workers, str) else {"workers": workers}
     return timed(lambda: run_batch(placed, places(count), folder / str(len(list(folder.iterdir()))), **engine))
+
+
+def each(tasks: list[dict[str, float]]) -> None:
+    """Plans one after the other, which nobody keeps."""
+    for task in tasks:
+        placed(task)
+
+
+def plain(processes: int, count: int) -> float:
+    """Wall time of the same plans by so many processes that share them evenly, their starts included, s."""
+    tasks = places(count)
+    own = [get_context("spawn").Process(target=each, args=(tasks[k::processes],)) for k in range(processes)]
+
+    def work() -> None:
+        for process in own:
+            process.start()
+        for process in own:
+            process.join()
+            if process.exitcode:
+                raise RuntimeError(f"a plain process ended with {process.exitcode}")
+
+    return timed(work)[1]
 
 
 def ways(count: int, folder: Path) -> dict[str, tuple[Batch, float]]:
@@ -54,14 +88,17 @@ def pace(folder: Path) -> list[float]:
 
 def run(repeats: int = 5) -> dict[str, Any]:
     """Least time of each way, of as many runs as `repeats` but two at most, and the pace of short tasks."""
-    runs = []
+    runs, alone = [], []
     with tempfile.TemporaryDirectory() as name:
         for _ in progress(range(max(1, min(repeats, 2))), "plans"):
             runs.append(ways(PLANS, Path(name)))
+            alone.append({way: plain(processes, PLANS) for processes, way in PLAIN.items()})
         short = Path(name) / "short"
         run_batch(nothing, [{"x": float(i)} for i in range(SHORT)], short, workers=1)
         written = pace(short)
     least = {way: min(run[way][1] for run in runs) for way in runs[0]}
+    bare = {way: min(times[way] for times in alone) for way in PLAIN.values()}
+    given = bare[PLAIN[1]] / bare[PLAIN[2]]
     costs = {way: [result.cost for result in batch] for way, (batch, _) in runs[0].items()}
     rows = [
         {
@@ -77,12 +114,12 @@ def run(repeats: int = 5) -> dict[str, Any]:
     ]
     first, last = written[CUT - 1] - written[0], written[-1] - written[-CUT]
     steps = {"first": first / (CUT - 1) * 1e3, "last": last / (CUT - 1) * 1e3}
-    figures = {row["way"]: row["times_one_worker"] for row in rows} | {
-        "overhead": written[-1] / (len(written) - 1) * 1e3
-    }
+    gains = {way: least["one worker"] / seconds for way, seconds in least.items()}
+    shares = {f"{way}, share": gain / given for way, gain in gains.items()}
+    figures = gains | shares | {"overhead": written[-1] / (len(written) - 1) * 1e3}
     goals = {name: {"figure": figures.get(name), "goal": goal, "unit": unit} for name, (goal, unit) in GOALS.items()}
     times = [{"record": i, "seconds": written[i]} for i in range(0, len(written), max(1, len(written) // 200))]
-    return {"rows": rows, "short": times, "ms_a_short_task": steps, "goals": goals}
+    return {"rows": rows, "plain": {**bare, "gain": given}, "short": times, "ms_a_short_task": steps, "goals": goals}
 
 
 def report(numbers: dict[str, Any]) -> str:
@@ -91,7 +128,8 @@ def report(numbers: dict[str, Any]) -> str:
     words = (
         f"of {SHORT} short tasks one takes {steps['first']:.3g} ms at the beginning, {steps['last']:.3g} ms at the end"
     )
-    return "\n".join([text_table(numbers["rows"], 4), words, against(numbers["goals"], "goal")])
+    plain = f"two plain processes make the same plans {numbers['plain']['gain']:.3g} times as fast as one"
+    return "\n".join([text_table(numbers["rows"], 4), plain, words, against(numbers["goals"], "goal")])
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:
