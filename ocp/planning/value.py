@@ -35,8 +35,6 @@ PAIRS = 200_000
 """Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
 ROUNDS, LOWER = 4, 3
 """Times that the least of a step in a box is looked at nearer, and places on the way to it at first."""
-SUNK = 0.5
-"""Share of its curvature that a bound may lose where the least of all steps is bent less."""
 RISE = 0.02
 """Share of what is left to be gained by which that has to raise it, or it is the last time."""
 
@@ -306,7 +304,7 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Value
             before[rows] = found[rows] if number else -np.inf
             if not number:
                 for one in tangents:
-                    best, found[rows] = best.mixed(one.of(near).leaning(lean[rows]), box, bend)
+                    best, found[rows] = best.mixed(found[rows], one.of(near).leaning(lean[rows]), box, bend)
                 continue
             part = steps.of(near)
             for _ in range(LOWER):
@@ -315,7 +313,7 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Value
                 there = best.lowest(box, bend) if looked_at is None else looked_at
                 touched = part.at(there)
                 one = _tangents(there, touched, curves[near], common[near]).leaning(lean[rows])
-                best, found[rows] = best.mixed(one, box, bend)
+                best, found[rows] = best.mixed(found[rows], one, box, bend)
                 seen = touched[0] - _pressed(common[near], there) - (there * lean[rows]).sum(axis=1)
                 np.minimum.at(most, own_group[rows], seen)
         return np.asarray(np.minimum.reduceat(found, first))
@@ -360,9 +358,12 @@ class Tangents(NamedTuple):
         """Where that is. Shape (P, r)."""
         return least_in_box(self.slope, bend, charts.low, charts.high)[1]
 
-    def mixed(self, other: Tangents, charts: Charts, bend: Array) -> tuple[Tangents, Array]:
-        """The mean with others whose least is the largest, of those level along an axis; and that least."""
-        best, most = self, self.least(charts, bend)
+    def mixed(self, most: Array, other: Tangents, charts: Charts, bend: Array) -> tuple[Tangents, Array]:
+        """The mean with others whose least is the largest, of those level along an axis; and that least.
+
+        Their own least is the `most` that is known. Shape (P,).
+        """
+        best = self
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.clip(np.nan_to_num(-self.slope / (other.slope - self.slope)), 0.0, 1.0)
         for share in (*shares.T, np.ones(len(most))):
@@ -393,12 +394,13 @@ def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: A
 
 
 def _sunk(values: Array, half: Array, curve: Array) -> Array:
-    """How functions in boxes bend down, (M, r, r), by values in the middle, and at each axis' ends."""
+    """How functions in boxes bend down, (M, r, r), by values in the middle, and at each axis' ends.
+
+    No more than leaves of their curvature none.
+    """
     bent = (values[1::2] + values[2::2] - 2 * values[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        bent = np.where(
-            half > 0, np.clip(bent / half**2, -SUNK * np.maximum(np.einsum("paa->pa", curve), 0.0), 0.0), 0.0
-        )
+        bent = np.where(half > 0, np.clip(bent / half**2, -np.maximum(np.einsum("paa->pa", curve), 0.0), 0.0), 0.0)
     return bent[:, :, None] * np.eye(half.shape[1])
 
 
