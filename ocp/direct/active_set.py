@@ -89,7 +89,8 @@ class Newton:
                 return None
             if _same(after, sides):
                 cost, _ = self._program.numbers.values(at.v, arguments["p"])
-                if self._matrix(at.v, arguments["p"], at.lam, *_held(sides, arguments), scales) is None:  # a saddle
+                which = _held(sides, arguments)
+                if self._matrix(at.v, arguments["p"], at.lam, which, scales, local=True) is None:  # it is a saddle
                     return None
                 seconds = time.monotonic() - began
                 return Outcome(at.v, cost, at.rows, at.lam, True, start.status, steps, seconds, False, "newton")
@@ -124,7 +125,7 @@ class Newton:
                 return None
             is_new = matrix is None or missed > GAIN * before
             if is_new:
-                matrix = self._matrix(v, p, lam, fixed, held, scales)
+                matrix = self._matrix(v, p, lam, (fixed, held), scales)
             if matrix is None:
                 return None
             before = missed
@@ -133,14 +134,24 @@ class Newton:
         return None
 
     def _matrix(
-        self, v: np.ndarray, p: np.ndarray, lam: np.ndarray, fixed: np.ndarray, held: np.ndarray, scales: Scales
+        self,
+        v: np.ndarray,
+        p: np.ndarray,
+        lam: np.ndarray,
+        which: tuple[np.ndarray, np.ndarray],
+        scales: Scales,
+        local: bool = False,
     ) -> _Matrix | None:
-        """Newton's matrix, of scaled variables and rows, some fixed and held; None where it is not positive definite.
+        """Newton's matrix, of scaled variables and rows; None where it is not positive definite.
+
+        ``which`` variables are fixed and which rows held. ``local``: The price of a row is against the curvature of its
+        own variables alone: so rounding hides nothing of those that are small.
 
         That it is so exactly if the cost curves upwards along what is free, once the price is high enough, is Finsler's
         lemma.
         """
         a, b, c = scales.variables, scales.rows, scales.cost
+        fixed, held = which
         free = np.where(fixed, 0.0, a)
         curves = self._program.numbers.second(v, p, 1.0 / c, lam / c).data * free[self._first] * free[self._second]
         slopes = (
@@ -149,11 +160,16 @@ class Newton:
         if not np.all(np.isfinite(curves)) or not np.all(np.isfinite(slopes)):
             return None
         size = np.sqrt(np.bincount(self._row, slopes**2, minlength=len(b)))
-        weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-        slopes *= weight[self._row]
-        largest = float(np.abs(curves).max(initial=0.0))
-        price = PRICE * (largest if largest > 0 else 1.0)
         n, m = len(a), len(b)
+        own, among = np.zeros(n), np.zeros(m)
+        for index in (self._first, self._second):
+            np.maximum.at(own, index, np.abs(curves))
+        largest = float(own.max(initial=0.0)) or 1.0
+        if local:
+            np.maximum.at(among, self._row, np.where(slopes != 0, own[self._column], 0.0))
+        weight = np.divide(np.sqrt(np.where(among > 0, among / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
+        slopes *= weight[self._row]
+        price = PRICE * largest
         by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
         by_column = sp.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
         missing = by_column @ by_row

@@ -88,6 +88,23 @@ def test_a_saddle_beside_a_plan_is_none(stiffness: float) -> None:
     assert beside.solver == ("newton" if stiffness < np.pi**2 else "ipopt")
 
 
+def test_a_saddle_to_which_curved_steps_lead_is_none() -> None:
+    """The cost curves upwards in y while |x| < pi: where Newton's steps begin, not where they end; y has no size."""
+    problem = Problem("away")
+    level = problem.parameter("level")
+    x = problem.state("x", initial=level, terminal=level)
+    y = problem.state("y", initial=0.0, terminal=0.0)
+    a, b = problem.control("a"), problem.control("b")
+    problem.dynamics(x, a)
+    problem.dynamics(y, b)
+    problem.horizon(1.0)
+    problem.minimize(running=a**2 + x**2 + b**2 - x**2 * y**2)
+    prepared = ready(problem, Collocation(20))
+    plan = prepared.solve({"level": 2.0}, {"x": 1.0, "y": 0.1})
+    assert prepared.solve({"level": 3.0}, plan).solver == "newton"
+    assert prepared.solve({"level": 3.8}, plan, check=False).solver == "ipopt"
+
+
 def test_units_of_states_controls_and_cost_do_not_matter() -> None:
     """Of powers of two, so that they round nothing: the same steps to the same plan."""
     found = {}
