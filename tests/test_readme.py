@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from scripts.robots import robots
 from scripts.site.executed import blocks
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -53,6 +58,19 @@ def test_the_readme_plans_and_the_tutorials_do_what_they_are_about() -> None:
     assert [page for page, _, _ in ALONE.values()].count(README) == 1
     tutorials = {page.stem for page, _, _ in ALONE.values() if page.parent.name == "tutorials"}
     assert tutorials == {page.stem for page in (SITE / "tutorials").glob("*.md")}
+
+
+def test_the_readme_plans_for_many_places(tmp_path: Path) -> None:
+    """The script that it shows, for one place instead of a hundred times a hundred."""
+    text = README.read_text(encoding="utf-8")
+    script = re.search(r"`places\.py`.*?^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert script is not None
+    assert script[1].count("range(100)") == 2
+    source = script[1].replace("range(100)", "range(1)").replace("ur5.urdf", str(robots.UR5.path))
+    (tmp_path / "places.py").write_text(source, encoding="utf-8")
+    subprocess.run([sys.executable, "places.py"], cwd=tmp_path, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    rows = list(csv.DictReader((tmp_path / "places.csv").read_text(encoding="utf-8").splitlines()))
+    assert [row["status"] for row in rows] == ["done"]
 
 
 def test_the_readme_is_short() -> None:
