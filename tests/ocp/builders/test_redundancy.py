@@ -113,6 +113,7 @@ def test_the_papers_optimum_passes_its_audit_and_beats_the_pseudo_inverse() -> N
     assert solution.cost < 0.6 * local.cost[-1]
 
 
+@pytest.mark.long
 def test_the_papers_optimum_satisfies_the_minimum_principle() -> None:
     """(31), (35): the free end has no costate, H is constant, and u minimises H in the null space of G."""
     machine = paper_example()

@@ -269,8 +269,10 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
 
 @pytest.mark.parametrize(
     ("standing", "task", "start", "external", "index"),
-    [(arm(), arm_task(), ARM_START, tool, -0.3), (six(), six_task(), SIX_START, six_tool, -0.01)],
-    ids=["seven joints", "six joints"],
+    [
+        pytest.param(arm(), arm_task(), ARM_START, tool, -0.3, marks=pytest.mark.long, id="seven joints"),
+        pytest.param(six(), six_task(), SIX_START, six_tool, -0.01, id="six joints"),
+    ],
 )
 def test_a_spatial_arm_stands_where_the_local_method_tips(
     standing: Standing, task: TipTask, start: Any, external: Any, index: float

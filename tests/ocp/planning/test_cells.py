@@ -31,7 +31,9 @@ def example(horizon: float) -> TipTask:
     return TipTask(velocity=[-1.0, -1.0], rows=[3, 4], duration=horizon)
 
 
-@pytest.mark.parametrize("horizon", EXTREMALS)
+@pytest.mark.parametrize(
+    "horizon", [each if each == 3.5 else pytest.param(each, marks=pytest.mark.long) for each in EXTREMALS]
+)
 def test_from_the_start_alone_every_extremal_known_of_the_paper_is_found(horizon: float) -> None:
     found = plan(paper_example(), example(horizon), start=START, search="global", clearance=None)
     known = EXTREMALS[horizon]

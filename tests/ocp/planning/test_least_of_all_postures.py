@@ -35,6 +35,7 @@ def other_postures() -> list[Array]:
     return kept
 
 
+@pytest.mark.long
 def test_no_posture_leads_to_a_cheaper_seam() -> None:
     """By `minimum_velocity_problem`, the start free along its self-motion, on a mesh of its own."""
     what, found = ASKED["seam_ur5"](), cheapest()
@@ -54,7 +55,6 @@ def test_no_posture_leads_to_a_cheaper_seam() -> None:
     assert min(costs) == pytest.approx(found.cost, rel=1e-6)
 
 
-@pytest.mark.long
 @pytest.mark.long
 def test_every_motion_is_told_with_its_cost_and_why_it_is_not_the_plan() -> None:
     found, one = cheapest(), planned("seam_ur5")
