@@ -32,6 +32,7 @@ PARTS = (
     "cts",
     "blend",
     "robots",
+    "distances",
 )
 """Modules of scripts/timing, each with run(repeats) -> numbers, plot(path, numbers) and report(numbers) -> text."""
 TOGETHER = PARTS[:2]

@@ -38,7 +38,7 @@ NO_EDGE = 1e-18
 """Squared sine of an angle: edges at less span no direction that could separate."""
 BARRED = 1e9
 """m: taken from the gap along a direction that is none."""
-GRAIN = 2.0**40
+GRAIN = 2.0**53
 """Steps of a segment at which its piece is looked up."""
 
 
@@ -163,9 +163,50 @@ def pair_function(one: type[Shape], other: type[Shape], rounding: float = 0.0) -
 
 
 @cache
+def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int) -> Any:
+    """Function (columns of ones, columns of others) -> distances of n pairs side by side, and their wrenches.
+
+    Of the columns, one pair a row, shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6): (moment about
+    the world's origin, force) w, with which a distance grows at the rate w . (twist of one - twist of other), twists
+    being (angular, linear at the world's origin). Nearest points move along the shapes without changing the distance,
+    so that only the places of points of the shapes are differentiated (envelope theorem). The operations are those of
+    columns as wholes, which an interpreter does several times faster than pair after pair.
+
+    Args:
+        one, other, rounding: As of `pair_function`. count: n.
+
+    Raises:
+        ModelError: As of `pair_function`.
+    """
+    kinds = (one, other)
+    pair_function(one, other, rounding)
+    given = [ca.MX.sym(kind.__name__, count, COLUMNS[kind]) for kind in kinds]
+    # the derivative by the shape of fewer numbers tells the wrench
+    side = 0 if COLUMNS[one] <= COLUMNS[other] else 1
+    points, directions = VECTORS[kinds[side]]
+    vectors = ca.MX.sym("vectors", count, 3 * (points + directions))
+    rows = [ca.horzsplit(each) for each in given]
+    rows[side][: vectors.shape[1]] = ca.horzsplit(vectors)
+    first, second = (_core_of(kind, each) for kind, each in zip(kinds, rows, strict=True))
+    gap = _between(first, second, rounding, held=True)
+    for kind, each in zip(kinds, rows, strict=True):
+        gap -= each[-1] if kind in (Sphere, Capsule) else 0
+    slopes = ca.horzsplit(ca.gradient(ca.sum1(gap), vectors))
+    moment, force = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    for k in range(points + directions):
+        (x, y, z), (a, b, c) = rows[side][3 * k : 3 * k + 3], slopes[3 * k : 3 * k + 3]
+        moment = list(_add(_triple(moment), (y * c - z * b, z * a - x * c, x * b - y * a)))
+        force = list(_add(_triple(force), (a, b, c))) if k < points else force
+    wrench = ca.horzcat(*moment, *force) * (1 if side == 0 else -1)
+    inner = ca.Function("wrenches", [*given, vectors], [gap, wrench])
+    own = given[side][:, : vectors.shape[1]]
+    return ca.Function("wrenches", given, inner.call([*given, own], True, False))
+
+
+@cache
 def _pair_function(kinds: tuple[Any, Any], rounding: float) -> Any:
     columns = [ca.SX.sym(kind.__name__, COLUMNS[kind]) for kind in kinds]
-    one, other = (_core_of(kind, entries) for kind, entries in zip(kinds, columns, strict=True))
+    one, other = (_core_of(kind, ca.vertsplit(entries)) for kind, entries in zip(kinds, columns, strict=True))
     gap = _between(one, other, rounding)
     for kind, entries in zip(kinds, columns, strict=True):
         gap -= entries[-1] if kind in (Sphere, Capsule) else 0
@@ -227,8 +268,8 @@ def _written_out(
     return _between(first, second, rounding) - (one.swelling + other.swelling)
 
 
-def _between(one: Core, other: Core, rounding: float) -> Expression:
-    """Signed distance of two cores."""
+def _between(one: Core, other: Core, rounding: float, held: bool = False) -> Expression:
+    """Signed distance of two cores; if held, without derivatives by way of where on segments the nearest points are."""
     if isinstance(one, Plane):
         return _lowest(other, one.normal, one.point, rounding)
     if isinstance(other, Plane):
@@ -237,10 +278,11 @@ def _between(one: Core, other: Core, rounding: float) -> Expression:
         gaps = [*_gaps(one, other, rounding), *_gaps(other, one, rounding)]
         return _highest(gaps, rounding)
     if isinstance(one, Rod) and isinstance(other, Rod):
-        return _rods(one, other, rounding)
+        return _rods(one, other, rounding, held)
     if isinstance(one, Block) and isinstance(other, Block):
-        return _blocks(one, other, rounding)
-    return _rod_block(one, other, rounding) if isinstance(other, Block) else _rod_block(other, one, rounding)
+        return _blocks(one, other, rounding, held)
+    rod, block = (one, other) if isinstance(other, Block) else (other, one)
+    return _rod_block(rod, block, rounding, held)
 
 
 # ---- cores in world -----------------------------------------------------------------------------------------------
@@ -265,9 +307,9 @@ def _core(shape: Shape, turn: Expression, place: Expression) -> Core:
     return Solid(centre, axes, shape.hull)
 
 
-def _core_of(kind: type[Shape], entries: Expression) -> Core:
-    """The core of a shape of this kind that is written as a column."""
-    parts = [_scalars(entries[3 * k : 3 * k + 3]) for k in range(entries.shape[0] // 3)]
+def _core_of(kind: type[Shape], entries: Sequence[Expression]) -> Core:
+    """The core of a shape of this kind that is written as a column, entry by entry."""
+    parts = [_triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return Block(parts[0], (parts[1], parts[2], parts[3]), parts[4])
     return Plane(parts[0], parts[1]) if kind is HalfSpace else Rod(tuple(parts))
@@ -355,7 +397,7 @@ def _least(values: Sequence[Expression], rounding: float) -> Expression:
 # ---- rods ---------------------------------------------------------------------------------------------------------
 
 
-def _rods(one: Rod, other: Rod, rounding: float) -> Expression:
+def _rods(one: Rod, other: Rod, rounding: float, held: bool) -> Expression:
     """Distance of points and segments; that of crossing segments is 0, which is their depth."""
     if len(one.points) < len(other.points):
         one, other = other, one
@@ -366,15 +408,15 @@ def _rods(one: Rod, other: Rod, rounding: float) -> Expression:
     u = _subtract(one.points[1], p)
     if len(other.points) == 1:
         s = _clip(-_dot(u, gap) / (_dot(u, u) + KINK**2))
-        apart = _along(gap, s, u)
+        apart = _along(gap, _placed(s) if held else s, u)
         return _root(_dot(apart, apart), 0.0)
     v = _subtract(other.points[1], q)
     weight = rounding**2
-    square = _segments(gap, u, v, weight)
+    square = _segments(gap, u, v, weight, held)
     return _root(square, weight / 2)
 
 
-def _segments(gap: Triple, u: Triple, v: Triple, weight: float) -> Expression:
+def _segments(gap: Triple, u: Triple, v: Triple, weight: float, held: bool) -> Expression:
     """Least over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
 
     s of the whole plane, cut to 0..1; then the best t for it, cut; then the best s for that (Ericson, Real-Time
@@ -385,6 +427,7 @@ def _segments(gap: Triple, u: Triple, v: Triple, weight: float) -> Expression:
     s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, PARALLEL * a * e))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
+    s, t = (_placed(s), _placed(t)) if held else (s, t)
     apart = _along(_along(gap, s, u), -t, v)
     square = _dot(apart, apart)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
@@ -393,7 +436,7 @@ def _segments(gap: Triple, u: Triple, v: Triple, weight: float) -> Expression:
 # ---- rods and boxes -----------------------------------------------------------------------------------------------
 
 
-def _rod_block(rod: Core, block: Core, rounding: float) -> Expression:
+def _rod_block(rod: Core, block: Core, rounding: float, held: bool) -> Expression:
     assert isinstance(rod, Rod)
     assert isinstance(block, Block)
     ends = [_into(_subtract(point, block.centre), block.axes) for point in rod.points]
@@ -404,11 +447,11 @@ def _rod_block(rod: Core, block: Core, rounding: float) -> Expression:
         return _root(_dot(outside, outside), 0.0) + ca.fmin(reduce(ca.fmax, over), 0)
     u = _subtract(ends[1], p)
     middle, weight = _along(p, 0.5, u), rounding**2
-    away = _root(_segment_box(middle, u, block.half, weight), weight / 4)
+    away = _root(_segment_box(middle, u, block.half, weight, held), weight / 4)
     return away + _negative_part(_segment_box_gap(middle, u, block.half), rounding)
 
 
-def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float) -> Expression:
+def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float, held: bool) -> Expression:
     """Least over s in -1/2..1/2 of the squared distance of middle + s u to a box plus weight s^2, in the box's axes.
 
     Half of its derivative is weight s and of each axis u_k (x_k - what x_k is cut to by the box), which is zero while
@@ -430,11 +473,16 @@ def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float) -> Expr
             pull, rise = pull + taken * (u[k] * over[k] - squares[k] * s), rise + taken * squares[k]
         left = [keep * (1 - taken) for keep, taken in zip(left, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
-        if step < 2:
-            s = ca.floor(s * GRAIN) / GRAIN
+        if step < 2 or held:
+            s = _placed(s)
     outside = [x - _clip(x, -h, h) for x, h in zip(_along(middle, s, u), half, strict=True)]
     square = sum(x * x for x in outside)
     return square + weight * s**2 if weight else square
+
+
+def _placed(s: Expression) -> Expression:
+    """A place along a segment, without derivatives; the grid is so fine that the distance there is the same."""
+    return ca.floor(s * GRAIN) / GRAIN
 
 
 def _farthest(over: Triple, sizes: Triple) -> list[Expression]:
@@ -466,7 +514,7 @@ def _per_length(gap: Expression, square: Expression, least: Expression) -> Expre
 # ---- two boxes ----------------------------------------------------------------------------------------------------
 
 
-def _blocks(one: Block, other: Block, rounding: float) -> Expression:
+def _blocks(one: Block, other: Block, rounding: float, held: bool) -> Expression:
     """The largest gap along 15 directions where they overlap, else the least of the distances of the 12 edges of one to
     the other and of the 8 corners of that to the first.
 
@@ -477,7 +525,7 @@ def _blocks(one: Block, other: Block, rounding: float) -> Expression:
     """
     if rounding == 0:
         gap = reduce(ca.fmax, _block_gaps(one, other))
-        square = reduce(ca.fmin, [*_edges_to(one, other), *_corners_to(other, one)])
+        square = reduce(ca.fmin, [*_edges_to(one, other, held), *_corners_to(other, one)])
         return _root(square * (gap > 0), 0.0) + ca.fmin(gap, 0)
     gaps = _block_gaps(one, other, rounding / sum((*one.half, *other.half)))
     gap = _highest(gaps, rounding)
@@ -488,7 +536,7 @@ def _blocks(one: Block, other: Block, rounding: float) -> Expression:
     return _highest(away, rounding) + _negative_part(gap, rounding)
 
 
-def _edges_to(one: Block, other: Block) -> list[Expression]:
+def _edges_to(one: Block, other: Block, held: bool) -> list[Expression]:
     """Squares of the distances of the edges of one box to another."""
     centre, reaches = _in_axes_of(one, other)
     found = []
@@ -496,7 +544,7 @@ def _edges_to(one: Block, other: Block) -> list[Expression]:
         direction = _triple(2 * part for part in reaches[k])
         for side, back in product((-1.0, 1.0), repeat=2):
             middle = _along(_along(centre, side, reaches[i]), back, reaches[j])
-            found.append(_segment_box(middle, direction, other.half, 0.0))
+            found.append(_segment_box(middle, direction, other.half, 0.0, held))
     return found
 
 

@@ -248,3 +248,39 @@ def test_a_slide_without_limits() -> None:
     long = Robot((Link("ground", 1.0), *robot.links), tuple(turned), tip="left")
     with pytest.raises(ModelError, match="rail"):
         _ = Surroundings(FixedBase(long), OBSTACLES[:1]).levers
+
+
+@pytest.mark.parametrize(("name", "rounding"), [("arm", 0.0), ("arm", 0.01), ("slider", 0.01), ("space", 0.01)])
+def test_gradients_of_distances_are_their_derivatives(name: str, rounding: float) -> None:
+    """By joints, slides, followers, a base that floats, beside what stands and what turns; pairs in any order."""
+    machine = machines()[name]
+    tumbling = Moving(Box((0.2, 0.3, 0.4)), lambda t: (0.5, 0.3 * t, 0.5), lambda t: turned(t))
+    around = Surroundings(machine, (*OBSTACLES, tumbling))
+    order = np.random.default_rng(6).permutation(len(around.pairs)).tolist()
+    function = around.distance_gradients(pairs=order, rounding=rounding)
+    base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
+    told = around.distances(base, q, t, pairs=order, rounding=rounding)
+    known = ca.Function("known", [base, q, t], [told, ca.jacobian(told, ca.vertcat(base, q))])
+    for b, j, at in zip(*postures(machine, 15, 7), np.linspace(0.0, 2.0, 15), strict=True):
+        values, slopes = (np.array(part) for part in function(b, j, at))
+        expected, derived = (np.array(part) for part in known(b, j, at))
+        assert slopes.shape == (len(order), machine.base_size + machine.joint_size)
+        assert_allclose(values, expected, atol=1e-12)
+        if machine.base_size:  # a unit quaternion stays one
+            along = np.r_[np.zeros(3), b[3:], np.zeros(machine.joint_size)]
+            slopes, derived = (part - np.outer(part @ along, along) for part in (slopes, derived))
+        assert_allclose(slopes, derived, atol=1e-9)
+
+
+def turned(t: Any) -> Any:
+    c, s = ca.cos(t), ca.sin(t)
+    return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+
+
+def test_gradients_of_no_pairs_have_no_rows() -> None:
+    machine = machines()["arm"]
+    values, slopes = Surroundings(machine, OBSTACLES).distance_gradients(pairs=[])(
+        (), np.zeros(machine.joint_size), 0.0
+    )
+    assert values.shape == (0, 1)
+    assert slopes.shape == (0, machine.joint_size)
