@@ -14,9 +14,9 @@ import pytest
 
 from models import CollisionShape, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
 from models.arrays import Array
-from models.shapes.bodies import Body, bodies_of
+from models.shapes.bodies import Body, LinkMesh, bodies_of
 from models.shapes.distance import distance
-from models.shapes.pairs import ALWAYS, COVERED, NEIGHBOURS, NEVER, RIGID, SRDF, TOLD, Pairs, checked_pairs
+from models.shapes.pairs import ALWAYS, COVERED, NEIGHBOURS, NEVER, RIGID, SRDF, TOLD, Pairs, _bound, checked_pairs
 from models.shapes.shapes import Box, Capsule, Sphere
 from tests import redundancy_benchmark
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
@@ -158,6 +158,32 @@ def test_fixed_links_are_one_rigid_part_and_links_without_bodies_are_passed_over
 
 SRDF_TEXT = """<robot name="chain"><disable_collisions link1="link2" link2="link0" reason="Never"/>
 <disable_collisions link1="link0" link2="ghost"/></robot>"""
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.1)])
+def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[float, float, float]) -> None:
+    """A cube always within another one, though the spheres that cover them might stand out of both: that they touch."""
+    robot, _ = chain(0.1, 0.001, 0.1)
+    held = Joint("held", "fixed", "link0", "plate", shift)
+    robot = Robot((*robot.links, Link("plate")), (*robot.joints, held))
+    corners = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    middle = np.array([0.1, 0.0, 0.0]) - shift
+    plate = Body("plate", Sphere(0.09, middle), 0.04, LinkMesh(0.05 * corners + middle))
+    inner = Body("link2", Sphere(0.04, (0.0, 0.0, 0.0)), 0.1, LinkMesh(0.02 * corners))
+    between = Body("link1", Sphere(0.01, (0.0, 0.0, 0.0)))
+    assert checked_pairs(robot, (plate, between, inner)).left["plate", "link2"] == ALWAYS
+
+
+@pytest.mark.parametrize("slope", [-2.0, 0.0, 0.5])
+def test_the_bound_is_exact_where_a_capsule_crosses_an_edge(slope: float) -> None:
+    """Square across from the edge at x = y = 0.1 of a box, which lies along z; from each of the two shapes."""
+    box, out = Box((0.2, 0.2, 0.6)), np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    across = np.array([1.0, -1.0, slope])
+    middle = np.array([0.1, 0.1, 0.05]) + 0.07 * out
+    capsule = Capsule(0.02, middle - 0.1 * across, middle + 0.05 * across)
+    turn, shift = np.eye(3)[None], np.zeros((1, 3))
+    assert _bound(box, capsule)(turn, shift) == pytest.approx([0.05], abs=1e-12)
+    assert _bound(capsule, box)(turn, shift) == pytest.approx([0.05], abs=1e-12)
 
 
 def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
