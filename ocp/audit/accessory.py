@@ -21,8 +21,8 @@ from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
 from ocp.audit.sizes import FLOOR
+from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Formulation
-from ocp.problem.problem import Variable
 
 __all__ = ["AccessoryProblem", "end_conditions"]
 

@@ -15,7 +15,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, unknown_name
-from ocp.problem.problem import Constraint, Declarations, Problem, Signal, Variable, checked_problem
+from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
+from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Bounds", "Formulation", "Rows", "Sampler", "at_samples", "in_blocks"]

@@ -27,7 +27,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, checked_text, unknown_name
-from ocp.problem.problem import Constraint, PhaseTimes, Problem, Variable, checked_problem
+from ocp.problem.declarations import Constraint, PhaseTimes, Variable
+from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.separation import Separation
 from ocp.problem.values import constant, identity, is_symbolic, numeric
 

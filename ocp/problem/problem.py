@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import wraps
 from typing import Any, TypeVar, cast
 
@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
+from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
 from ocp.problem.hulls import Hull
 from ocp.problem.separation import Separation
 from ocp.problem.stored import restored, stored
@@ -31,13 +32,10 @@ from ocp.problem.values import (
     table,
 )
 
-__all__ = ["Constraint", "Declarations", "Horizon", "Problem", "Signal", "Variable", "checked_problem"]
+__all__ = ["Problem", "checked_problem"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
-Guess = Any  # a value, or a function of time that returns one
-ENDS = ("initial", "terminal")
 RESERVED = ("t", "time", "horizon")
-WIDTH = 100  # of an expression shown as text
 Declare = TypeVar("Declare", bound=Callable[..., Any])
 
 
@@ -57,139 +55,6 @@ def checked_problem(problem: Any) -> Problem:
     if not isinstance(problem, Problem):
         raise ProblemError(f"a Problem is expected, not {type(problem).__name__}", name="problem", value=problem)
     return problem
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A named state, control or parameter.
-
-    Attributes:
-        name: Its name, unique in the problem.
-        symbol: Its symbol. Shape (n, 1).
-        lower, upper: Bounds, casadi expressions of parameters. Shape (n, 1).
-        initial, terminal: Values at both ends, nan where an entry is free. Shape (n, 1). States only.
-        guess: A value, a function of time, or None. States and controls only.
-        unit: For those who read it, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
-        scale: Sizes that solvers divide the entries by, nan where they find them. Shape (n,), or None for all nan.
-    """
-
-    name: str
-    symbol: Any
-    lower: Any = None
-    upper: Any = None
-    initial: Any = None
-    terminal: Any = None
-    guess: Guess = None
-    unit: str = ""
-    scale: Any = None
-
-    @property
-    def size(self) -> int:
-        return int(self.symbol.numel())
-
-    def __str__(self) -> str:
-        low, high = _column_text(self.lower), _column_text(self.upper)
-        bounds = "" if (low, high) == ("-inf", "inf") else f" in [{low}, {high}]"
-        return f"{self.name} ({self.size}){bounds} {self.unit}".rstrip()
-
-
-@dataclass(frozen=True)
-class Signal:
-    """A named, known function of time.
-
-    Attributes:
-        name: Its name, unique in the problem.
-        symbol: What stands for its value. Shape (n, 1).
-        function: casadi Function time (s) -> value.
-    """
-
-    name: str
-    symbol: Any
-    function: Any
-
-    @property
-    def size(self) -> int:
-        return int(self.symbol.numel())
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """A named vector constraint ``lower <= expression <= upper``; equal bounds make an equality.
-
-    Attributes:
-        name: Its name, unique among the constraints of the problem.
-        expression: Shape (m, 1).
-        lower, upper: casadi expressions of parameters. Shape (m, 1).
-        unit: As of a variable.
-        integral: Whether it is the integral of the expression over time that is meant. Of what is watched only.
-        way: Rate of the way that it is judged against, shape (m, 1), or None. Of what is watched only.
-    """
-
-    name: str
-    expression: Any
-    lower: Any
-    upper: Any
-    unit: str = ""
-    integral: bool = False
-    way: Any = None
-
-    @property
-    def size(self) -> int:
-        return int(self.expression.numel())
-
-    def __str__(self) -> str:
-        low, high = _column_text(self.lower), _column_text(self.upper)
-        what = f"integral of {_short(self.expression)} dt" if self.integral else _short(self.expression)
-        return f"{self.name} ({self.size}): {low} <= {what} <= {high} {self.unit}".rstrip()
-
-
-@dataclass
-class Horizon:
-    """The final time: fixed when lower and upper are one expression."""
-
-    symbol: Any
-    lower: Any
-    upper: Any
-    guess: float | None
-    fixed: bool
-
-
-@dataclass(frozen=True)
-class PhaseTimes:
-    """When a phase is, of a problem of several one after the other (:mod:`ocp.problem.phases`).
-
-    Attributes:
-        name: Of the phase. What belongs to it bears names that begin with it and a dot.
-        begin, duration: Expressions of states that stand still, and of parameters. Scalars, s.
-        running, terminal: Its own share of the cost: density over the fraction of the phase, and what comes at its end.
-    """
-
-    name: str
-    begin: Any
-    duration: Any
-    running: Any
-    terminal: Any
-
-
-@dataclass
-class Declarations:
-    """Everything declared so far, by kind and name, in order of declaration."""
-
-    states: dict[str, Variable] = field(default_factory=dict)
-    controls: dict[str, Variable] = field(default_factory=dict)
-    parameters: dict[str, Variable] = field(default_factory=dict)
-    signals: dict[str, Signal] = field(default_factory=dict)
-    dynamics: dict[str, Any] = field(default_factory=dict)
-    path: dict[str, Constraint] = field(default_factory=dict)
-    start: dict[str, Constraint] = field(default_factory=dict)
-    end: dict[str, Constraint] = field(default_factory=dict)
-    watch: dict[str, Constraint] = field(default_factory=dict)
-    apart: dict[str, Separation] = field(default_factory=dict)
-    phases: dict[str, PhaseTimes] = field(default_factory=dict)
-    at_start: dict[str, Any] = field(default_factory=dict)
-    horizon: Horizon | None = None
-    running: Any = None
-    terminal: Any = None
 
 
 class Problem:
@@ -541,26 +406,7 @@ class Problem:
 
     def __str__(self) -> str:
         """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
-        d, lines = self.declared, [f"Problem {self.name!r}"]
-        if d.horizon is None:
-            lines.append("  horizon      not declared")
-        elif d.horizon.fixed:
-            lines.append(f"  horizon      {_column_text(d.horizon.lower)} s")
-        else:
-            lines.append(f"  horizon      free in [{_column_text(d.horizon.lower)}, {_column_text(d.horizon.upper)}] s")
-        for state in d.states.values():
-            ends = [f"; {end} {text}" for end in ENDS if (text := _column_text(getattr(state, end))) != "nan"]
-            lines.append(f"  state        {state}{''.join(ends)}")
-        lines += [f"  control      {control}" for control in d.controls.values()]
-        lines += [f"  parameter    {p.name} ({p.size})" for p in d.parameters.values()]
-        lines += [f"  signal       {s.name} ({s.size})" for s in d.signals.values()]
-        lines += [f"  d{state}/dt = {_short(rate)}" for state, rate in d.dynamics.items()]
-        for kind in ("path", "start", "end", "watch"):
-            lines += [f"  {kind:<12} {constraint}" for constraint in getattr(d, kind).values()]
-        lines += [f"  apart        {apart}" for apart in d.apart.values()]
-        if d.running is not None:
-            lines.append(f"  minimize     integral of {_short(d.running)} dt + {_short(d.terminal)}")
-        return "\n".join(lines)
+        return f"Problem {self.name!r}\n{self.declared}"
 
     def __repr__(self) -> str:
         d = self.declared
@@ -749,21 +595,3 @@ class Problem:
         if any(name in pool for pool in (d.path, d.start, d.end, d.watch, d.apart)):
             raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
         return f"{kind} {name!r}"
-
-
-def _column_text(value: Any) -> str:
-    """A column of numbers or expressions; one number where all entries are the same."""
-    if isinstance(value, ca.MX):
-        if ca.symvar(value):
-            return _short(str(value))
-        value = ca.evalf(value)
-    entries = [str(entry) for entry in ca.vertsplit(value)]
-    return entries[0] if len(set(entries)) == 1 else _short("[" + ", ".join(entries) + "]")
-
-
-def _short(expression: Any) -> str:
-    """An expression on one line of bounded length. SX prints its shared parts first; only bounded text is kept."""
-    if not isinstance(expression, str) and ca.Function("size", ca.symvar(expression), [expression]).n_nodes() > 60:
-        return f"expression of {', '.join(s.name() for s in ca.symvar(expression)[:8])}, ..."
-    text = " ".join(str(expression).split())
-    return text if len(text) <= WIDTH else text[: WIDTH - 3] + "..."
