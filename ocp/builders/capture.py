@@ -26,24 +26,17 @@ import numpy as np
 
 from models import FreeFloating, Thruster, center_of_mass, wheels_of
 from models.arrays import Array
+from ocp.audit.clearance import Clearance
 from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
 from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem
 from ocp.builders.dynamics_plan import within_limits
-from ocp.builders.grasping import (
-    Cone,
-    Grasp,
-    checked_pair,
-    distances,
-    grasp_wrench,
-    motion_of,
-    pair_momentum,
-    require_room,
-)
+from ocp.builders.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum, require_room
 from ocp.builders.standing.problem import FreeTime
+from ocp.builders.target_clearance import ClearOfTarget
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_each, checked_instance, checked_nonnegative, floats
+from ocp.errors import ProblemError, checked_each, checked_instance, floats
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -68,7 +61,7 @@ class AskedOfCapture(TypedDict, total=False):
     thrusters: Sequence[Thruster]
     cone: Cone | None
     grasp: Grasp | None
-    clearance: float | None
+    clearance: float | ClearOfTarget | None
     clear: Clear | None
     end_joints: Any
     rest: bool
@@ -101,7 +94,7 @@ def capture_problem(
             cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
             grasp: What the hand bears while detumbling.
             clearance: How far the chaser's bodies stay from the target's while approaching, m, but for those of the
-            link that grasps; None: they are not looked at.
+            hand: what moves with the tip, and what hangs on it. None: they are not looked at.
             clear: What the chaser stays clear of besides while approaching, as of `dynamics_problem`.
             end_joints: At the end of the detumbling. Shape (n,), nan where free, as those of wheels.
             rest: Whether joints (but for wheels) and base turn no more at the end; True if not given.
@@ -121,6 +114,7 @@ def capture_problem(
     base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
     begins = {"joints": ca.DM(given.arm) * end["joints"]}
     if given.thrusters:
+        begins["base"] = _of_unit_length(chaser, end["base"])
         base = ca.vertcat(base, one.at_end("momentum"))
         begins["momentum"] = pair_momentum(
             chaser, target, end["base"], end["target"], end["joints"], one.at_end("momentum")
@@ -160,13 +154,13 @@ def plan_capture(
         SolveError: As of `plan_dynamics`.
     """
 
-    def declare(clear: Clear | None) -> Problem:
-        asked["clear"] = clear
-        return capture_problem(chaser, target, start_joints, approach, detumble, **asked)
+    def declare(kept: _Kept) -> Problem:
+        return capture_problem(chaser, target, start_joints, approach, detumble, **kept.told(asked))
 
     mesh = POINTS if method is None else method
     driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    return within_limits(declare, asked.get("clear"), mesh, (), options, tolerances, driven)
+    given = _Capture.of(chaser, target, start_joints, asked)
+    return within_limits(declare, given.kept, mesh, (), options, tolerances, driven)
 
 
 @interruptible
@@ -194,26 +188,41 @@ def chained_capture(
     given = _Capture.of(chaser, target, start_joints, asked)
     given.detumbling(detumble, None)  # refused before the approach is solved
 
-    def first(clear: Clear | None) -> Problem:
-        problem = replace(given, asked={**given.asked, "clear": clear}).approach(approach)
+    def first(kept: _Kept) -> Problem:
+        problem = replace(given, asked=kept.told(given.asked)).approach(approach)
         given.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
         given.guess_approach(problem)
         return problem
 
-    one = within_limits(first, asked.get("clear"), mesh, (), options, tolerances, {"": (chaser, limits)})
+    one = within_limits(first, given.kept, mesh, (), options, tolerances, {"": (chaser, limits)})
     end = dict(one.at_fraction(1.0))
     end["joints"] = given.arm * end["joints"]
-    end["base"] = _of_unit_length(chaser, end["base"])
+    end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
-    def second(_: Clear | None) -> Problem:
+    def second(_: _Kept) -> Problem:
         problem = given.detumbling(detumble, end)
         guess_braking(problem, given.pair_after(end), end["joints"], end["velocities"], end["base"])
         return problem
 
-    return one, within_limits(second, None, mesh, (), options, tolerances, {"": (given.pair, limits)})
+    return one, within_limits(second, _Kept(None, None), mesh, (), options, tolerances, {"": (given.pair, limits)})
 
 
 # ---- inside ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """What the approach stays clear of: itself and its surroundings, and the target."""
+
+    clear: Clear | None
+    target: ClearOfTarget | None
+
+    def widened(self, proofs: Sequence[Clearance]) -> _Kept:
+        return _Kept(self.clear and self.clear.widened(proofs), self.target and self.target.widened(proofs))
+
+    def told(self, asked: AskedOfCapture) -> AskedOfCapture:
+        """What is asked, with these margins."""
+        return {**asked, "clear": self.clear, "clearance": self.target}
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,6 +265,19 @@ class _Capture:
         asked: Mapping[str, Any] = self.asked
         return {name: asked[name] for name in ("limits", "effort", "friction", "thrusters") if name in asked}
 
+    @property
+    def kept(self) -> _Kept:
+        """What a first plan stays clear of: none of the target's bodies is held before it comes too near."""
+        near = self.clear_of_target
+        return _Kept(self.asked.get("clear"), near and replace(near, margins={}))
+
+    @property
+    def clear_of_target(self) -> ClearOfTarget | None:
+        near, limits = self.asked.get("clearance"), self.asked.get("limits")
+        if near is None or isinstance(near, ClearOfTarget):
+            return near
+        return ClearOfTarget.of(self.chaser, self.target, near, limits=limits is None or limits.joints)
+
     def approach(self, duration: float | FreeTime) -> Problem:
         """The first phase: the target's motion, and the grasp at the end."""
         chaser, target, asked = self.chaser, self.target, self.asked
@@ -272,13 +294,13 @@ class _Capture:
         problem.dynamics(goal, target.base_rate(goal, none, none))
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone, near = asked.get("cone"), asked.get("clearance")
+        cone, near = asked.get("cone"), self.clear_of_target
         if cone is not None:
             self._require_inside(cone)
             problem.path("cone", cone.inside(place), lower=0.0, unit="m")
         if near is not None:
-            apart = distances(chaser, target, base, joints, goal)
-            problem.path("apart", apart, lower=checked_nonnegative("capture: clearance", near), unit="m")
+            near.require_room(self.base, self.joints, self.target_base)
+            near.declare(problem, base[: chaser.base_size], joints, goal)
         return problem
 
     def _require_inside(self, cone: Cone) -> None:
@@ -368,7 +390,8 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
     return joints, rates, base
 
 
-def _of_unit_length(machine: FreeFloating, base: Array) -> Array:
+def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
+    """The configuration, its quaternion a unit one."""
     if machine.base == "planar":
         return base
-    return np.concatenate([base[:3], base[3:] / np.linalg.norm(base[3:])])
+    return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,10 @@ from ocp.problem.separation import Separation
 from ocp.problem.values import constant
 from ocp.solution import Solution
 
-__all__ = ["LOOKS", "MARGIN", "ROUNDING", "Clear", "clearance_of", "keeping_clear", "touching_error"]
+__all__ = [
+    "CLEARANCE", "LOOKS", "MARGIN", "ROUNDING", "Clear", "Keeping", "Kept", "clearance_of", "keeping_clear",
+    "of_clearance", "touching_error", "widened",
+]  # fmt: skip
 
 CLEARANCE = "clearance"
 """Name of what the audit proves, and of the constraints, with the suffix of a stretch of time."""
@@ -75,15 +78,7 @@ class Clear:
 
     def widened(self, proofs: Sequence[Clearance]) -> Clear:
         """The same with what came too near held apart, farther by what it missed."""
-        labels = {label: pair for pair, label in enumerate(self.surroundings.labels)}
-        margins = dict(self.margins)
-        for proof in proofs:
-            for near in proof.pairs:
-                if near.missed > 0:
-                    pair = labels[near.bodies]
-                    held = pair in self.margins
-                    margins[pair] = self.margins[pair] + 1.5 * near.missed + MARGIN if held else MARGIN
-        return replace(self, margins=margins)
+        return replace(self, margins=widened(self.margins, self.surroundings.labels, proofs))
 
     def declare(
         self,
@@ -149,6 +144,27 @@ class Clear:
         return touches(self.surroundings, base, joints, times)
 
 
+class Keeping(Protocol):
+    """What is held apart, by margins that grow."""
+
+    def widened(self, proofs: Sequence[Clearance]) -> Self:
+        """The same with what came too near held apart, farther by what it missed."""
+
+
+def widened(
+    margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
+) -> dict[int, float]:
+    """Margins of pairs, m, by their places among the labels, grown by what the pairs missed; of other pairs nothing."""
+    places = {label: pair for pair, label in enumerate(labels)}
+    found = dict(margins)
+    for proof in proofs:
+        for near in proof.pairs:
+            if near.missed > 0 and near.bodies in places:
+                pair = places[near.bodies]
+                found[pair] = margins[pair] + 1.5 * near.missed + MARGIN if pair in margins else MARGIN
+    return found
+
+
 def clearance_of(
     around: Surroundings,
     joints: Callable[[Array], Array],
@@ -199,7 +215,11 @@ def _check_limits(around: Surroundings, joints: Variable) -> None:
         raise ProblemError(words, name=name)
 
 
-def keeping_clear(clear: Clear | None, run: Callable[[Clear | None], Solution]) -> Solution:
+Kept = TypeVar("Kept", bound=Keeping | None)
+"""What a planner is told to keep apart, or None."""
+
+
+def keeping_clear(clear: Kept, run: Callable[[Kept], Solution]) -> Solution:
     """What ``run`` plans, with the bodies held apart that come too near in what it planned before.
 
     Args:
@@ -214,7 +234,7 @@ def keeping_clear(clear: Clear | None, run: Callable[[Clear | None], Solution]) 
         try:
             return run(clear)
         except SolveError as error:
-            if clear is None or error.solution is None or not str(error.name).startswith(CLEARANCE):
+            if clear is None or error.solution is None or not of_clearance(error.name):
                 if touching is None:
                     raise
                 words = f"{touching}; held apart, no motion was found: {error}"
@@ -224,6 +244,11 @@ def keeping_clear(clear: Clear | None, run: Callable[[Clear | None], Solution]) 
             clear = clear.widened(list(error.solution.audit().clearances.values()))
     assert touching is not None
     raise touching
+
+
+def of_clearance(name: Any) -> bool:
+    """Whether that is the name of a clearance, in a phase or without one."""
+    return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
 def touching_error(audit: Audit, solution: Solution) -> SolveError | None:

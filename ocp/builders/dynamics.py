@@ -124,6 +124,7 @@ class Effort:
             turn by hardly any torque. jerk: Of the squared jerks, where they are the control.
         fuel: Of the thrust of all thrusters, 1/(N s). It is linear: what is best is full on or off but for singular
             arcs, so that thrusters that only switch cost no more than these, as far as the mesh resolves the switching.
+        thrust: Of the squared thrusts, which makes them smooth, 1/N^2/s.
         turning: Of the squared angular velocity of a base that floats, 1/(rad/s)^2/s.
         time: Of the final time, 1/s.
 
@@ -136,12 +137,13 @@ class Effort:
     acceleration: Any = 0.0
     jerk: float = 0.0
     fuel: float = 0.0
+    thrust: float = 0.0
     turning: float = 0.0
     time: float = 0.0
 
     def __post_init__(self) -> None:
         each = [_nonnegative(f"effort: {what}", getattr(self, what), None) for what in ("torque", "acceleration")]
-        names = ("energy", "jerk", "fuel", "turning", "time")
+        names = ("energy", "jerk", "fuel", "thrust", "turning", "time")
         parts = [checked_nonnegative(f"effort: {what}", getattr(self, what)) for what in names]
         if not (any(parts) or np.concatenate(each).any()):
             raise ProblemError("effort: at least one weight must be above zero", name="effort", value=self, limit=0.0)
@@ -421,7 +423,7 @@ def dynamics_problem(
         problem.path("torques", torques[limited], lower=-most, upper=most, unit=robot.effort_unit)
     running = ca.dot(ca.DM(_nonnegative("effort: acceleration", effort.acceleration, n)), second**2)
     running += effort.jerk * ca.sumsqr(jerks)
-    running += effort.fuel * ca.sum1(thrust)
+    running += effort.fuel * ca.sum1(thrust) + effort.thrust * ca.sumsqr(thrust)
     if effort.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += effort.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])

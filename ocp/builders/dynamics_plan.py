@@ -2,7 +2,8 @@
 
 A smooth plan, of least effort, needs few intervals. One of least time jumps from limit to limit, and has nodes at its
 jumps (`ocp.switching`). Where a plan still goes beyond a limit between its nodes, the limit is drawn in there
-(`ocp.tightening`), which costs little on a mesh that is fine enough; else the mesh is cut.
+(`ocp.tightening`), which costs little on a mesh that is fine enough; else the mesh is cut: where limits that are drawn
+in cost too much there alone, for a plan that only touches a limit goes beyond it with the square of the width.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from models import Machine
-from ocp.builders.clearance import Clear, keeping_clear, touching_error
+from ocp.builders.clearance import Clear, Kept, keeping_clear, of_clearance, touching_error
 from ocp.builders.dynamics import AskedOfDrives, Motors, dynamics_problem
 from ocp.builders.legs import Leg, checked_legs, dynamics_phases
 from ocp.builders.standing.problem import FreeTime
@@ -23,6 +24,7 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.problem.problem import Problem
+from ocp.refinement import split
 from ocp.solution import Solution
 from ocp.switching import NEAR, at_switches
 from ocp.tasks.checks import checked_horizon
@@ -34,7 +36,9 @@ __all__ = ["breaks_of", "plan_dynamics", "within_limits"]
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 MESHES = 3
-"""Each twice as fine as the one before."""
+"""Each finer than the one before."""
+THIRDS = 3
+"""Pieces of an interval in which a limit that is drawn in costs too much: its cost falls to a ninth."""
 HELD = 1e-5
 """By how much a limit may be exceeded between the nodes, in its own unit."""
 DEARER = 1e-3
@@ -70,7 +74,7 @@ def plan_dynamics(
         horizon: Final time, s, or FreeTime(...); or the legs of the motion, each with its own: the plan has a phase for
             each then, `plan.phase(name)`. total: Of legs, see `dynamics_phases`.
         method: The first mesh, controls at the points; 20 Legendre intervals of degree 5 if None, with nodes where
-            the tasks' pieces meet. Up to two more are tried, each twice as fine.
+            the tasks' pieces meet. Up to two more are tried, each twice as fine, or finer where it has to be.
         options: Of IPOPT. tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
 
     Raises:
@@ -107,8 +111,8 @@ def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[fl
 
 
 def within_limits(
-    declare: Callable[[Clear | None], Problem],
-    clear: Clear | None,
+    declare: Callable[[Kept], Problem],
+    clear: Kept,
     method: Collocation | None,
     breaks: Sequence[float],
     options: Mapping[str, Any] | None,
@@ -126,8 +130,19 @@ def within_limits(
     settings = {**IPOPT, **checked_mapping("options", options)}
     mesh = mesh.with_nodes_at(breaks)
 
-    def run(clear: Clear | None) -> Solution:
-        return _first_that_holds(declare(clear), mesh, settings, tolerances)
+    touching: Solution | None = None  # what was planned before, the bodies not held apart enough
+
+    def run(clear: Kept) -> Solution:
+        nonlocal touching
+        problem = declare(clear)
+        for guess in dict.fromkeys((touching, None)):
+            try:
+                return _first_that_holds(problem, mesh, settings, tolerances, guess)
+            except SolveError as error:
+                touching = error.solution if of_clearance(error.name) else None
+                if guess is None or touching is not None:
+                    raise
+        raise AssertionError("the last attempt returns or raises")
 
     try:
         return keeping_clear(clear, run)
@@ -136,16 +151,19 @@ def within_limits(
 
 
 def _first_that_holds(
-    problem: Problem, mesh: Collocation, settings: Mapping[str, Any], tolerances: Mapping[str, float] | None
+    problem: Problem,
+    mesh: Collocation,
+    settings: Mapping[str, Any],
+    tolerances: Mapping[str, float] | None,
+    guess: Solution | None,
 ) -> Solution:
-    """The plan of `within_limits`, of several meshes.
+    """The plan of `within_limits`, of several meshes, from that of the problem with bodies held less apart.
 
     Raises:
         SolveError: As it does; at once where a plan is sound but for bodies that touch.
     """
     reasons: list[str] = []
-    why, last, open_ = SolveError(), None, None
-    guess: Solution | None = None
+    why, last, open_, begin = SolveError(), None, None, guess
     for _ in range(MESHES):
         for what, plan in _attempts(problem, mesh, settings, guess):
             name = f"{mesh.intervals} intervals{what}"
@@ -168,9 +186,9 @@ def _first_that_holds(
                 reasons.append(f"{name}: {why}")
             else:
                 open_ = open_ or plan
-        if guess is None:
+        if guess is begin:
             break
-        mesh = mesh.halved()
+        mesh = _finer(mesh, guess, why)
     if open_ is not None:
         return open_
     words = "no plan holds its limits and passes its audit:\n" + "\n".join(reasons)
@@ -209,6 +227,14 @@ def _drawn_in(
         return drawn
     words = f"limits that are drawn in between the nodes make it cost {drawn.cost:.6g} for {plan.cost:.6g}"
     return SolveError(words, drawn, name="cost", value=drawn.cost, limit=most)
+
+
+def _finer(mesh: Collocation, plan: Solution, why: SolveError) -> Collocation:
+    """The next mesh: cut where limits drawn in cost the last plan too much, where that alone is wrong; else halved."""
+    if plan.drawn_in is None or why.solution is not plan or why.name != "cost":
+        return mesh.halved()
+    nodes, drawn = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
+    return mesh.with_mesh(split(nodes, np.where(drawn > 0, THIRDS, 1), drawn, THIRDS * len(drawn)))
 
 
 def _by_joint(error: SolveError, driven: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:

@@ -15,19 +15,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, ModelError, Robot, attached, center_of_mass, link_frames, wheels_of
+from models import FreeFloating, ModelError, Robot, attached, center_of_mass, wheels_of
 from models.machines.machine import with_tip
-from models.shapes.bodies import bodies_of
-from models.shapes.distance import distance
 from models.spatial import Expression, cross
-from ocp.builders.clearance import ROUNDING
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
 from ocp.problem.problem import Problem
 from ocp.tasks.limits import Limits
 
 __all__ = [
-    "Cone", "Grasp", "checked_pair", "distances", "grasp_wrench", "joined", "motion_of", "pair_momentum",
-    "require_room",
+    "Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum", "require_room",
 ]  # fmt: skip
 
 MOST_WHEELS = 12
@@ -207,19 +203,3 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
     rate = ca.jtimes(ca.vertcat(ca.mtimes(inertia, twist[0:3]), body.mass * twist[3:6]), at, along)
     arm = center.position - pair.tip_pose(base, joints).position
     return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
-
-
-def distances(chaser: FreeFloating, target: FreeFloating, base: Any, joints: Any, goal: Any) -> Any:
-    """Of the bodies of the chaser, but for those of the link that grasps, from those of the target. Shape (k, 1)."""
-    frames = link_frames(chaser.robot, joints, chaser.world_from_base(base))
-    theirs = link_frames(target.robot, ca.DM(0, 1), target.world_from_base(goal))
-    found = [
-        distance(one.shape, other.shape, frames[one.link], theirs[other.link], rounding=ROUNDING)
-        for one in bodies_of(chaser.robot)
-        for other in bodies_of(target.robot)
-        if one.link != chaser.robot.tip_link
-    ]
-    if not found:
-        words = "capture: a clearance is asked for, and chaser or target has no shapes (but for the link that grasps)"
-        raise ProblemError(words, name="clearance")
-    return ca.vertcat(*found)

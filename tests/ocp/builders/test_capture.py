@@ -11,10 +11,21 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from models import FreeFloating, Thruster, center_of_mass
+from models import FreeFloating, Joint, Link, Robot, Thruster, center_of_mass, link_frames
 from models.machines.machine import with_tip
-from ocp import Cone, ProblemError, Solution, capture_problem, chained_capture, dynamics_problem, plan_capture
+from ocp import (
+    Collocation,
+    Cone,
+    ProblemError,
+    Solution,
+    capture_problem,
+    chained_capture,
+    dynamics_problem,
+    plan_capture,
+)
 from ocp.builders.grasping import grasp_wrench, joined, pair_momentum
+from ocp.builders.target_clearance import hand_of
+from tests.models.machines.test_actuators import satellite
 from tests.models.robot.trees import Array
 from tests.ocp.builders.captures import (
     CONE,
@@ -25,10 +36,13 @@ from tests.ocp.builders.captures import (
     planar_target,
     replayed_momentum,
     target,
+    thruster_capture,
     turned,
+    with_bodies,
 )
 
 nan = np.nan
+SHORT = {"approach": 5.0, "detumble": 5.0, "method": Collocation(6, degree=4, scheme="legendre")}
 
 
 @cache
@@ -41,7 +55,8 @@ def gaps(asked: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
     end, one, other = plan.phase("approach").at_fraction(1.0), asked["chaser"], asked["target"]
     nothing = np.zeros(0)
     tip, grasped = one.tip_pose(end["base"], end["joints"]), other.tip_pose(end["target"], nothing)
-    twist = one.tip_twist(end["base"], end["joints"], end["velocities"])
+    pose = np.concatenate([end["base"], end.get("momentum", nothing)])
+    twist = one.tip_twist(pose, end["joints"], end["velocities"])
     twist = np.array(ca.DM(twist - other.tip_twist(end["target"], nothing, nothing)))
     way = np.array(ca.DM(tip.position - grasped.position))
     turn = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.rotation)))
@@ -208,8 +223,54 @@ def test_momentum_that_wheels_cannot_hold_is_refused_with_what_is_missing() -> N
     assert caught.value.value == pytest.approx(0.45)
     asked |= {"approach": 10.0, "detumble": 10.0}
     capture_problem(**(asked | {"rest": False}))
-    thrusters = [Thruster("hub", (0, 1, 0), 2.0, (0.3, 0, 0)), Thruster("hub", (0, -1, 0), 2.0, (0.3, 0, 0))]
-    assert "detumble.momentum" in capture_problem(**(asked | {"thrusters": thrusters})).declared.states
+
+
+def impulse(asked: dict[str, Any], plan: Solution, phase: str) -> Array:
+    """What thrusters on the hub give in a phase: (about the pair's centre of mass, force). (6,), N m s and N s."""
+    one, other, part = asked["chaser"], asked["target"], plan.phase(phase)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    breaks = plan.control_interpolant.breaks
+    at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
+    given = part.at_fraction(at)
+    machine = one if phase == "approach" else FreeFloating(joined(one.robot, other.robot), "planar")
+    whole = one.robot.total_mass + other.robot.total_mass
+    found = []
+    for k, (base, joints, thrust) in enumerate(zip(given["base"], given["joints"], given["thrust"], strict=True)):
+        center = np.array(ca.DM(center_of_mass(machine.robot, joints, machine.world_from_base(base)))).ravel()
+        if phase == "approach":  # the target's centre is at its frame
+            there = np.append(given["target"][k, :2], 0.0)
+            center = (one.robot.total_mass * center + other.robot.total_mass * there) / whole
+        c, s = np.cos(base[2]), np.sin(base[2])
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        forces = [turn @ each.direction * push for each, push in zip(asked["thrusters"], thrust, strict=True)]
+        places = [np.append(base[:2], 0.0) + turn @ each.point - center for each in asked["thrusters"]]
+        moments = [np.cross(place, force) for place, force in zip(places, forces, strict=True)]
+        found.append(np.concatenate([np.sum(moments, axis=0), np.sum(forces, axis=0)]))
+    shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
+    return np.asarray(part.horizon * shares @ np.array(found))
+
+
+def test_thrusters_take_the_momentum_that_wheels_cannot_hold() -> None:
+    """Momentum in MuJoCo changes by the impulse of the thrusters, before and after the grasp, and stays through it."""
+    asked = thruster_capture()
+    with pytest.raises(ProblemError, match="are missing"):
+        capture_problem(**(asked | {"thrusters": ()}))
+    plan = plan_capture(**(asked | SHORT))
+    audit = plan.audit()
+    assert audit.passed, audit
+    assert max(gaps(asked, plan)) < 1e-6
+    after = plan.phase("detumble").at_fraction(1.0)
+    assert after["velocities"][:3] == pytest.approx(0.0, abs=1e-9)
+    assert 0.02 * abs(after["velocities"][3]) <= 0.3 * (1 + 1e-9)
+    assert after["momentum"][0] == pytest.approx(0.02 * after["velocities"][3], abs=1e-9)  # no turning base but a wheel
+    before, later = replayed_momentum(asked, plan, 9)
+    assert later[0] == pytest.approx(before[-1], abs=1e-9)
+    assert before[-1] - before[0] == pytest.approx(impulse(asked, plan, "approach"), abs=1e-9)
+    assert later[-1] - later[0] == pytest.approx(impulse(asked, plan, "detumble"), abs=1e-9)
+    for phase in ("approach", "detumble"):
+        thrust = plan.phase(phase).at_fraction(np.linspace(0, 1, 401))["thrust"]
+        assert thrust.min() >= -1e-5
+        assert thrust.max() <= 0.2 + 1e-5
 
 
 def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
@@ -238,6 +299,46 @@ def test_what_cannot_be_captured_is_refused_by_name() -> None:
         with pytest.raises(ProblemError) as caught:
             capture_problem(**(asked | told))
         assert str(caught.value.name).rpartition(" ")[2] == name
+
+
+def test_the_arm_stays_clear_of_the_target_and_it_is_proven() -> None:
+    """An antenna in the way: the plan costs more, and its distance is never less than asked, by plain geometry."""
+    place, near, half = np.array([-0.9, 0.0, 0.0]), 0.06, 0.02
+    asked = with_bodies(planar_capture() | SHORT, place)
+    plan = plan_capture(**asked, clearance=near)
+    audit = plan.audit()
+    assert audit.passed, audit
+    proof = audit.clearances["approach.clearance of the target"]
+    assert proof.worst is not None
+    assert proof.worst.bodies == ("link2", "target/2")
+    assert {"link3"}.isdisjoint(name for pair in proof.pairs for name in pair.bodies)  # the hand
+    machine, least = asked["chaser"], np.inf
+    along = plan.phase("approach").at_fraction(np.linspace(0, 1, 301))
+    for base, joints, there in zip(along["base"], along["joints"], along["target"], strict=True):
+        frame = link_frames(machine.robot, joints, machine.world_from_base(base))["link2"]
+        rod = np.array(ca.DM(frame.position)) + np.array(ca.DM(frame.rotation))[:, :1] * np.linspace(0, 0.7, 141)
+        c, s = np.cos(there[2]), np.sin(there[2])
+        seen = np.array([[c, s], [-s, c]]) @ (rod[:2] - there[:2, None]) - place[:2, None]
+        outside = np.maximum(np.abs(seen) - half, 0.0)
+        least = min(least, float(np.linalg.norm(outside, axis=0).min()) - 0.05)
+    assert least >= near - 1e-9
+    assert proof.worst.least == pytest.approx(least, abs=1e-4)
+
+
+def test_what_is_too_near_at_the_start_is_refused_and_a_hand_may_touch() -> None:
+    asked = with_bodies(planar_capture(), (-0.9, 0.0, 0.0))
+    with pytest.raises(ProblemError, match=r"'link2' and 'target/2' are 0\.1557 m apart at the start") as caught:
+        capture_problem(**asked, clearance=0.2)
+    assert caught.value.name == "clearance"
+    robot = satellite()
+    assert hand_of(robot) == {"arm0_link2"}
+    fixed = Link("palm"), Link("finger")
+    joints = (
+        Joint("mount", "fixed", "arm0_link2", "palm"),
+        Joint("grip", "prismatic", "palm", "finger", lower=0, upper=1),
+    )
+    gripper = Robot((*robot.links, *fixed), (*robot.joints, *joints), tip="palm")
+    assert hand_of(gripper) == {"arm0_link2", "palm", "finger"}
 
 
 @pytest.mark.long
@@ -277,7 +378,7 @@ def random_target(seed: int) -> tuple[Array, Array, Array]:
     """Spin about a random axis, moments of inertia that a body can have, attitude near that of the world.
 
     The least spin, and the least duration of 5 s, were chosen after first runs: from 2 s on, seed 0 took over a minute.
-    Seed 2 is left out: on 8 and 16 intervals its cone, drawn in between the nodes, costs more than a plan may.
+    That of seed 2 only grazes its cone, and needs a finer mesh there.
     """
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
@@ -287,7 +388,7 @@ def random_target(seed: int) -> tuple[Array, Array, Array]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(3))
 def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
     spin, inertia, attitude = random_target(seed)
     asked = capture(spin, inertia)
