@@ -73,6 +73,7 @@ class AskedOfDrives(TypedDict, total=False):
     friction: JointFriction | None
     wrenches: Sequence[Wrench]
     thrusters: Sequence[Thruster]
+    firing: Sequence[Thruster] | None
     gravity: Any
     control: Literal["acceleration", "jerk"]
     start: Any
@@ -281,6 +282,7 @@ def dynamics_problem(
     friction: JointFriction | None = None,
     wrenches: Sequence[Wrench] = (),
     thrusters: Sequence[Thruster] = (),
+    firing: Sequence[Thruster] | None = None,
     gravity: Any = None,
     control: Literal["acceleration", "jerk"] = "acceleration",
     start: Literal["rest", "free"] | Any = "rest",
@@ -309,7 +311,9 @@ def dynamics_problem(
         limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         effort: Weights of the cost; the squared torques if None.
         friction, wrenches, gravity: As of `joint_torques`.
-        thrusters: Of a machine that floats, as of `models.Thruster`.
+        thrusters: Of a machine that floats, as of `models.Thruster`; each gives any force up to its own.
+        firing: Thrusters that are full on all the time, as those that only switch are in a phase of their own; () where
+            all of them are off, and None where there are none.
         control: "jerk" makes accelerations continuous, zero at ends at rest.
         start, end: Whether the joints are at rest there, or free to move; or their velocities, nan where free, shape
             (n,): wheels that hold the momentum of a base at rest turn.
@@ -333,7 +337,7 @@ def dynamics_problem(
     checked_choice("control", control, ("acceleration", "jerk"))
     robot, n = machine.robot, machine.joint_size
     first_rates, last_rates = (_rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
-    pushers = _checked_thrusters(machine, thrusters)
+    pushers, fired = (_checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
     bounds = limits.bounds(machine)
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
         words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
@@ -396,7 +400,7 @@ def dynamics_problem(
     if machine.base_size:
         known_base = None if joined else home
         base = problem.state("base", machine.base_size, initial=known_base, guess=home)
-    if isinstance(machine, FreeFloating) and (pushers or wrenches or gravity is not None):
+    if isinstance(machine, FreeFloating) and (pushers or firing is not None or wrenches or gravity is not None):
         held = machine.conserved_momentum
         momentum = problem.state(
             "momentum", initial=None if joined else held, guess=held,
@@ -405,6 +409,7 @@ def dynamics_problem(
         base = ca.vertcat(base, momentum)
         frames = link_frames(robot, joints, machine.world_from_base(base))
         wrenches = [*wrenches, *(each.wrench(frames, thrust[k]) for k, each in enumerate(pushers))]
+        wrenches += [each.wrench(frames, each.force) for each in fired]
     elif end_momentum is not None:
         words = "nothing acts on the machine from outside, so that its momentum stays as it is"
         raise ProblemError(words, name="end_momentum", value=end_momentum)
@@ -424,6 +429,7 @@ def dynamics_problem(
     running = ca.dot(ca.DM(_nonnegative("effort: acceleration", effort.acceleration, n)), second**2)
     running += effort.jerk * ca.sumsqr(jerks)
     running += effort.fuel * ca.sum1(thrust) + effort.thrust * ca.sumsqr(thrust)
+    running += sum(effort.fuel * each.force + effort.thrust * each.force**2 for each in fired)
     if effort.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += effort.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])

@@ -186,7 +186,7 @@ def _first_that_holds(
                 reasons.append(f"{name}: {why}")
             else:
                 open_ = open_ or plan
-        if guess is begin:
+        if guess is None or guess is begin:
             break
         mesh = _finer(mesh, guess, why)
     if open_ is not None:

@@ -51,7 +51,7 @@ def with_bodies(asked: dict[str, Any], antenna: Any, size: float = 0.04) -> dict
     one, other = asked["chaser"], asked["target"]
     shapes = {"hub": CollisionShape("box", (0.5, 0.5, 0.3))}
     for name, length in (("link1", 0.8), ("link2", 0.7), ("link3", 0.3)):
-        place = {"translation": (length / 2, 0, 0), "rotation": along_x}
+        place: dict[str, Any] = {"translation": (length / 2, 0, 0), "rotation": along_x}
         shapes[name] = CollisionShape("capsule", (0.05, length), **place)
     links = [
         replace(link, collisions=(shapes[link.name],)) if link.name in shapes else link for link in one.robot.links

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import mujoco
 import numpy as np
 import pytest
 
@@ -15,15 +16,20 @@ from models.spatial import quaternion_about
 from ocp import (
     Collocation,
     Effort,
+    FreeTime,
+    Leg,
     ProblemError,
     Solution,
     TipTask,
+    dynamics_phases,
     dynamics_problem,
     joint_torques,
     minimum_velocity_problem,
+    plan_dynamics,
     solve,
 )
 from tests.models.machines.test_actuators import satellite, state, wheeled
+from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 
 nan = np.nan
@@ -31,10 +37,10 @@ SHORT = Collocation(6, 4)
 MASS, INERTIA, ROTOR = 50.0, 4.0, 0.05
 
 
-def hub() -> FreeFloating:
-    """A body with one wheel, in the plane."""
+def hub(mass: float = 0.0) -> FreeFloating:
+    """A body with one wheel, of some mass, in the plane."""
     body = Link("hub", MASS, (0, 0, 0), np.diag([3.0, 3.0, INERTIA]))
-    return FreeFloating(with_wheels(Robot((body,), ()), [[0, 0, 1]], ROTOR, momentum=9.0), "planar")
+    return FreeFloating(with_wheels(Robot((body,), ()), [[0, 0, 1]], ROTOR, momentum=9.0, mass=mass), "planar")
 
 
 def body(momentum: Array | None = None) -> FreeFloating:
@@ -73,6 +79,89 @@ def test_thrusters_burn_coast_and_brake() -> None:
     assert plan["momentum"][:, 1].max() == pytest.approx(force * burn, rel=1e-4)
     assert np.abs(plan["momentum"][:, [0, 2]]).max() < 1e-6
     assert plan["thrust"].max() <= force * (1 + 1e-6)
+
+
+def switched(*firing: list[Thruster]) -> list[Leg]:
+    """Legs on which thrusters are full on, or off, the wheel at rest between them."""
+    return [Leg(None, FreeTime(0.01, 40.0, 5.0), firing=each) for each in firing]
+
+
+def test_thrusters_that_are_on_or_off_switch_when_it_is_best() -> None:
+    """Rest to rest over d: in a fixed time T, (F / m) t (T - t) = d; in a free one that costs w a second,
+
+    t = sqrt(w m d / F / (2 F + w)) for least 2 F t + w T, from T = t + m d / (F t).
+    """
+    machine, force, way, horizon, worth = hub(), 5.0, 2.775, 20.0, 0.5
+    on, back = (Thruster("hub", (side, 0, 0), force) for side in (1, -1))
+    asked: dict[str, Any] = {
+        "method": Collocation(2, 3, scheme="legendre"), "end_base": [way, 0.0, 0.0], "end_momentum": np.zeros(3)
+    }  # fmt: skip
+    legs = switched([on], [], [back])
+    for total, weight in ((horizon, 0.0), (None, worth)):
+        effort = Effort(torque=1e-3, fuel=1.0, time=weight)
+        plan = plan_dynamics(machine, [0.0], legs, total=total, effort=effort, **asked)
+        burn = (horizon - np.sqrt(horizon**2 - 4 * way * MASS / force)) / 2
+        burn = burn if total else np.sqrt(worth * way * MASS / force / (2 * force + worth))
+        whole = burn + way * MASS / (force * burn)
+        times = [plan.phase(f"leg {k}").horizon for k in (1, 2, 3)]
+        assert times == pytest.approx([burn, whole - 2 * burn, burn], rel=1e-6)
+        assert plan.cost == pytest.approx(2 * force * burn + weight * whole, rel=1e-8)
+        assert plan.audit().passed
+    with pytest.raises(ProblemError, match="switch") as caught:
+        dynamics_phases(machine, [0.0], [*legs, Leg(None, 1.0)])
+    assert caught.value.name == "firing"
+
+
+def test_a_turn_by_thrusters_that_switch_is_that_of_mujoco() -> None:
+    """Couples burn and brake, a wheel helps: MuJoCo, told when they switch and the wheel's torque, ends there, too."""
+    machine, force, arm, angle = hub(0.1), 0.4, 0.5, 0.8
+    turns, stops = (
+        [Thruster("hub", (0, way * side, 0), force, (way * arm, 0, 0)) for way in (1, -1)] for side in (1, -1)
+    )
+    push = Thruster("hub", (1, 0, 0), 0.1)
+    fired = [*turns, push], [push], stops
+    plan = plan_dynamics(
+        machine, [0.0], switched(*fired), total=6.0, end_base=[nan, nan, angle], end_momentum=[0.0, nan, nan],
+        effort=Effort(torque=100.0, fuel=1.0), method=Collocation(4, 4, scheme="legendre"),
+    )  # fmt: skip
+    assert plan.audit().feasible
+    model = mujoco_model(machine.robot)
+    model.opt.gravity[:] = 0.0
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    data, carrier, wheel = mujoco.MjData(model), model.body("hub").id, model.joint("wheel1").dofadr[0]
+    count = 200
+    for k, burning in enumerate(fired):
+        leg = plan.phase(f"leg {k + 1}")
+        assert leg.horizon > 0.1
+        model.opt.timestep = leg.horizon / count
+        for torque in wheel_torques(machine, leg, burning, count):
+            mujoco.mj_kinematics(model, data)
+            turn = data.xmat[carrier].reshape(3, 3)
+            forces = [turn @ each.direction * each.force for each in burning]
+            moments = [np.cross(turn @ each.point, push) for each, push in zip(burning, forces, strict=True)]
+            data.xfrc_applied[carrier] = np.concatenate([np.sum(forces, axis=0), np.sum(moments, axis=0)])
+            data.qfrc_applied[wheel] = torque
+            mujoco.mj_step(model, data)
+    last = plan.phase("leg 3").at_fraction(1.0)
+    assert data.qpos[:2] == pytest.approx(last["base"][:2], abs=1e-4)
+    assert 2 * np.arctan2(data.qpos[6], data.qpos[3]) == pytest.approx(angle, abs=1e-5)
+    assert machine.robot.total_mass * data.qvel[:2] == pytest.approx(last["momentum"][1:], abs=1e-3)
+    assert data.qvel[wheel] == pytest.approx(0.0, abs=1e-4)
+
+
+def wheel_torques(machine: FreeFloating, leg: Solution, burning: list[Thruster], count: int) -> Array:
+    """Of a wheel in the middle of so many steps. Shape (count,)."""
+    base, joints, rates, second = (ca.SX.sym("z", size) for size in (6, 1, 1, 1))
+    frames = {"hub": machine.world_from_base(base)}
+    wrenches = [each.wrench(frames, each.force) for each in burning]
+    torque = ca.Function(
+        "torque",
+        [base, joints, rates, second],
+        [joint_torques(machine, base, joints, rates, second, wrenches=wrenches)],
+    )
+    at = leg.at_fraction((np.arange(count) + 0.5) / count)
+    poses = np.hstack([at["base"], at["momentum"]])
+    return np.array(torque(poses.T, at["joints"].T, at["velocities"].T, at["accelerations"].T)).ravel()
 
 
 def test_momentum_that_is_given_is_kept_by_wheels() -> None:
