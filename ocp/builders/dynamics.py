@@ -24,6 +24,7 @@ from typing import Any, Literal, TypedDict
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import FixedBase, FreeFloating, ModelError, Robot, Standing, Thruster, link_frames, wheels_of
 from models.arrays import Array
@@ -41,6 +42,7 @@ from ocp.errors import (
     checked_instance,
     checked_nonnegative,
     floats,
+    unknown_name,
 )
 from ocp.problem.problem import Problem
 from ocp.tasks.checks import (
@@ -74,6 +76,7 @@ class AskedOfDrives(TypedDict, total=False):
     wrenches: Sequence[Wrench]
     thrusters: Sequence[Thruster]
     firing: Sequence[Thruster] | None
+    steady: Sequence[str]
     gravity: Any
     control: Literal["acceleration", "jerk"]
     start: Any
@@ -283,6 +286,7 @@ def dynamics_problem(
     wrenches: Sequence[Wrench] = (),
     thrusters: Sequence[Thruster] = (),
     firing: Sequence[Thruster] | None = None,
+    steady: Sequence[str] = (),
     gravity: Any = None,
     control: Literal["acceleration", "jerk"] = "acceleration",
     start: Literal["rest", "free"] | Any = "rest",
@@ -314,6 +318,8 @@ def dynamics_problem(
         thrusters: Of a machine that floats, as of `models.Thruster`; each gives any force up to its own.
         firing: Thrusters that are full on all the time, as those that only switch are in a phase of their own; () where
             all of them are off, and None where there are none.
+        steady: Names of joints that keep the speed with which they start, as rotors of gyros do, whatever torque that
+            takes; no limit holds them.
         control: "jerk" makes accelerations continuous, zero at ends at rest.
         start, end: Whether the joints are at rest there, or free to move; or their velocities, nan where free, shape
             (n,): wheels that hold the momentum of a base at rest turn.
@@ -338,7 +344,13 @@ def dynamics_problem(
     robot, n = machine.robot, machine.joint_size
     first_rates, last_rates = (_rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
     pushers, fired = (_checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
-    bounds = limits.bounds(machine)
+    bounds, keeps = limits.bounds(machine), _steady(robot, steady)
+    sizes = _wheel_sizes(robot, bounds, checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon))
+    bounds = bounds._replace(
+        velocity=np.where(keeps, np.inf, bounds.velocity),
+        acceleration=np.where(keeps, 0.0, bounds.acceleration),
+        torque=np.where(keeps, np.inf, bounds.torque),
+    )
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
         words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
@@ -361,16 +373,19 @@ def dynamics_problem(
         if isinstance(horizon, FreeTime)
         else problem.horizon(duration)
     )
-    rests = [bool((given == 0).all()) for given in (first_rates, last_rates)]
+    rests = [bool((given[~keeps] == 0).all()) for given in (first_rates, last_rates)]
     if rests[1]:
         last_rates = resting
+    last_rates = np.where(keeps, np.nan, last_rates)
 
     def between(order: int) -> Any:
         """The quintic from rest to rest, or a derivative of it."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
-        return lambda t: known * (order == 0) + (towards - known) * shape(t / duration) / duration**order
+        kept = np.where(keeps, np.nan_to_num(first_rates), 0.0)
+        if order:
+            return lambda t: kept * (order == 1) + (towards - known) * shape(t / duration) / duration**order
+        return lambda t: known + kept * t + (towards - known) * shape(t / duration)
 
-    sizes = _wheel_sizes(robot, bounds, duration)
     joints = problem.state(
         "joints", n, initial=first, terminal=last, lower=bounds.lower, upper=bounds.upper, guess=between(0),
         unit=robot.unit(), scale=sizes[0],
@@ -503,6 +518,16 @@ def _wheel_sizes(robot: Robot, bounds: JointBounds, duration: float) -> Array:
         acceleration = torque / inertia / 4 if np.isfinite(torque) else 1 / inertia
         found[:, k] = speed * duration / 4, speed, acceleration, 4 * acceleration / duration
     return found
+
+
+def _steady(robot: Robot, names: Any) -> NDArray[np.bool_]:
+    """Whether each joint is one of these. Shape (n,)."""
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise ProblemError(f"steady: names of joints are expected, not {names!r}", name="steady", value=names)
+    for name in names:
+        if name not in robot.joint_names:
+            raise unknown_name("joint", name, robot.joint_names)
+    return np.array([name in names for name in robot.joint_names], dtype=bool)
 
 
 def _rates_at(what: str, given: Any, n: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -17,8 +18,11 @@ from models import (
     Robot,
     Thruster,
     center_of_mass,
+    gyro_matrix,
+    gyros_of,
     link_frames,
     wheels_of,
+    with_gyros,
     with_wheels,
 )
 from ocp import ProblemError, joint_torques
@@ -75,6 +79,64 @@ def test_wheels_are_known_by_their_symmetry() -> None:
     assert "loose" not in wheels_of(Robot(more.links, more.joints, "panel"))
 
 
+def pyramid(**limits: Any) -> Robot:
+    """A body with four gyros on the sides of a pyramid, whose momenta cancel at zero."""
+    tilt = np.arctan(np.sqrt(2.0))
+    angles = np.arange(4) * np.pi / 2
+    out = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
+    side = np.stack([-np.sin(angles), np.cos(angles), np.zeros(4)], axis=1)
+    gimbals = np.sin(tilt) * out + np.cos(tilt) * np.array([0.0, 0.0, 1.0])
+    body = Link("hub", 80.0, (0, 0, 0), [[20.0, 1.0, 0.5], [1.0, 25.0, -0.8], [0.5, -0.8, 22.0]])
+    places = 0.1 * np.arange(12.0).reshape(4, 3)
+    robot = with_gyros(Robot((body,), ()), gimbals, side, 5.0, 0.05, mass=0.5, translations=places, **limits)
+    links = [replace(link, mass=0.2) if link.name.endswith("gimbal") else link for link in robot.links]
+    return replace(robot, links=tuple(links))
+
+
+SPINNING = np.array([0.0, 100.0] * 4)
+
+
+def test_gyros_turn_their_momentum() -> None:
+    """Columns of their matrix are the derivatives of all rotors' momentum by the gimbals' angles."""
+    robot = pyramid(rate=0.8, torque=3.0)
+    gyros = gyros_of(robot)
+    assert [gyro.gimbal for gyro in gyros] == ["gyro1", "gyro2", "gyro3", "gyro4"]
+    assert [gyro.momentum for gyro in gyros] == pytest.approx([5.0] * 4)
+    assert robot.velocity == pytest.approx([0.8, 100.0] * 4)
+    machine, q = FreeFloating(robot), ca.SX.sym("q", 8)
+    held = ca.mtimes(machine.momentum_matrices(ca.DM(machine.base_home()), q)[1], ca.DM(SPINNING))[:3]
+    slopes = ca.Function("slopes", [q], [ca.jacobian(held, q)[:, ::2], gyro_matrix(robot, q)])
+    for seed in range(3):
+        found, given = slopes(np.random.default_rng(seed).uniform(-3, 3, 8))
+        np.testing.assert_allclose(np.array(given), np.array(found), atol=1e-12)
+
+
+def test_a_pyramid_of_gyros_has_no_torque_along_an_axis_where_it_is_singular() -> None:
+    """Gimbals at (-90, 0, 90, 0) degrees, the known inner singularity of a pyramid: nothing along x."""
+    robot = pyramid()
+    singular = np.zeros(8)
+    singular[[0, 4]] = -np.pi / 2, np.pi / 2
+    at, beside = (np.array(ca.DM(gyro_matrix(robot, ca.DM(angles)))) for angles in (singular, np.zeros(8)))
+    assert np.abs(at[0]).max() < 1e-12
+    assert np.linalg.matrix_rank(at) == 2
+    assert np.linalg.svd(beside, compute_uv=False)[-1] > 1.0
+
+
+def test_what_is_no_gyro_is_refused_by_name() -> None:
+    body = Robot((Link("hub", 80.0, (0, 0, 0), np.eye(3)),), ())
+    wrong: list[tuple[Any, Any, float, str]] = [
+        ([[0, 0, 1]], [[0, 1, 1]], 1.0, "rotors"),
+        ([[0, 0, 0]], [[0, 1, 0]], 1.0, "gimbals"),
+        ([[0, 0, 1]], [[0, 1, 0], [1, 0, 0]], 1.0, "rotors"),
+        ([[0, 0, 1]], [[0, 1, 0]], 0.0, "momentum"),
+    ]
+    for gimbals, rotors, momentum, name in wrong:
+        with pytest.raises(ModelError) as caught:
+            with_gyros(body, gimbals, rotors, momentum, 0.1)
+        assert caught.value.name == name
+    assert gyros_of(wheeled()) == ()
+
+
 def state(machine: FreeFloating, seed: int) -> tuple[Array, Array, Array, Array]:
     """Pose, joints, rates and accelerations."""
     rng = np.random.default_rng(seed)
@@ -96,6 +158,18 @@ def moving(machine: FreeFloating, base: Array, joints: Array, rates: Array) -> t
     turn = np.array(ca.DM(machine.world_from_base(base).rotation))
     data.qvel[:3], data.qvel[3:6], data.qvel[order] = twist[3:], turn.T @ twist[:3], rates
     return model, data
+
+
+def test_gyros_and_base_have_the_momentum_together() -> None:
+    """In MuJoCo, whose rotors spin."""
+    momentum = np.array([3.0, -2.0, 5.0, 4.0, 1.0, -6.0])
+    machine = FreeFloating(pyramid(), conserved_momentum=momentum)
+    pose, joints, rates, _ = state(machine, 2)
+    model, data = moving(machine, pose, joints, np.where(SPINNING > 0, SPINNING, rates))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    assert data.subtree_angmom[1] == pytest.approx(momentum[:3], abs=1e-8)
+    assert machine.robot.total_mass * data.subtree_linvel[1] == pytest.approx(momentum[3:], abs=1e-8)
 
 
 @pytest.mark.parametrize("carried", ["conserved", "a state"])

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from models import FreeFloating, Link, Robot, Thruster, Wrench, mass_matrix, planar_chain, with_wheels
+from models import FreeFloating, Link, Robot, Thruster, Wrench, gyros_of, mass_matrix, planar_chain, with_wheels
 from models.machines.machine import with_tip
 from models.robot.dynamics import external_wrench
 from models.spatial import quaternion_about
@@ -20,6 +20,7 @@ from ocp import (
     Leg,
     ProblemError,
     Solution,
+    SolveError,
     TipTask,
     dynamics_phases,
     dynamics_problem,
@@ -28,7 +29,7 @@ from ocp import (
     plan_dynamics,
     solve,
 )
-from tests.models.machines.test_actuators import satellite, state, wheeled
+from tests.models.machines.test_actuators import SPINNING, moving, pyramid, satellite, state, wheeled
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 
@@ -178,6 +179,42 @@ def test_momentum_that_is_given_is_kept_by_wheels() -> None:
     assert plan.audit().feasible
 
 
+def gyro_slew(rate: float, horizon: float) -> dict[str, Any]:
+    """Half a radian about an axis between, from rest to rest."""
+    goal = np.array(ca.DM(quaternion_about((0.6, 0.0, 0.8), 0.5))).ravel()
+    robot = pyramid(rate=rate, torque=8.0)
+    return {
+        "machine": FreeFloating(robot), "start_joints": np.zeros(8), "horizon": horizon, "start": SPINNING,
+        "end_base": [nan, nan, nan, *goal], "steady": [gyro.rotor for gyro in gyros_of(robot)],
+        "effort": Effort(torque=[1.0, 0.0] * 4, acceleration=[1.0, 0.0] * 4),
+        "method": Collocation(8, degree=4, scheme="legendre"),
+    }  # fmt: skip
+
+
+def test_a_pyramid_of_gyros_turns_a_body_within_the_rates_of_its_gimbals() -> None:
+    """The rotors' speed stays, and the momentum of all in MuJoCo is zero wherever one looks."""
+    asked = gyro_slew(0.55, 6.0)
+    plan, machine = plan_dynamics(**asked), asked["machine"]
+    audit = plan.audit()
+    assert audit.passed, audit
+    assert plan["base"][-1] == pytest.approx([*plan["base"][-1, :3], *asked["end_base"][3:]], abs=1e-8)
+    fine = plan.at_fraction(np.linspace(0, 1, 31))
+    assert fine["velocities"][:, 1::2] == pytest.approx(100.0, abs=1e-9)
+    assert 0.54 < np.abs(fine["velocities"][:, ::2]).max() < 0.55 + 1e-5
+    for base, joints, rates in zip(fine["base"], fine["joints"], fine["velocities"], strict=True):
+        model, data = moving(machine, base, joints, rates)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        assert np.abs(data.subtree_angmom[1]).max() < 1e-8
+
+
+@pytest.mark.long
+def test_a_slew_that_is_too_fast_for_gyros_names_the_gimbal_that_saturates() -> None:
+    with pytest.raises(SolveError, match=r"velocities of 'gyro\d' would have to go .* beyond its") as caught:
+        plan_dynamics(**gyro_slew(0.8, 1.2))
+    assert str(caught.value.name).startswith("velocities of 'gyro")
+
+
 # ---- laws ----------------------------------------------------------------------------------------------------------
 
 
@@ -284,6 +321,9 @@ def test_what_does_not_fit_a_spacecraft_is_refused_by_name() -> None:
         ({"end_base": [0.0, 0.0]}, "end_base"),
         ({"thrusters": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
         ({"start": [0.0, 1.0]}, "start"),
+        ({"steady": "wheel1"}, "steady"),
+        ({"steady": ["wheel2"]}, "wheel2"),
+        ({"firing": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
     ]
     for told, name in wrong:
         with pytest.raises(ProblemError) as caught:
