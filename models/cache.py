@@ -8,12 +8,14 @@ no error: then the work is done again.
 from __future__ import annotations
 
 import fcntl
+import functools
 import hashlib
 import json
 import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import resources
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any
@@ -29,12 +31,27 @@ MOMENT = 0.02  # s between two looks at a lock
 
 
 def key_of(version: str, *contents: Any) -> str:
-    """A name for arrays or texts and the version of what is done with them: hexadecimal digits of SHA-256."""
+    """A name for arrays or texts and the version of what is done with them: hexadecimal digits of SHA-256.
+
+    Args:
+        version: What is done with them; `version_of` the package that does it, where its code changes often.
+    """
     digest = hashlib.sha256(version.encode())
     for content in contents:
         plain = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
         digest.update(f"|{plain.dtype.str}{plain.shape}|".encode())
         digest.update(plain.tobytes())
+    return digest.hexdigest()
+
+
+@functools.cache
+def version_of(package: str) -> str:
+    """Hexadecimal digits that tell the sources of a package's modules from any others: no change is forgotten."""
+    found = sorted((file.name, file.read_bytes()) for file in resources.files(package).iterdir() if file.is_file())
+    digest = hashlib.sha256()
+    for name, source in found:
+        if name.endswith(".py"):
+            digest.update(f"|{name} {len(source)}|".encode() + source)
     return digest.hexdigest()
 
 

@@ -16,13 +16,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
-from models.cache import keep, kept, key_of
+from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Box, Capsule
 
-VERSION = "covering 4"
-"""Of what is kept: changes whenever a cover may come out otherwise."""
 MOST_PARTS = 3
 WORTH_A_PART = 1.07
 """By how much the volume covered must fall for each part more: by less where the largest overhang falls, too, of which
@@ -78,7 +76,7 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
         message = f"cover: faces have shape {corners.shape}, expected (m, 3)"
         raise ModelError(message, name="faces", value=faces, limit=("m", 3))
     triangles = points[corners]
-    key = key_of(VERSION, triangles)
+    key = key_of(version_of("models.shapes"), "cover", triangles)
     known = _read(kept(key), triangles.reshape(-1, 3))
     if known is None:
         known = fitted(triangles)

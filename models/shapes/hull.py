@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array, frozen
-from models.cache import keep, kept, key_of
+from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
 
 FLAT = 1e-10
@@ -17,8 +17,6 @@ FLAT = 1e-10
 SAME_PLANE = 1e-9
 """Normals of faces that differ by less are one."""
 TRIES = 6
-VERSION = "hull 1"
-"""Of what is kept between runs: another one where the same points have another hull."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,7 @@ def kept_hull(points: Array) -> Hull:
 
     Args, Raises: As `convex_hull`.
     """
-    key = key_of(VERSION, points)
+    key = key_of(version_of("models.shapes"), "hull", points)
     known = _read(kept(key), points)
     if known is None:
         known = convex_hull(points)
@@ -201,7 +199,6 @@ class _Growing:
             a, b, c = self.corners.pop(number)
             del self.planes[number]
             for edge in ((a, b), (b, c), (c, a)):
-                if self.owner.get(edge) == number:
-                    del self.owner[edge]
+                self.owner.pop(edge, None)
         left = np.concatenate(loose)
         self.close([(*edge, apex) for edge in edges], left[left != apex])

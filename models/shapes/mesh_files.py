@@ -178,7 +178,7 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
 
 def _joined(corners: Array) -> Triangles:
     """Corners of triangles, three rows each, with those at the same place made one."""
-    vertices, faces = np.unique(corners + 0.0, axis=0, return_inverse=True)  # + 0.0: -0.0 is 0.0
+    vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     return bare(vertices, faces.reshape(-1, 3).astype(np.intp))
 
 

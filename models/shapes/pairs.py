@@ -22,12 +22,12 @@ from models.arrays import (
     checked_nonnegative,
     one_for_each,
 )
-from models.cache import keep, kept, key_of
+from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
 from models.shapes.bodies import Body
-from models.shapes.distance import distance
+from models.shapes.distance import distance, pair_function
 from models.shapes.rigid_parts import RigidParts, Step, arms
 from models.shapes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from models.spatial import Frame
@@ -36,14 +36,14 @@ NEIGHBOURS, RIGID, ALWAYS, NEVER = "neighbours", "one rigid part", "always touch
 COVERED = "always touch, perhaps only in their covers"
 """Where in some posture bodies overlap by no more than their covers stand out of the meshes: these may be apart."""
 SRDF, TOLD = "the SRDF file", "told"
-VERSION = "pairs 5"
-"""Of what is kept between runs: another one where the same input gives other pairs."""
 LIMITLESS = 1.0
 """m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
 SURE = 1e-6
 """m: more than rounding takes away from a proof of distance."""
 MOST_NORMALS = 200
 """Of a hull, along which gaps are looked at."""
+NO_DIRECTION = 1e-9
+"""A vector along which two bodies might be apart and that is no longer, in m or as a sine, is none."""
 AT_ONCE = 2**20
 """Numbers of an array that bounds are computed in."""
 GRID, FINER, LOWEST = 24, 3, 8
@@ -177,7 +177,7 @@ def _key(
 ) -> str:
     """A name for all that the pairs depend on."""
     parts: list[Any] = [low, high, near, count, seed]
-    words = [VERSION, *(f"{sorted(pair)} {why}" for pair, why in named.items())]
+    words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
         words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.drives.get(joint.name)}")
         parts += [joint.axis, joint.translation, joint.rotation]
@@ -189,7 +189,7 @@ def _key(
             body.overhang,
             np.zeros(0) if body.mesh is None else body.mesh.points,
         ]
-    return key_of("\n".join(words), *parts)
+    return key_of(version_of("models.shapes"), "\n".join(words), *parts)
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
@@ -444,10 +444,12 @@ def _bound(one: Shape, other: Shape) -> Callable[[Array, Array], Array]:
         apart = (points.mean(axis=1) - core.mean(axis=0))[:, None]
         own = np.broadcast_to(normals, (len(turn), *normals.shape))
         tried = np.concatenate([own, other_normals @ turn.transpose(0, 2, 1), crossed, apart], axis=1)
-        tried = tried / np.maximum(np.linalg.norm(tried, axis=2, keepdims=True), 1e-9)  # one of no length says nothing
+        long = np.linalg.norm(tried, axis=2)
+        tried = tried / np.maximum(long, NO_DIRECTION)[:, :, None]
         here, there = tried @ core.T, tried @ points.transpose(0, 2, 1)
         ahead, behind = there.min(axis=2) - here.max(axis=2), here.min(axis=2) - there.max(axis=2)
-        return np.asarray(np.maximum(ahead, behind).max(axis=1) - swelling)
+        found = np.where(long > NO_DIRECTION, np.maximum(ahead, behind), -np.inf)
+        return np.asarray(found.max(axis=1) - swelling)
 
     return measured
 
@@ -465,15 +467,8 @@ def _directions(shape: Shape) -> tuple[Array, Array]:
 
 
 def _capsules(one: Sphere | Capsule, other: Sphere | Capsule, turn: Array, shift: Array) -> Array:
-    """Distances of two capsules: nearest points of segments (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
-    p, u = one.core[0], one.core[-1] - one.core[0]
-    q, v = turn @ other.core[0] + shift, turn @ (other.core[-1] - other.core[0])
-    gap = p - q
-    a, e, b = float(u @ u) + 1e-30, (v * v).sum(axis=1) + 1e-30, v @ u
-    c, f = gap @ u, (gap * v).sum(axis=1)
-    slack = a * e - b * b
-    s = np.where(slack > 1e-12 * a * e, np.clip((b * f - c * e) / np.where(slack > 0, slack, 1), 0, 1), 0.0)
-    t = np.clip((b * s + f) / e, 0, 1)
-    s = np.clip((b * t - c) / a, 0, 1)
-    apart = gap + s[:, None] * u - t[:, None] * v
-    return np.asarray(np.linalg.norm(apart, axis=1) - one.radius - other.radius)
+    """Distances of two spheres or capsules."""
+    points = other.core @ turn.transpose(0, 2, 1) + shift[:, None]
+    moved = np.column_stack([points.reshape(len(turn), -1), np.full(len(turn), other.radius)])
+    still = np.tile(np.append(one.core, one.radius)[:, None], len(turn))
+    return np.array(pair_function(type(one), type(other))(still, moved.T)).ravel()

@@ -264,6 +264,21 @@ def test_keys_tell_contents_and_versions_apart() -> None:
     assert cache.key_of("1", one) == cache.key_of("1", one.copy()[::1])
 
 
+def test_a_version_changes_with_any_module_of_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    package = tmp_path / "whole"
+    package.mkdir()
+    (package / "__init__.py").write_text("", encoding="utf-8")
+    found = []
+    for name, text in (("a.py", "x = 1"), ("b.py", "x = 1"), ("a.py", "x = 2"), ("notes.txt", "none")):
+        (package / name).write_text(text, encoding="utf-8")
+        cache.version_of.cache_clear()
+        found.append(cache.version_of("whole"))
+    assert len(set(found)) == 3
+    assert found[2] == found[3]
+    assert cache.version_of("models.shapes") != cache.version_of("models.robot")
+
+
 @pytest.mark.parametrize(
     ("vertices", "faces", "name"),
     [

@@ -187,6 +187,13 @@ def test_the_excess_is_halved_with_the_intervals() -> None:
         (ca.if_else(T < 1, T + 5, T + 3), 0, 0.5, 5, 5.5),
         (ca.if_else(T < 1, T + 5, T + 3), 2, 3, 5, 6),
         (ca.if_else(T < 1, T + 5, T + 3), 0.5, 1.5, 3.5, 6.5),
+        (ca.if_else(T == 0.5, 3, 7), 0.5, 0.5, 3, 3),
+        (ca.if_else(T == 0.5, 3, 7), 0, 1, 3, 7),
+        (ca.if_else(T == 0.5, 3, 7), 0.5, 1, 3, 7),
+        (ca.if_else(T == 0.5, 3, 7), 0.6, 1, 7, 7),
+        (ca.if_else(T == T**2, 3, 7), 0.25, 0.75, 3, 7),
+        (ca.if_else(T == ca.floor(T), 3, 7), 0.5, 0.75, 7, 7),
+        (ca.if_else(ca.floor(T) == ca.ceil(T), 3, 7), 0.5, 0.75, 7, 7),
         (ca.copysign(2, T), 1, 2, 2, 2),
         (ca.copysign(2, T), -2, -1, -2, 2),
         (ca.hypot(T, 3), -4, 1, 3, 5),
@@ -200,6 +207,20 @@ def test_the_excess_is_halved_with_the_intervals() -> None:
 def test_ranges_of_single_functions_are_exact(values: Any, low: float, high: float, least: float, most: float) -> None:
     lower, upper = bounds(values, T, low, high)
     np.testing.assert_allclose([lower[0, 0], upper[0, 0]], [least, most], rtol=1e-12, atol=1e-12)
+
+
+def test_the_pole_of_the_tangent_is_within_whatever_rounding_does() -> None:
+    """Of the many from a quarter turn on, one rounding beyond the start of an interval or before its end."""
+    poles = np.pi / 2 + np.pi * np.arange(-300, 300)
+    for low, high in (
+        (np.nextafter(poles, -np.inf), poles + 1),
+        (poles, poles + 1),
+        (poles - 1, poles),
+        (poles - 1, np.nextafter(poles, np.inf)),
+    ):
+        lower, upper = bounds(ca.tan(T), T, low, high)
+        assert (lower == -np.inf).all()
+        assert (upper == np.inf).all()
 
 
 def test_both_kinds_of_symbols_have_the_same_bounds() -> None:

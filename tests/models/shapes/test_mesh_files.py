@@ -126,6 +126,26 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
     np.testing.assert_allclose(vertices[faces[4:]], 1e-3 * CORNERS[FACES], atol=1e-12)
 
 
+def test_parts_side_by_side_keep_their_triangles() -> None:
+    """Of different sizes, and one of none."""
+    rng = np.random.default_rng(1)
+    parts = [triangles.bare(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)]
+    whole = triangles.together(parts)
+    wanted = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
+    np.testing.assert_array_equal(whole.vertices[whole.faces].reshape(-1, 3), wanted)
+    assert whole.faces.min() >= 0
+    assert whole.colors.shape == (10, 4)
+
+
+def test_zero_of_either_sign_is_one_place(tmp_path: Path) -> None:
+    signs = np.random.default_rng(2).choice([-1.0, 1.0], (12, 3))
+    corners = np.where(CORNERS[FACES.ravel()] == 0, 0.0 * signs, CORNERS[FACES.ravel()])
+    file = written(tmp_path, "a.stl", binary_stl(corners, np.arange(12).reshape(4, 3)))
+    vertices, faces = read_mesh(file)
+    assert len(vertices) == 4
+    np.testing.assert_allclose(surface(vertices, faces), surface(CORNERS, FACES), atol=1e-6)
+
+
 def test_only_vertices_of_triangles_count(tmp_path: Path) -> None:
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)
     text = "v 9 9 9\n" + corners + "".join(f"f {a + 2} {b + 2} {c + 2}\n" for a, b, c in FACES)
@@ -168,6 +188,7 @@ BROKEN: list[tuple[str, str | bytes, str]] = [
     ("a.dae", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><COLLADA>&a;</COLLADA>", "entities"),
     ("a.dae", dae("<node><instance_geometry url='#h'/></node>"), "'#h' names nothing"),
     ("a.dae", dae(RING), "64 deep"),
+    ("a.dae", dae("<node>" * 66 + "<instance_geometry url='#g'/>" + "</node>" * 66), "64 deep"),
     ("a.dae", dae(DOUBLING), "triangles in the scene"),
     ("a.dae", dae("<node><lookat>1 2 3 4 5 6 7 8 9</lookat></node>"), "<lookat>"),
     ("a.dae", dae("<node><matrix>1 2 3</matrix></node>"), "<matrix>: 3 numbers, not 16"),

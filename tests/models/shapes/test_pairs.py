@@ -16,10 +16,32 @@ from models import CollisionShape, Joint, Link, Mimic, ModelError, ModelWarning,
 from models.arrays import Array
 from models.shapes.bodies import Body, LinkMesh, bodies_of
 from models.shapes.distance import distance
-from models.shapes.pairs import ALWAYS, COVERED, NEIGHBOURS, NEVER, RIGID, SRDF, TOLD, Pairs, _bound, checked_pairs
-from models.shapes.shapes import Box, Capsule, Sphere
+from models.shapes.pairs import (
+    ALWAYS,
+    COVERED,
+    NEIGHBOURS,
+    NEVER,
+    RIGID,
+    SRDF,
+    TOLD,
+    Pairs,
+    _bound,
+    _distances,
+    _postures,
+    checked_pairs,
+)
+from models.shapes.shapes import Box, Capsule, Shape, Sphere
 from tests import redundancy_benchmark
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
+from tests.models.shapes.shape_oracles import turns
+
+KINDS: tuple[Shape, ...] = (
+    Sphere(0.1, (0, 0, 0)),
+    Capsule(0.1, (0, 0, 0), (0, 0, 0)),
+    Capsule(0.05, (0, 0, -0.3), (0, 0, 0.2)),
+    Box((0.2, 0.3, 0.4)),
+)
+"""Of which the distances are exact."""
 
 
 def chain(*lengths: float, radius: float = 0.02, limit: float = np.pi) -> tuple[Robot, tuple[Body, ...]]:
@@ -184,6 +206,79 @@ def test_the_bound_is_exact_where_a_capsule_crosses_an_edge(slope: float) -> Non
     turn, shift = np.eye(3)[None], np.zeros((1, 3))
     assert _bound(box, capsule)(turn, shift) == pytest.approx([0.05], abs=1e-12)
     assert _bound(capsule, box)(turn, shift) == pytest.approx([0.05], abs=1e-12)
+
+
+@pytest.mark.parametrize("one", KINDS, ids=lambda shape: type(shape).__name__)
+@pytest.mark.parametrize("other", KINDS, ids=lambda shape: type(shape).__name__)
+def test_the_bound_is_no_more_than_the_distance(one: Shape, other: Shape) -> None:
+    """In frames at random and aligned, where middles coincide and edges are parallel, apart and deep inside."""
+    rng = np.random.default_rng(8)
+    turn = np.concatenate([np.tile(np.eye(3), (4, 1, 1)), turns(rng, 60)])
+    shift = np.concatenate(
+        [np.array([(0, 0, 0), (0, 0, 0.1), (0.3, 0, 0), (0.3, 0.3, 0)]), rng.normal(size=(60, 3)) / 3]
+    )
+    found, exact = _bound(one, other)(turn, shift), _distances(one, other, turn, shift)
+    assert (found <= exact + 1e-9).all()
+    assert (found > -1).all()
+
+
+def test_the_bound_of_spheres_is_exact_and_that_of_boxes_beside_a_face() -> None:
+    turn, shift = np.eye(3)[None], np.array([[0.0, 3.0, 4.0]])
+    assert _bound(Sphere(0.5, (1, 0, 0)), Sphere(0.25, (1, 0, 0)))(turn, shift) == pytest.approx([4.25], abs=1e-11)
+    assert _bound(Box((2, 2, 2)), Box((1, 9, 1)))(turn, shift) == pytest.approx([2.5], abs=1e-12)
+
+
+def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> None:
+    """Of a turn and a slide, each with both limits, the lower one, the upper one, none."""
+    ends = [(-0.3, 0.4), (1.0, np.inf), (-np.inf, 1.0), (-np.inf, np.inf)]
+    links, joints = [Link("link0")], []
+    for k in range(8):
+        kind: Any = "prismatic" if k >= 4 else "revolute"
+        joints.append(Joint(f"joint{k}", kind, f"link{k}", f"link{k + 1}"))
+        links.append(Link(f"link{k + 1}"))
+    low, high = np.tile(np.array(ends).T, 2)
+    found = _postures(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
+    for first, room in ((0, np.pi), (4, 1.0)):
+        spans = [(-0.3, 0.4), (1.0, 1.0 + 2 * room), (1.0 - 2 * room, 1.0), (-room, room)]
+        for k, (least, most) in enumerate(spans):
+            values = found[:, first + k]
+            assert least <= values.min() < least + 0.01 * (most - least)
+            assert most >= values.max() > most - 0.01 * (most - least)
+
+
+def test_a_clearance_larger_than_what_balls_leave_is_proven_by_the_bodies() -> None:
+    """Plates one above the other, 0.98 m apart; the balls around them are 0.2 m apart and less."""
+    links, limit = tuple(Link(f"link{k}") for k in range(3)), 0.1
+    turn: dict[str, Any] = {"axis": (0, 0, 1), "lower": -limit, "upper": limit}
+    joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0, 0, 0.5), **turn) for k in (1, 2))
+    plate = Box((0.56, 0.56, 0.02))
+    bodies = (Body("link0", plate), Body("link1", Sphere(0.01, (9, 9, 0))), Body("link2", plate))
+    for clearance, reason in ((0.97, NEVER), (0.99, None)):
+        pairs = checked_pairs(Robot(links, joints), bodies, clearance=clearance)
+        assert pairs.left.get(("link0", "link2")) == reason
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [((1.0, 1.0), None), ((-1.0, 1.0), None), ((0.313, -0.477), None), ((0.0, 0.0), None), ((1.1, 0.2), NEVER)],
+    ids=["corner", "other corner", "between", "middle", "beyond a limit"],
+)
+def test_hulls_that_meet_in_few_postures_are_checked(place: tuple[float, float], reason: str | None) -> None:
+    """Cubes of 0.04 m on slides of -1 to 1 m, of which one passes by this place alone; their covers always touch."""
+    links = tuple(Link(f"link{k}") for k in range(3))
+    slide: dict[str, Any] = {"lower": -1.0, "upper": 1.0}
+    joints = (
+        Joint("x", "prismatic", "link0", "link1", axis=(1, 0, 0), **slide),
+        Joint("y", "prismatic", "link1", "link2", axis=(0, 1, 0), **slide),
+    )
+    corners = 0.02 * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    ball = Sphere(4.0, (0, 0, 0))
+    bodies = (
+        Body("link0", ball, 4.0, LinkMesh(corners + np.array([*place, 0.0]))),
+        Body("link1", Sphere(0.01, (9, 9, 9))),
+        Body("link2", ball, 4.0, LinkMesh(corners)),
+    )
+    assert checked_pairs(Robot(links, joints), bodies).left.get(("link0", "link2")) == reason
 
 
 def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:

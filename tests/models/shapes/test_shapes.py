@@ -69,6 +69,26 @@ def test_a_hull_is_kept_and_a_broken_file_is_no_error(
     np.testing.assert_array_equal(mesh.placed(turn, shift).core, Mesh(points).placed(turn, shift).core)
 
 
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
+def test_a_kept_hull_is_read_and_one_a_little_too_small_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: float
+) -> None:
+    """By a share of its size, whatever that is: what is kept of a body of 1 um or 1 km is sound just as well."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    points = size * np.random.default_rng(5).normal(size=(30, 3))
+    known, sought = kept_hull(points), []
+    monkeypatch.setattr("models.shapes.hull.convex_hull", lambda given: sought.append(1) or convex_hull(given))
+    kept_hull(points)
+    assert not sought
+    (file,) = (tmp_path / "selfmotion").iterdir()
+    vertices, faces, normals, offsets = json.loads(file.read_text(encoding="utf-8"))
+    for share, seeks in ((1e-12, False), (1e-7, True)):
+        file.write_text(json.dumps([vertices, faces, normals, [(1 - share) * x for x in offsets]]), encoding="utf-8")
+        kept_hull(points)
+        assert bool(sought) is seeks
+    np.testing.assert_array_equal(kept_hull(points).offsets, known.offsets)
+
+
 def test_what_has_no_end_is_out_of_reach() -> None:
     assert HalfSpace((0, 0, 1), (0, 0, 0)).reach((0, 0, 0)) == np.inf
     assert Box((np.inf, 1, 1)).reach((0, 0, 0)) == np.inf
@@ -123,6 +143,18 @@ def test_the_hull_of_points_in_common_planes_is_that_of_qhull(seed: int, count: 
     turn = random_frame(rng).rotation if turned else np.eye(3)
     for points in (grid, prism):
         assert_hull(points @ turn.T)
+
+
+def test_a_hull_far_away_is_the_same_hull_moved() -> None:
+    """What is flat is so beside the size of the points, not beside how far away they are."""
+    rng = np.random.default_rng(6)
+    points, shift = rng.normal(size=(60, 3)), np.array([4e5, -3e5, 2e5])
+    near, far = convex_hull(points), convex_hull(points + shift)
+    np.testing.assert_array_equal(far.faces, near.faces)
+    np.testing.assert_allclose(far.vertices - shift, near.vertices, atol=1e-9)
+    np.testing.assert_allclose(far.normals, near.normals, atol=1e-9)
+    plate = np.vstack([points[:, :2] @ np.eye(2, 3), points[:, :2] @ np.eye(2, 3) + (0, 0, 1e-6)])
+    assert np.ptp(convex_hull(plate + 1e4).vertices[:, 2]) == pytest.approx(1e-6, abs=1e-11)
 
 
 def test_the_faces_of_a_box_and_of_a_drum_are_counted_once() -> None:

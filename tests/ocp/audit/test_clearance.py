@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.audit.clearance import Clearance, nearest_at
-from ocp.problem.hulls import Hull, gap_along, nearest_directions
+from ocp.audit.clearance import Clearance, Track, clearance_along, nearest_at
+from ocp.problem.hulls import Frames, Hull, frames_of, gap_along, nearest_directions
+from ocp.problem.separation import Separation
 
 EYE = np.eye(3).ravel()
 
@@ -172,6 +173,121 @@ def test_time_and_length_rescaled_change_no_verdict() -> None:
         assert found.worst is not None
         assert_allclose(found.worst.distance / scale, 0.15, rtol=0.03)
         assert_allclose(found.worst.time / horizon, 0.5, atol=0.05)
+
+
+def swinging(low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.0) -> Clearance:
+    """A point on a slide on an arm that turns, past a floor 1 m below where it passes the axis.
+
+    Its distance from the axis grows by 1 m/s, the arm turns by 0.1 rad/s; it passes at a share of the 1 s. The height
+    1 + s sin(0.1 s), s = t - share, is least there, and bends by Coriolis' acceleration of 0.2 m/s^2.
+    """
+    reach = max(low, 1 - low)
+    place = ca.SX.sym("place", 12)
+    apart = Separation(
+        "clearance", place, {"point": Hull(0, np.zeros((1, 3))), "floor": Hull(-1, np.array([[0, -1.0, 0]]), 0.0, UP)},
+        np.array([[0, 1, -1]]), np.array([1.0 + asked]), {"slide": 1, "turn": 1},
+        np.array([[1.0, reach]]), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1),
+    )  # fmt: skip
+
+    def frames(at: np.ndarray) -> Frames:
+        s = at - low
+        places = np.stack([s * np.cos(0.1 * s), s * np.sin(0.1 * s), 0 * s], axis=1)
+        return frames_of(np.hstack([np.tile(EYE, (len(at), 1)), places]))
+
+    rates, seconds = np.tile([[1.0, 0.1]], (pieces, 1)), np.zeros((pieces, 2))
+    return clearance_along(apart, Track(np.linspace(0, 1, pieces + 1), 1.0, rates, seconds, smooth, frames))
+
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("low", [0.3, 0.45, 0.6, 0.81])
+def test_what_slides_on_what_turns_bends_by_coriolis(low: float) -> None:
+    """It comes nearer than is asked for an instant, between all places that are looked at first."""
+    found = swinging(low, asked=4e-4).worst
+    assert found is not None
+    assert found.missed > 0
+    assert found.least <= 1.0 <= found.distance + 1e-15
+    clear = swinging(low, asked=-1e-2)
+    assert clear.settled
+    assert clear.worst is not None
+    assert clear.worst.missed == 0
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_the_pieces_of_a_track_do_not_matter(smooth: bool) -> None:
+    """Many are looked at together at first; the last of an odd number is by itself."""
+    for pieces in (1, 2, 7, 128, 129, 1001):
+        found = swinging(0.3137, pieces, smooth, asked=-0.5)
+        assert found.settled
+        assert found.worst is not None
+        assert 1.0 - 0.02 * 0.5 <= found.worst.least <= 1.0 <= found.worst.distance <= 1.01
+        assert found.looked < 3 * max(pieces, 20)
+
+
+@pytest.mark.parametrize("pieces", [1, 5, 129, 300, 1001])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_what_comes_too_near_between_the_places_looked_at_first_is_found(pieces: int, smooth: bool) -> None:
+    """Half way between two of them in some piece, by half as much as it bends in between."""
+    for share in (0.1, 0.37, 0.5, 0.63, 0.999):
+        low = (np.floor(share * pieces) + 0.25) / pieces
+        found = swinging(low, pieces, smooth, asked=0.1 * (0.25 / pieces) ** 2 / 2).worst
+        assert found is not None
+        assert found.missed > 0
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1.0, 1e2])
+def test_the_unit_of_a_state_does_not_matter(unit: float) -> None:
+    """A point that dips to a height of 1 m, 0.3 s after it starts, told in cm, m, or 100 m."""
+    hulls = {"point": Hull(0, np.zeros((1, 3))), "floor": Hull(-1, np.zeros((1, 3)), 0.0, UP)}
+    one, rate, second = np.ones((1, 1)), np.array([[1.4 / unit]]), np.array([[2.0 / unit]])
+
+    def frames(at: np.ndarray) -> Frames:
+        heights = (1 + (at - 0.3) ** 2)[:, None] * UP
+        return frames_of(np.hstack([np.tile(EYE, (len(at), 1)), heights]))
+
+    for asked in (0.5, 0.99, 1.0 + 1e-3):
+        apart = Separation(
+            "clearance", ca.SX.sym("place", 12), hulls, np.array([[0, 1, -1]]), np.array([asked]), {"height": 1},
+            unit * one, 0 * one, np.zeros(1), np.zeros(1),
+        )  # fmt: skip
+        found = clearance_along(apart, Track(np.array([0.0, 1.0]), 1.0, rate, second, True, frames))
+        assert found.settled
+        assert found.worst is not None
+        assert (found.worst.missed > 0) == (asked > 1)
+        assert found.worst.least <= 1.0
+        assert found.looked < 60
+
+
+def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_be() -> None:
+    """Of what it is more than is asked, over many places and sizes; of a pair that touches as well."""
+    for sign in (1.0, -1.0):
+        spare = sign * np.geomspace(1e-3, 0.9, 16)
+        shares = []
+        for k, each in enumerate(spare):
+            worst = swinging(0.2 + 0.04 * k, asked=-each).worst
+            assert worst is not None
+            shares.append((worst.distance - worst.least) / abs(worst.distance - worst.asked))
+        assert 0.01 < max(shares) <= 0.02 + 1e-9
+    worst = swinging(0.3137, asked=1e-5).worst
+    assert worst is not None
+    assert 1e-7 < worst.distance - worst.least <= 1e-6
+
+
+def test_what_would_take_too_long_is_not_proven(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is told from below all the same, and no more is looked at than may be."""
+    assert swinging(0.3137, asked=-1e-5).settled
+    monkeypatch.setattr("ocp.audit.clearance.MOST", 12)
+    short = swinging(0.3137, asked=-1e-5)
+    assert not short.settled
+    assert short.looked <= 12
+    assert short.worst is not None
+    assert short.worst.least <= 1.0
+    assert short.worst.missed > 0
+    assert str(short).startswith("not proven")
+    monkeypatch.setattr("ocp.audit.clearance.MOST", 400_000)
+    monkeypatch.setattr("ocp.audit.clearance.HALVINGS", 2)
+    assert not swinging(0.3137, asked=-1e-5).settled
 
 
 def test_a_plan_of_held_controls_and_one_that_was_saved(tmp_path: Any) -> None:

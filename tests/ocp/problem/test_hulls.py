@@ -71,6 +71,26 @@ def test_moved_and_scaled_together(seed: int, scale: float) -> None:
     assert_allclose(found(*moved)[far], scale * gap[far], rtol=1e-7)
 
 
+@pytest.mark.parametrize("power", [-30, -10, 10])
+def test_the_unit_of_length_does_not_matter(power: int) -> None:
+    """Of hulls apart and within each other: the same directions, gaps by the same factor."""
+    rng = np.random.default_rng(4)
+    one, other = rng.normal(size=(60, 6, 3)), rng.normal(size=(60, 7, 3)) + rng.normal(size=(60, 1, 3))
+    scale = 2.0**power
+    gap = found(one, other)
+    assert min((gap < 0).sum(), (gap > 0).sum()) > 15
+    assert_allclose(found(scale * one, scale * other) / scale, gap, atol=1e-14)
+
+
+def test_hulls_overlap_along_what_is_found_by_no_more_than_along_their_middles() -> None:
+    rng = np.random.default_rng(5)
+    one, other = rng.normal(size=(80, 20, 3)), rng.normal(size=(80, 30, 3)) + 0.3 * rng.normal(size=(80, 1, 3))
+    gap, middles = found(one, other), other.mean(axis=1) - one.mean(axis=1)
+    assert (gap < 0).all()
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    assert (gap >= np.maximum(gap_along(middles, one, other), gap_along(-middles, one, other)) - 1e-12).all()
+
+
 def test_against_a_convex_program() -> None:
     rng = np.random.default_rng(3)
     one, other = rng.normal(size=(12, 5, 3)), rng.normal(size=(12, 7, 3)) + 3

@@ -1,0 +1,99 @@
+"""How far a body at the end of a chain may come from the axes of its joints: exact stretched out, never less."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import Joint, Link, Robot, link_frames
+from models.arrays import Array
+from models.shapes.rigid_parts import RigidParts, Step, arms
+from models.shapes.shapes import Box, Capsule, Shape
+
+
+def chain_of(joints: list[dict[str, Any]]) -> tuple[Robot, list[Step]]:
+    """Links on joints one after the other, and the steps from the first to the last."""
+    links = tuple(Link(f"link{k}") for k in range(len(joints) + 1))
+    made = [Joint(f"joint{k}", parent=f"link{k}", child=f"link{k + 1}", **each) for k, each in enumerate(joints)]
+    robot = Robot(links, tuple(made))
+    return robot, RigidParts.of(robot).path("link0", f"link{len(joints)}")[1]
+
+
+def test_a_chain_that_is_stretched_out_reaches_as_far_as_is_said() -> None:
+    """0.2 m along x to a turn, 0.3 m to a slide of -0.1 to 0.5 m, 0.4 m to a turn, and there a rod of 0.6 m."""
+    turn, slide = {"kind": "revolute", "axis": (0, 0, 1), "lower": -2, "upper": 2}, {"kind": "prismatic"}
+    robot, steps = chain_of(
+        [
+            {**turn, "translation": (0.2, 0, 0)},
+            {**slide, "axis": (1, 0, 0), "lower": -0.1, "upper": 0.5, "translation": (0.3, 0, 0)},
+            {**turn, "translation": (0.4, 0, 0)},
+        ]
+    )
+    rod = Capsule(0.05, (0.1, 0, 0), (0.6, 0, 0))
+    own, reach = arms(robot, [(step, True) for step in steps], rod, robot.lower, robot.upper)
+    end = 0.6 + 0.05
+    assert own == pytest.approx([0.3 + 0.5 + 0.4 + end, 0.0 + end, end])
+    assert reach == pytest.approx(0.2 + 0.3 + 0.5 + 0.4 + end)
+    # the other way round: a rod on the first link, seen from behind the last joint
+    start = Capsule(0.05, (0.1, 0, 0), (-0.6, 0, 0))
+    own, _ = arms(robot, [(step, False) for step in steps[::-1]], start, robot.lower, robot.upper)
+    assert own == pytest.approx([0.4 + 0.5 + 0.3 + 0.2 + end, 0.2 + end, 0.2 + end])
+    assert arms(robot, [], rod, robot.lower, robot.upper) == ([], pytest.approx(end))
+
+
+def test_an_axis_along_the_way_has_no_arm_and_one_across_all_of_it() -> None:
+    joint = {"kind": "revolute", "lower": -2, "upper": 2}
+    robot, steps = chain_of(
+        [
+            {**joint, "axis": (1, 0, 0), "translation": (0.2, 0.1, 0)},
+            {**joint, "axis": (1, 0, 0), "translation": (3, 4, 0)},
+        ]
+    )
+    box = Box((0.2, 0.6, 0.8))
+    own, reach = arms(robot, [(step, True) for step in steps], box, robot.lower, robot.upper)
+    assert own == pytest.approx([4.0 + np.hypot(0.5, 0.1), 0.5])
+    assert reach == pytest.approx(np.hypot(0.2, 0.1) + 5.0 + np.hypot(0.5, 0.1))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_point_is_farther_from_an_axis_in_any_posture(seed: int) -> None:
+    """Up from one link of a random tree, down to another: of points of the body in 300 postures."""
+    rng = np.random.default_rng(seed)
+    links, joints = tuple(Link(f"link{k}") for k in range(6)), []
+    for k in range(1, 6):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        kind: Any = "prismatic" if k in (2, 5) else "revolute"
+        low, high = np.sort(rng.uniform(-0.5, 0.5, 2) if kind == "prismatic" else rng.uniform(-3, 3, 2))
+        parent = {4: "link0"}.get(k, f"link{k - 1}")  # 0-1-2-3 and 0-4-5
+        place: dict[str, Any] = {"translation": rng.normal(size=3), "rotation": turn * np.linalg.det(turn)}
+        joints.append(
+            Joint(f"joint{k}", kind, parent, f"link{k}", axis=rng.normal(size=3), lower=low, upper=high, **place)
+        )
+    robot = Robot(links, tuple(joints), tip="link5")
+    up, down = RigidParts.of(robot).path("link3", "link5")
+    chain = [*((step, False) for step in up), *((step, True) for step in down)]
+    end = Box(rng.uniform(0.1, 1, 3), rng.normal(size=3)) if seed % 2 else Capsule(0.2, *rng.normal(size=(2, 3)))
+    own, _ = arms(robot, chain, end, robot.lower, robot.upper)
+    assert len(own) == 5
+    found = farthest(robot, [step for step, _ in chain], "link5", end, rng)
+    assert (found <= np.array(own) + 1e-9).all()
+    assert found[-1] == pytest.approx(own[-1], rel=1e-9)
+    assert (found > 0.3 * np.array(own)).all()
+
+
+def farthest(robot: Robot, steps: list[Step], link: str, body: Shape, rng: np.random.Generator) -> Array:
+    """Of points of a body of a link from the axis of each joint, in random postures."""
+    q = ca.SX.sym("q", robot.dof)
+    frames = link_frames(robot, q)
+    points = ca.mtimes(frames[link].rotation, ca.DM(body.core.T)) + ca.repmat(frames[link].position, 1, len(body.core))
+    each = []
+    for step in steps:
+        frame = frames[step.joint.child]
+        axis = ca.mtimes(frame.rotation, ca.DM(step.joint.axis))
+        away = [ca.norm_2(ca.cross(axis, points[:, k] - frame.position)) for k in range(len(body.core))]
+        each.append(ca.mmax(ca.vertcat(*away)) + body.swelling)
+    postures = rng.uniform(robot.lower, robot.upper, (300, robot.dof)).T
+    return np.array(ca.Function("away", [q], [ca.vertcat(*each)])(postures)).max(axis=1)
