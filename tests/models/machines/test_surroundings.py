@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -20,13 +21,17 @@ from models import (
     HalfSpace,
     Joint,
     Link,
+    Mesh,
     Mimic,
     ModelError,
     Moving,
     Robot,
     Sphere,
     Surroundings,
+    link_frames,
 )
+from models.shapes.distance import distance
+from models.shapes.hull import convex_hull
 from ocp.problem.hulls import gap_along, nearest_directions
 from tests.models.machines.armoured import armoured_arm
 
@@ -179,6 +184,28 @@ def test_a_moving_obstacle_is_no_faster_than_its_bounds() -> None:
     assert np.all(speeds[[i for i, pair in enumerate(around.labels) if "obstacle 0" not in pair]] == 0)
 
 
+def test_each_obstacle_that_moves_is_where_it_is_then() -> None:
+    """Two of them, others between: beside each link as if it stood where it is at that time."""
+    machine = machines()["arm"]
+    ways: list[Any] = [lambda t: (0.5, 0.3 * t, 0.5), lambda t: (-0.4 * t, 0.2, 0.3 + t**2)]
+    moving = [Moving(OBSTACLES[1], ways[0], turned), Moving(OBSTACLES[2], ways[1])]
+    around = Surroundings(machine, (OBSTACLES[0], moving[0], OBSTACLES[3], moving[1]))
+    q, t = ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
+    found = ca.Function("found", [q, t], [around.distances((), q, t)])
+    for j, at in zip(postures(machine, 5, 3)[1], (0.0, 0.3, 0.7, 1.0, 2.0), strict=True):
+        placed = []
+        for one, way, turn in zip(moving, ways, (np.array(ca.DM(turned(at))), np.eye(3)), strict=True):
+            placed.append(one.shape.placed(turn, np.array(way(at))))
+        still = Surroundings(machine, (OBSTACLES[0], placed[0], OBSTACLES[3], placed[1]))
+        known = dict(zip(still.labels, np.array(ca.DM(still.distances((), ca.DM(j)))).ravel(), strict=True))
+        told = dict(zip(around.labels, np.array(found(j, at)).ravel(), strict=True))
+        assert {one for label in told for one in label if one.startswith("obstacle")} == {
+            f"obstacle {k}" for k in range(4)
+        }
+        for label, value in known.items():
+            assert told[label] == pytest.approx(value, abs=1e-9)
+
+
 def test_scaled_machines_have_scaled_distances_and_levers() -> None:
     plain, large = (Surroundings(FixedBase(armoured_arm(scale=k))) for k in (1.0, 3.0))
     q = np.linspace(-1, 1, 7)
@@ -284,3 +311,59 @@ def test_gradients_of_no_pairs_have_no_rows() -> None:
     )
     assert values.shape == (0, 1)
     assert slopes.shape == (0, machine.joint_size)
+
+
+@pytest.fixture
+def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FixedBase:
+    """Five links one above the other, of one mesh: a hook that two capsules cover."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # fitted once
+    corners = np.array(np.meshgrid(*[(0.0, 1.0)] * 3)).reshape(3, -1).T
+    hook = [convex_hull(low + corners * size) for low, size in
+            (((-0.05, -0.05, 0.0), (0.1, 0.1, 0.4)), ((-0.05, -0.05, 0.3), (0.35, 0.1, 0.1)))]  # fmt: skip
+    lines = [f"v {x} {y} {z}" for each in hook for x, y, z in each.vertices]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for k, each in enumerate(hook) for a, b, c in each.faces + 8 * k]
+    (tmp_path / "hook.obj").write_text("\n".join(lines), encoding="utf-8")
+    shape = CollisionShape("mesh", (1.0, 1.0, 1.0), file="hook.obj")
+    links = tuple(Link(f"link{k}", collisions=(shape,)) for k in range(5))
+    limits: dict[str, Any] = {"axis": (0, 1, 0), "translation": (0, 0, 0.45), "lower": -2.5, "upper": 2.5}
+    joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", **limits) for k in range(1, 5))
+    return FixedBase(Robot(links, joints, tip="link4"))
+
+
+def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: FixedBase, tmp_path: Path) -> None:
+    """Their distances are those of their covers, from below; gradients by the soft minimum; others are covers alone."""
+    around = Surroundings(hooked, folders=[tmp_path])
+    hulls = [isinstance(around.bodies[one].shape, Mesh) for one, _, _ in around.pairs]
+    links = [tuple(int(name[4]) for name in label) for label in around.labels]
+    assert {(i, j) for (i, j), hull in zip(links, hulls, strict=True) if hull} == {
+        (i, j) for i in range(5) for j in range(i + 2, 5) if j - i <= 3
+    }
+    assert [pair for pair, hull in zip(links, hulls, strict=True) if not hull] == 4 * [(0, 4)]
+    points = np.array([-0.05, -0.05, 0.0]), np.array([0.3, 0.05, 0.4])
+    for body in around.bodies:
+        if isinstance(body.shape, Mesh):
+            assert_allclose([body.shape.core.min(axis=0), body.shape.core.max(axis=0)], points, atol=1e-12)
+    q = ca.SX.sym("q", 4)
+    covers = [body for body in around.bodies if not isinstance(body.shape, Mesh)]
+    frames = link_frames(hooked.robot, q)
+    for rounding in (0.0, 3e-3):
+        told = around.distances((), q, rounding=rounding)
+        function = ca.Function("known", [q], [told, ca.jacobian(told, q)])
+        gradients = around.distance_gradients(rounding=rounding)
+        each = {
+            (i, j): [
+                distance(a.shape, b.shape, frames[f"link{i}"], frames[f"link{j}"], rounding=rounding)
+                for a in covers if a.name.startswith(f"link{i}/")
+                for b in covers if b.name.startswith(f"link{j}/")
+            ]
+            for (i, j), hull in zip(links, hulls, strict=True) if hull
+        }  # fmt: skip
+        least = ca.Function("least", [q], [ca.vertcat(*(ca.mmin(ca.vertcat(*of)) for of in each.values()))])
+        for posture in np.random.default_rng(9).uniform(-2, 2, (8, 4)):
+            values, slopes = (np.array(part) for part in function(posture))
+            found, derived = (np.array(part) for part in gradients((), posture, 0.0))
+            assert_allclose(found, values, atol=1e-12)
+            assert_allclose(derived, slopes, atol=1e-8)
+            short = np.array(least(posture)).ravel() - values.ravel()[hulls]
+            assert (short >= -1e-12).all()
+            assert (short <= (rounding / 4 + 1e-6) * np.log(4) + 1e-12).all()

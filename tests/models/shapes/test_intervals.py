@@ -192,7 +192,7 @@ def test_the_excess_is_halved_with_the_intervals() -> None:
         (ca.if_else(T == 0.5, 3, 7), 0.5, 1, 3, 7),
         (ca.if_else(T == 0.5, 3, 7), 0.6, 1, 7, 7),
         (ca.if_else(T == T**2, 3, 7), 0.25, 0.75, 3, 7),
-        (ca.if_else(T == ca.floor(T), 3, 7), 0.5, 0.75, 7, 7),
+        (ca.if_else(ca.floor(T) == T, 3, 7), 0.5, 0.75, 7, 7),
         (ca.if_else(ca.floor(T) == ca.ceil(T), 3, 7), 0.5, 0.75, 7, 7),
         (ca.copysign(2, T), 1, 2, 2, 2),
         (ca.copysign(2, T), -2, -1, -2, 2),
