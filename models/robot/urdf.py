@@ -87,7 +87,8 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
     Warns:
         ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF; angles that look like
-            degrees, lengths that look like millimetres (see `models.arrays.warn_of_degrees`).
+            degrees, lengths that look like millimetres (see `models.arrays.warn_of_degrees`); collision shapes of a
+            root link that is left out.
     """
     checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
     tree = parsed(source)
@@ -108,6 +109,12 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
                 "the whole robot; make it fixed, or read its two sides as two robots"
             )
             raise ModelError(message, name=name, value="floating")
+        if base.collisions:
+            message = (
+                f"link {base.name!r}, from which joint {name!r} lets the robot float, is left out with its "
+                "<collision> shapes: give them as obstacles"
+            )
+            warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=3)
         links = tuple(link for link in links if link is not base)
         pairs = [pair for pair in pairs if pair[0] != name]
     tip = _only(tree, "tip", "the robot")

@@ -18,11 +18,13 @@ from models.robot.robot import Robot
 from models.shapes.covering import Cover, cover
 from models.shapes.hull import kept_hull
 from models.shapes.mesh_files import find_mesh, read_mesh
-from models.shapes.shapes import SIDES, Box, Capsule, Cylinder, Mesh, Shape, Sphere, checked_shape
+from models.shapes.shapes import CORNERS, SIDES, Box, Capsule, Cylinder, Mesh, Shape, Sphere, checked_shape
 
 MissingRule: TypeAlias = Literal["raise", "skip"]
 Folders: TypeAlias = Sequence[str | os.PathLike[str]]
 
+THIN = 1e-6
+"""m: by which a mesh in a plane is thickened."""
 FLAT = 1.25
 """A capsule of this many times the volume of the cylinder that it stands for is too much: the cylinder is kept."""
 RADII = np.linspace(0.0, 1.0, 400) ** 3
@@ -42,12 +44,11 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Its convex hull, in the frame of the link.
-
-        Raises:
-            ModelError: Points in a plane.
-        """
-        return Mesh.around(kept_hull(self.points))
+        """Its convex hull, in the frame of the link; of points in a plane, which have none, that of THIN cubes."""
+        try:
+            return Mesh.around(kept_hull(self.points))
+        except ModelError:
+            return Mesh.around(kept_hull((self.points[:, None] + THIN * CORNERS).reshape(-1, 3)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -281,6 +281,9 @@ def test_a_floating_joint_below_a_massless_root_says_that_the_robot_floats() -> 
     source = chain("Frr").replace(f'<link name="l0">{BODY}</link>', '<link name="l0"/>')
     robot = Robot.from_urdf(source)
     assert (robot.root, robot.joint_names) == ("l1", ("j2", "j3"))
+    table = '<link name="l0"><collision><geometry><box size="1 1 1"/></geometry></collision></link>'
+    with pytest.warns(ModelWarning, match="'l0'.*give them as obstacles"):
+        Robot.from_urdf(source.replace('<link name="l0"/>', table))
     for elsewhere in (chain("Frr"), chain("rFr")):
         with refused(r"joint 'j[12]' is floating, which is supported only"):
             Robot.from_urdf(elsewhere)

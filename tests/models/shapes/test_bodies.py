@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from models import CollisionShape, Link, ModelError, ModelWarning, Robot
+from models import CollisionShape, FixedBase, Joint, Link, ModelError, ModelWarning, Robot, Surroundings
 from models.arrays import Array
 from models.shapes.bodies import Body, bodies_of, capsule_around
 from models.shapes.covering import inside
 from models.shapes.mesh_files import find_mesh, read_mesh
-from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
@@ -122,6 +122,24 @@ def test_a_mesh_is_found_scaled_mirrored_and_placed(mesh_robot: Path, monkeypatc
         bodies_of(Robot.from_urdf(text))  # a text has no folder
     again = bodies_of(Robot.from_urdf(text), folders=[mesh_robot.parents[2]])
     np.testing.assert_array_equal(again[0].shape.core, bodies[0].shape.core)
+
+
+@pytest.mark.parametrize("flat", [(1, 1, 0), (0, 0, 1)], ids=["plate", "line"])
+def test_meshes_in_a_plane_are_looked_at_as_plates_of_a_micrometre(tmp_path: Path, flat: tuple[float, ...]) -> None:
+    """Of two links two joints apart, which are seen as hulls: of what has none, with next to no thickness."""
+    corners = np.array(np.meshgrid(*[(-0.3, 0.3)] * 3)).reshape(3, -1).T * flat
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 2 4 5\nf 6 7 8\n"
+    (tmp_path / "flat.obj").write_text(text, encoding="utf-8")
+    links = tuple(Link(f"link{k}", collisions=(CollisionShape("mesh", (1, 1, 1), "flat.obj"),)) for k in range(3))
+    turn: dict[str, Any] = {"axis": (0, 1, 0), "translation": (0, 0, 0.2), "lower": -2, "upper": 2}
+    joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", **turn) for k in (1, 2))
+    around = Surroundings(FixedBase(Robot(links, joints)), folders=[tmp_path])
+    assert around.labels == (("link0 hull 1", "link2 hull 2"),)
+    for body in around.bodies:
+        if isinstance(body.shape, Mesh):
+            wanted = np.maximum(np.ptp(corners, axis=0), 2e-6)
+            np.testing.assert_allclose(np.ptp(body.shape.core, axis=0), wanted, atol=3e-6)
+    assert np.isfinite(float(around.distances((), [1.5, -1.5])))
 
 
 def test_a_missing_mesh_is_named_and_skipped_only_if_told(mesh_robot: Path) -> None:

@@ -39,9 +39,18 @@ SETS, TIMES = sets_of(MACHINE, moved(MACHINE, START, "place"))
 INSTANTS = [Instant(SETS, k) for k in range(len(TIMES))]
 
 
-def followed() -> Array:
+def slid(way: float) -> Array:
+    """The start moved along its self-motion, so far in the metric of the sets."""
+    joints, tangents = START, None
+    for _ in range(20):
+        tangents = SETS.tangents_at(np.array([0]), joints[None], tangents)
+        joints = SETS.corrected(np.array([0]), (joints + way / 20 * tangents[0, :, 0])[None])[0][0]
+    return joints
+
+
+def followed(start: Array = START) -> Array:
     """A way that does the task, each posture from the one before."""
-    path = [START]
+    path = [start]
     for k in range(len(TIMES)):
         joints, good = SETS.corrected(np.array([k]), path[-1][None])
         assert good.all()
@@ -58,6 +67,15 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     return drawn_tight(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
 
 
+def drawn(start: Array = START, weight: float = 1.0, far: Any = 1.0, lower: Any = -9.0, upper: Any = 9.0) -> Array:
+    """The way from a start drawn tight, whatever is around."""
+    robot = MACHINE.robot
+    steps = np.full((len(TIMES) - 1, robot.dof), far)
+    bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
+    cost = Length(np.full(robot.dof, weight))
+    return drawn_tight(followed(start), INSTANTS, cost, TIMES, steps, bounds, None, (0.1, 1e-3))
+
+
 def length(path: Array) -> float:
     return float(np.abs(np.diff(path, axis=0)).sum())
 
@@ -68,10 +86,38 @@ def middle_of_the_last_link(joints: Array) -> Array:
 
 
 def test_it_is_no_longer_and_does_its_task() -> None:
-    drawn = tight()
-    assert length(drawn) < 0.99 * length(followed())
-    error = SETS.linearised(np.arange(len(TIMES)), drawn)[0]
+    found = tight()
+    assert length(found) < 0.99 * length(followed())
+    error = SETS.linearised(np.arange(len(TIMES)), found)[0]
     assert_allclose(error, 0.0, atol=1e-9)
+
+
+def test_from_all_along_a_valley_it_leads_to_its_bottom() -> None:
+    """Ways up to 2 rad from the cheapest one, which is farther than the postures beside them reach at once."""
+    least = length(drawn())
+    for way in (-0.5, -1.0, -1.5):
+        assert length(drawn(slid(way))) == pytest.approx(least, rel=3e-3)
+
+
+@pytest.mark.parametrize("weight", [1e-4, 1e4])
+def test_the_unit_of_the_cost_does_not_matter(weight: float) -> None:
+    assert_allclose(drawn(weight=weight), drawn(), atol=1e-12)
+
+
+def test_limits_of_joints_and_of_their_steps_are_kept_and_met() -> None:
+    free = drawn()
+    assert free[:, 1].min() < -1e-3
+    assert free[:, 0].max() > 1.1
+    for low, high in (((-9.0, 0.2, -9.0), 9.0), (-9.0, (0.9, 9.0, 9.0))):
+        kept = drawn(lower=low, upper=high)
+        assert (kept >= np.array(low)).all()
+        assert (kept <= np.array(high)).all()
+        assert length(free) < length(kept) < length(followed())
+        assert min(np.abs(kept - low).min(), np.abs(kept - high).min()) < 0.02
+    steps = np.abs(np.diff(free, axis=0)).max(axis=0)
+    short = drawn(far=(1.0, 1.0, 0.9 * steps[2]))
+    assert np.abs(np.diff(short, axis=0)).max(axis=0)[2] <= 0.9 * steps[2] + 1e-9
+    assert length(free) < length(short) < length(followed())
 
 
 @pytest.mark.parametrize("later", [0.0, 20.0])
@@ -81,12 +127,12 @@ def test_what_moves_is_in_the_way_where_it_is_then(later: float) -> None:
     beside, away = np.append(middle_of_the_last_link(half), 0.04), np.array([0.0, 0.0, 9.0])
     before, after = (beside, away) if later else (away, beside)
     moving = Moving(Sphere(0.05, (0, 0, 0)), lambda t: ca.if_else(t < 10.0, ca.DM(before), ca.DM(after)))
-    drawn = tight(moving, later)
-    assert_allclose(drawn, tight(Sphere(0.05, away)), atol=1e-12)
+    passed = tight(moving, later)
+    assert_allclose(passed, tight(Sphere(0.05, away)), atol=1e-12)
     around = Surroundings(MACHINE, [moving], clearance=CLEARANCE)
-    assert distances_along(around, np.zeros(0), drawn, TIMES + later).min() > CLEARANCE
+    assert distances_along(around, np.zeros(0), passed, TIMES + later).min() > CLEARANCE
     there = Surroundings(MACHINE, [Sphere(0.05, beside)], clearance=CLEARANCE)
-    assert distances_along(there, np.zeros(0), drawn, TIMES).min() < 0.0
+    assert distances_along(there, np.zeros(0), passed, TIMES).min() < 0.0
     past = tight(Sphere(0.05, beside))
     assert distances_along(there, np.zeros(0), past, TIMES).min() > CLEARANCE
-    assert length(past) > length(drawn)
+    assert length(past) > length(passed)
