@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -151,7 +152,7 @@ class _Growing:
     """A hull as it grows: triangles by number, who lies across each edge, the points outside of each triangle."""
 
     def __init__(self, points: Array, tolerance: float) -> None:
-        self.points, self.tolerance, self.made = points, tolerance, 0
+        self.points, self.tolerance, self.numbers = points, tolerance, count()
         self.corners: dict[int, tuple[int, int, int]] = {}
         self.planes: dict[int, tuple[Array, float]] = {}
         self.owner: dict[tuple[int, int], int] = {}
@@ -168,7 +169,7 @@ class _Growing:
         best = above.argmax(axis=1)
         outside = above.max(axis=1) > self.tolerance
         for k, (a, b, c) in enumerate(triangles):
-            number, self.made = self.made, self.made + 1
+            number = next(self.numbers)
             self.corners[number], self.planes[number] = (a, b, c), (normals[k], float(levels[k]))
             self.owner |= {(a, b): number, (b, c): number, (c, a): number}
             mine = loose[outside & (best == k)]

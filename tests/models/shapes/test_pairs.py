@@ -25,11 +25,13 @@ from models.shapes.pairs import (
     SRDF,
     TOLD,
     Pairs,
+    _Between,
     _bound,
     _distances,
     _postures,
     checked_pairs,
 )
+from models.shapes.rigid_parts import RigidParts
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
 from tests import redundancy_benchmark
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
@@ -134,6 +136,35 @@ def gaps(robot: Robot, bodies: tuple[Body, ...], pairs: list[tuple[int, int]], c
     each = ca.vertcat(*[expression(bodies, frames, i, j) for i, j in pairs])
     postures = np.random.default_rng(1).uniform(robot.lower, robot.upper, (count, robot.dof)).T
     return np.array(ca.Function("gaps", [q], [each])(postures))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
+    """Of random trees the distances in random postures, slides and followers among the joints."""
+    robot, bodies = random_robot(np.random.default_rng(seed))
+    parts = RigidParts.of(robot)
+    postures = np.random.default_rng(1).uniform(robot.lower, robot.upper, (10, robot.dof))
+    every = [(i, j) for i, j in combinations(range(len(bodies)), 2) if i % 3 or j % 3]  # but boxes beside boxes
+    known = gaps(robot, bodies, every, 10)
+    for (i, j), row in zip(every, known, strict=True):
+        one, other = bodies[i].shape, bodies[j].shape
+        between = _Between(robot, one, other, *parts.path(bodies[i].link, bodies[j].link), _bound(one, other))
+        turn, shift = between._relative(postures)
+        np.testing.assert_allclose(_distances(one, other, turn, shift), row, atol=1e-9)
+        assert (between.gaps(postures)[0] <= row + 1e-9).all()
+
+
+def test_of_several_bodies_the_reason_that_matters_most_is_told() -> None:
+    """Whatever their order: always touching before never touching, and before it what only covers may do."""
+    robot, _ = chain(0.1, 0.001, 0.1)
+    ball, between = Sphere(0.05, (0.0, 0.0, 0.0)), Body("link1", Sphere(0.05, (0.0, 0.0, 0.0)))
+    near, loose = Body("link0", Sphere(0.05, (0.1, 0, 0))), Body("link0", Sphere(0.05, (0.1, 0, 0)), 0.12)
+    far = Body("link0", Sphere(0.01, (9.0, 0, 0)))
+    for several, reason in (((near, far), ALWAYS), ((loose, far), COVERED), ((near, loose), COVERED), ((far,), NEVER)):
+        for own in (several, several[::-1]):
+            pairs = checked_pairs(robot, (*own, between, Body("link2", ball)))
+            assert pairs.left["link0", "link2"] == reason
+            assert pairs.checked == ()
 
 
 def test_pairs_that_are_checked_touch_somewhere_or_nearly() -> None:
@@ -256,6 +287,17 @@ def test_a_clearance_larger_than_what_balls_leave_is_proven_by_the_bodies() -> N
     for clearance, reason in ((0.97, NEVER), (0.99, None)):
         pairs = checked_pairs(Robot(links, joints), bodies, clearance=clearance)
         assert pairs.left.get(("link0", "link2")) == reason
+
+
+@pytest.mark.parametrize(("short", "reason"), [(0.5e-6, None), (2e-6, NEVER)])
+def test_a_proof_leaves_room_for_rounding(short: float, reason: str | None) -> None:
+    """Balls on a common axis, always 0.8 m apart, that have to be apart by a little less."""
+    links = tuple(Link(f"link{k}") for k in range(3))
+    turn: dict[str, Any] = {"axis": (0, 0, 1), "lower": -1e-9, "upper": 1e-9}
+    joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0, 0, 0.5), **turn) for k in (1, 2))
+    bodies = tuple(Body(f"link{k}", Sphere(0.1, (0, 0, 0))) for k in range(3))
+    pairs = checked_pairs(Robot(links, joints), bodies, clearance=0.8 - short)
+    assert pairs.left.get(("link0", "link2")) == reason
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,25 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import CollisionShape, FixedBase, Joint, Link, Moving, Robot, Sphere, Surroundings
+from models import (
+    Box,
+    Capsule,
+    CollisionShape,
+    FixedBase,
+    HalfSpace,
+    Joint,
+    Link,
+    Mimic,
+    Moving,
+    Robot,
+    Sphere,
+    Surroundings,
+)
 from ocp import Clear, Collocation, Problem, ProblemError, SolveError, solve
 from ocp.audit.audit import Finding
 from ocp.audit.clearance import Clearance, Nearest
 from ocp.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, keeping_clear, touching_error
+from ocp.local.touching import distances_along
 from ocp.problem.values import constant
 from tests.models.machines.armoured import armoured_arm
 
@@ -104,6 +118,67 @@ def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
         assert found.worst.least <= least + 1e-9
         assert (found.worst.missed > 0) == (least < 0)
         assert found.worst.time == pytest.approx(2.0 if end < 0.4 else 2.0 * 1.4 / 1.7, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
+    """Random machines of 0.1 mm to 100 m, of thin boxes and needles, slides and followers, in 10 ms to 100 s."""
+    rng = np.random.default_rng(seed)
+    size, horizon, pieces = 10.0 ** rng.uniform(-4, 1.5), 10.0 ** rng.uniform(-2, 2), int(rng.choice([1, 3, 17]))
+    robot = random_robot(rng, size)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    obstacles = [
+        Sphere(0.1 * size, rng.normal(size=3) * size),
+        Box(size * 10.0 ** rng.uniform(-5, 0, 3), rng.normal(size=3) * size, turn * np.linalg.det(turn)),
+        HalfSpace(7 * rng.normal(size=3), 2 * size * rng.normal(size=3)),
+        Capsule(1e-4 * size, rng.normal(size=3) * size, rng.normal(size=3) * size),
+    ]
+    around = Surroundings(FixedBase(robot), obstacles)
+    factors = rng.normal(size=(4, robot.dof)) * (robot.upper - robot.lower) / 8
+
+    def joints(at: Any, order: int = 0) -> Any:
+        powers = [np.polyval(np.polyder(np.eye(4)[3 - k], order), at) for k in range(4)]
+        return np.stack(powers, axis=-1) @ factors
+
+    breaks = np.linspace(0, 1, pieces + 1)
+    within = breaks[:-1, None] + np.linspace(0, 1, 400) / pieces
+    rates, seconds = (np.abs(joints(within, k)).max(axis=1) * 1.001 / horizon**k for k in (1, 2))
+    found = clearance_of(around, joints, breaks, horizon, rates, seconds, True)
+    assert found.settled
+    times = np.linspace(0, 1, 2001)
+    sampled = distances_along(around, np.zeros(0), joints(times), times * horizon).min(axis=0)
+    known = dict(zip(around.labels, sampled, strict=True))
+    assert len(found.pairs) == len(known) > 4
+    for near in found.pairs:
+        least = known[near.bodies]
+        assert near.least <= max(least, 0.0) + 1e-9 * size
+        assert (near.distance > 0) >= (least > 0)
+
+
+def random_robot(rng: np.random.Generator, size: float) -> Robot:
+    """Four links one after the other, each with a box, a capsule or a ball, on turns and slides, one that follows."""
+    links, joints = [Link("link0", collisions=(CollisionShape("box", size * rng.uniform(0.05, 0.3, 3)),))], []
+    for k in range(1, 5):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        turn *= np.linalg.det(turn)
+        kind: Any = ("box", "capsule", "sphere")[rng.integers(3)]
+        sizes = {
+            "box": size * rng.uniform(1e-3, 0.3, 3),
+            "capsule": (size * 10.0 ** rng.uniform(-4, -1), size * rng.uniform(0.1, 0.5)),
+            "sphere": (size * rng.uniform(0.01, 0.1),),
+        }
+        shape = CollisionShape(kind, sizes[kind], translation=0.1 * size * rng.normal(size=3), rotation=turn)
+        links.append(Link(f"link{k}", collisions=(shape,)))
+        slides = k > 1 and rng.random() < 0.4
+        most = 0.4 * size if slides else 2.0
+        more: dict[str, Any] = {"lower": -most, "upper": most}
+        if k == 3:
+            more = {"mimic": Mimic("joint1", float(rng.uniform(-1, 1)) * (size if slides else 1.0), 0.1 * most)}
+        place: dict[str, Any] = {"translation": 0.3 * size * rng.normal(size=3), "rotation": turn}
+        joint_kind: Any = "prismatic" if slides else "revolute"
+        axis = rng.normal(size=3)
+        joints.append(Joint(f"joint{k}", joint_kind, f"link{k - 1}", f"link{k}", axis=axis, **place, **more))
+    return Robot(tuple(links), tuple(joints))
 
 
 def touching(around: Surroundings, pair: int = 0, least: float = 0.0, name: str = "clearance") -> SolveError:
