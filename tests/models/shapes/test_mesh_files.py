@@ -126,6 +126,15 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
     np.testing.assert_allclose(vertices[faces[4:]], 1e-3 * CORNERS[FACES], atol=1e-12)
 
 
+def test_points_begin_where_the_accessor_says(tmp_path: Path) -> None:
+    """One number before them, a fourth of each that is no coordinate, and two that are left over."""
+    rows = np.column_stack([CORNERS, np.full(4, 9.0)]).ravel()
+    numbers = " ".join(map(str, [7.0, *rows, 8.0, 8.0]))
+    text = dae(ONE).replace(" ".join(map(str, CORNERS.ravel())), numbers).replace("stride='3'", "stride='4' offset='1'")
+    vertices, faces = read_mesh(written(tmp_path, "a.dae", text))
+    np.testing.assert_array_equal(vertices[faces], CORNERS[FACES])
+
+
 def test_parts_side_by_side_keep_their_triangles() -> None:
     """Of different sizes, and one of none."""
     rng = np.random.default_rng(1)

@@ -76,8 +76,13 @@ def test_a_kept_hull_is_read_and_one_a_little_too_small_is_not(
     """By a share of its size, whatever that is: what is kept of a body of 1 um or 1 km is sound just as well."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     points = size * np.random.default_rng(5).normal(size=(30, 3))
-    known, sought = kept_hull(points), []
-    monkeypatch.setattr("models.shapes.hull.convex_hull", lambda given: sought.append(1) or convex_hull(given))
+    known, sought = kept_hull(points), list[int]()
+
+    def seeking(given: Any) -> Any:
+        sought.append(1)
+        return convex_hull(given)
+
+    monkeypatch.setattr("models.shapes.hull.convex_hull", seeking)
     kept_hull(points)
     assert not sought
     (file,) = (tmp_path / "selfmotion").iterdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -101,17 +102,19 @@ def test_what_moves_by_itself_needs_a_horizon_and_joints_their_limits() -> None:
         assert caught.value.name == name
 
 
+def swung(at: Any, end: float) -> Any:
+    """From -1 rad to an end at an even pace."""
+    return (-1.0 + (end + 1.0) * at)[:, None]
+
+
 def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
     """The post stands in the way at an angle of 0.4 rad; the swing ends before, at 0.3: 2 sin(0.05) between centres."""
     around = Surroundings(crane(), [Sphere(0.005, (np.cos(0.4), np.sin(0.4), 0.0))])
     breaks = np.linspace(0, 1, 5)
     rates, seconds = np.full((4, 1), 1.3 / 2.0), np.zeros((4, 1))
     for end, least in ((0.3, 2 * np.sin(0.05) - 0.105), (0.7, -0.105)):
-        found = clearance_of(
-            around,
-            lambda at, end=end: (-1.0 + (end + 1.0) * at)[:, None],
-            breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True,
-        )  # fmt: skip
+        swing = partial(swung, end=end)
+        found = clearance_of(around, swing, breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True)
         assert found.settled
         assert found.worst is not None
         assert found.worst.distance == pytest.approx(least, abs=2e-3)
@@ -127,7 +130,7 @@ def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
     size, horizon, pieces = 10.0 ** rng.uniform(-4, 1.5), 10.0 ** rng.uniform(-2, 2), int(rng.choice([1, 3, 17]))
     robot = random_robot(rng, size)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    obstacles = [
+    obstacles: list[Any] = [
         Sphere(0.1 * size, rng.normal(size=3) * size),
         Box(size * 10.0 ** rng.uniform(-5, 0, 3), rng.normal(size=3) * size, turn * np.linalg.det(turn)),
         HalfSpace(7 * rng.normal(size=3), 2 * size * rng.normal(size=3)),
@@ -202,7 +205,8 @@ def test_it_is_planned_anew_until_it_is_clear() -> None:
             raise touching(around, pair=0, least=0.01)
         return "clear"
 
-    assert keeping_clear(Clear(around), run) == "clear"
+    found: Any = keeping_clear(Clear(around), run)
+    assert found == "clear"
     margins = [MARGIN + k * (1.5 * 0.01 + MARGIN) for k in range(LOOKS - 1)]
     assert seen == [{}, *({0: pytest.approx(margin)} for margin in margins)]
 
