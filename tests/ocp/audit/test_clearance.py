@@ -73,14 +73,15 @@ def test_a_ball_that_flies_past_a_ball() -> None:
 
 def test_the_nearest_two_at_a_time() -> None:
     posts = {f"post {k}": Hull(-1, np.array([[x, 0.3, 0.0]]), 0.05) for k, x in enumerate((0.2, 0.8))}
-    problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, -1]], 0.1)
-    solution = solve(problem, Collocation(6, 3))
+    problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, 0]], 0.1)
+    solution = solve(problem, Collocation(6, 3))  # the second pair is seen from the ball
     for time in (0.0, 0.3, 0.7, 1.0):
         found, x = nearest_at(problem, solution, time), float(solution.at(time)["q"][0])
         assert found is not None
         assert set(found.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
         assert_allclose(found.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
-        assert_allclose(sorted(found.points[:, 1]), [0.0, 0.3], atol=1e-9)
+        ends = [[x, 0, 0], [0.2 if time < 0.5 else 0.8, 0.3, 0]]
+        assert_allclose(found.points, ends if found.bodies[0] == "ball" else ends[::-1], atol=1e-9)
     free = Problem("free")
     q = free.state("q", initial=0.0)
     free.dynamics(q, free.control("u"))
@@ -89,11 +90,13 @@ def test_the_nearest_two_at_a_time() -> None:
     assert nearest_at(free, solve(free, Collocation(3, 2)), 0.5) is None
 
 
-@pytest.mark.parametrize("thickness", [1e-2, 1e-4, 1e-6])
-def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float) -> None:
+@pytest.mark.parametrize(("thickness", "horizon"), [(1e-2, 1e2), (1e-4, 1.0), (1e-6, 1e-2), (1e-6, 1e2)])
+def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float, horizon: float) -> None:
     wall = np.array([[0.437, y, z] for y in (-1, 1) for z in (-1, 1)], dtype=float)
     point = Hull(0, np.zeros((1, 3)), 0.0)
-    problem = flight([0, 0, 0], [1, 0, 0], {"point": point, "wall": Hull(-1, wall, thickness)}, [[0, 1, -1]], 0.0)
+    problem = flight(
+        [0, 0, 0], [1, 0, 0], {"point": point, "wall": Hull(-1, wall, thickness)}, [[0, 1, -1]], 0.0, horizon
+    )
     audit = solve(problem, Collocation(4, 3)).audit()
     assert not audit["clearance"].passed
     assert not audit.feasible

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import FixedBase, FreeFloating, HalfSpace, Machine, Moving, Sphere, Surroundings
+from models import Box, FixedBase, FreeFloating, HalfSpace, Machine, Moving, Sphere, Surroundings
 from models.arrays import Array
 from models.shapes.distance import COLUMNS
+from models.spatial import skew
 from ocp import ProblemError
 from ocp.local.touching import checked_surroundings, distances_along, hulls_of, touches
 from tests.models.machines.armoured import armoured_arm
@@ -43,6 +44,22 @@ def test_distances_along_a_motion_are_those_of_the_expression(name: str) -> None
     assert_allclose(found[:, exact], told[:, exact], atol=1e-9)
     assert (found >= told - 1e-9)[found > 0].all()
     assert exact.sum() > 8
+
+
+def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
+    """A box that tumbles about its diagonal where another one slides."""
+    axis = skew(ca.DM([1, 1, 1]) / np.sqrt(3))
+
+    def tumbling(t: Any) -> Any:
+        return ca.DM.eye(3) + ca.sin(t) * axis + (1 - ca.cos(t)) * ca.mtimes(axis, axis)
+
+    around = Surroundings(machines()["slider"], [Moving(Box((0.3, 0.2, 0.25)), lambda t: (0.1, 0.1, 0.25), tumbling)])
+    base, joints = postures(around.machine, len(TIMES), 7)
+    joints[:, 0] = np.linspace(-0.1, 0.3, len(TIMES))
+    found, told = distances_along(around, base, joints, TIMES), known(around, base, joints)
+    boxes = [all(isinstance(around.bodies[k].shape, Box) for k in pair[:2]) for pair in around.pairs]
+    assert (found[:, boxes] < -0.05).sum() > 10
+    assert_allclose(found[:, boxes], told[:, boxes], atol=1e-9)
 
 
 @pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])

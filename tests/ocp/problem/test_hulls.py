@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from ocp.problem.hulls import gap_along, nearest_directions
+from ocp.problem.hulls import Frames, Hull, frames_of, gap_along, grouped, nearest_directions
 
 CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0
 
@@ -57,6 +57,17 @@ def test_boxes_that_overlap_do_so_by_the_least_shift() -> None:
     shifts = np.array([[0.9, 0, 0], [0.2, 0.7, 0.1], [0.0, 0.0, 0.0]])
     one = np.tile(CORNERS, (3, 1, 1))
     assert_allclose(found(one, one + shifts[:, None]), [-0.1, -0.3, -1.0], atol=1e-12)
+
+
+def test_a_corner_within_a_face_overlaps_along_its_normal() -> None:
+    """By 0.1, whichever of the two is named first; the face is wide, and its middle beside the corner."""
+    normal = np.ones(3) / np.sqrt(3)
+    turn = np.linalg.qr(np.column_stack([normal, [1.0, 0, 0], [0, 1.0, 0]]))[0]
+    turn[:, 0] = normal
+    place = normal * (0.5 * np.sqrt(3) - 0.1 + 2.0) + 0.7 * turn[:, 1]
+    block = place + (4 * CORNERS) @ turn.T
+    for one, other in ((CORNERS, block), (block, CORNERS)):
+        assert_allclose(found(one[None], other[None]), [-0.1], atol=1e-12)
 
 
 @given(st.integers(0, 10**6), st.floats(1e-3, 1e3))
@@ -112,3 +123,40 @@ def test_points_that_coincide_and_lines_that_are_parallel() -> None:
     one = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [1, 0, 0]]], dtype=float)
     other = np.array([[[0, 2, 0], [1, 2, 0]], [[0, 0, 3], [0, 0, 3]], [[3, 0, 0], [5, 0, 0]]], dtype=float)
     assert_allclose(found(one, other), [2, 3, 2], atol=1e-12)
+
+
+def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
+    """Bodies on frames at random, their points far from the origins of these, seen from world and from each other."""
+    rng = np.random.default_rng(6)
+    hulls = [
+        Hull(k - 1, rng.normal(size=(m, 3)) * 0.3 + rng.normal(size=3), 0.1 * k) for k, m in enumerate((1, 2, 5, 8))
+    ]
+    ground = Hull(-1, np.array([[0.3, 0.1, -2.0]]), 0.0, np.array([0.0, 0.6, 0.8]))
+    pairs = np.array([[0, 1, -1], [1, 2, -1], [3, 2, 1], [0, 3, 0], [1, 3, 2], [4, 2, -1], [3, 4, -1]])
+    places = np.concatenate([np.swapaxes(turns(rng, 150), 1, 2).reshape(-1, 9), rng.normal(size=(150, 3))], axis=1)
+    frames = frames_of(places.reshape(50, 36))
+    for kind in grouped([*hulls, ground], pairs):
+        for pair in np.flatnonzero(kind.has):
+            one, other = ([*hulls, ground][k] for k in pairs[pair, :2])
+            at, row = np.arange(50), np.full(50, kind.row[pair])
+            way, gap, points = kind.nearest(frames, at, row)
+            apart = kind.balls(frames, at, row)
+            widths = sum(np.linalg.norm(hull.core[:, None] - hull.core, axis=2).max() for hull in (one, other))
+            assert (apart <= gap + 1e-9).all()
+            assert kind.flat[row[0]] or (apart >= np.maximum(gap, -one.radius - other.radius) - widths - 1e-9).all()
+            assert_allclose(kind.gaps(way, frames, at, row), gap, atol=1e-12)
+            sides = [placed(frames, hull) for hull in (one, other)]
+            if not (one.normal.size or other.normal.size):
+                known = gap_along(nearest_directions(*sides)[0], *sides) - one.radius - other.radius
+                assert_allclose(gap[known > 0], known[known > 0], atol=1e-9)
+            else:
+                body = sides[1] if one.normal.size else sides[0]
+                known = ((body - ground.core[0]) @ ground.normal).min(axis=1) - one.radius - other.radius
+                assert_allclose(gap, known, atol=1e-9)
+            assert points.shape == (50, 2, 3)
+
+
+def placed(frames: Frames, hull: Hull) -> np.ndarray:
+    """Points of a body in world. Shape (M, m, 3)."""
+    turned = hull.core @ np.swapaxes(frames.rotations[:, hull.frame], 1, 2)
+    return np.asarray(turned + frames.positions[:, hull.frame][:, None])
