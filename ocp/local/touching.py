@@ -147,9 +147,8 @@ class _Pairs:
         middles = np.einsum("mbij,bj->mbi", rotations[:, self._riding], self._middles) + positions[:, self._riding]
         apart = np.linalg.norm(middles[:, self._other] - middles[:, self._one], axis=2)
         for k in self._grounds:
-            beside = (self._one == k) | (self._other == k)
-            bodies = np.where(self._one[beside] == k, self._other[beside], self._one[beside])
-            apart[:, beside] = (middles[:, bodies] - middles[:, k, None]) @ self._normals[k]
+            beside = self._other == k  # obstacles come second
+            apart[:, beside] = (middles[:, self._one[beside]] - middles[:, k, None]) @ self._normals[k]
         return np.asarray(apart - self._reach[self._one] - self._reach[self._other])
 
 

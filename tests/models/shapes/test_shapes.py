@@ -94,6 +94,13 @@ def test_a_kept_hull_is_read_and_one_a_little_too_small_is_not(
     np.testing.assert_array_equal(kept_hull(points).offsets, known.offsets)
 
 
+def test_the_corners_of_a_box_are_listed_along_z_first_then_y_then_x() -> None:
+    turn = np.array([(0.0, -1, 0), (1, 0, 0), (0, 0, 1)])
+    core = Box((2, 4, 6), (10, 20, 30), turn).core
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)])
+    np.testing.assert_allclose(core, corners @ turn.T + (10, 20, 30), atol=1e-12)
+
+
 def test_what_has_no_end_is_out_of_reach() -> None:
     assert HalfSpace((0, 0, 1), (0, 0, 0)).reach((0, 0, 0)) == np.inf
     assert Box((np.inf, 1, 1)).reach((0, 0, 0)) == np.inf

@@ -9,7 +9,20 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import Box, FixedBase, FreeFloating, HalfSpace, Machine, Moving, Sphere, Surroundings
+from models import (
+    Box,
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    HalfSpace,
+    Joint,
+    Link,
+    Machine,
+    Moving,
+    Robot,
+    Sphere,
+    Surroundings,
+)
 from models.arrays import Array
 from models.shapes.distance import COLUMNS
 from models.spatial import skew
@@ -60,6 +73,21 @@ def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
     boxes = [all(isinstance(around.bodies[k].shape, Box) for k in pair[:2]) for pair in around.pairs]
     assert (found[:, boxes] < -0.05).sum() > 10
     assert_allclose(found[:, boxes], told[:, boxes], atol=1e-9)
+
+
+def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() -> None:
+    """Square to each other, each turned about its length, and far from their middles."""
+    ends = {"lower": -1.0, "upper": 1.0}
+    angles = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in (0.5, 0.4)]
+    across = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    beam = CollisionShape("box", (2.0, 0.2, 0.3), rotation=angles[0])
+    slide = Joint("slide", "prismatic", "base", "beam", axis=(1, 0, 0), **ends)
+    machine = FixedBase(Robot((Link("base"), Link("beam", collisions=(beam,))), (slide,)))
+    around = Surroundings(machine, [Box((2.0, 0.3, 0.25), (0.1, 0.6, 0.33), across @ angles[1])])
+    joints = np.linspace(-0.8, 0.8, len(TIMES))[:, None]
+    found = distances_along(around, np.zeros(0), joints, TIMES)
+    assert_allclose(found, known(around, np.zeros((len(TIMES), 0)), joints), atol=1e-9)
+    assert -0.05 < found.min() < -0.01
 
 
 @pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])

@@ -14,7 +14,7 @@ from models import CollisionShape, FixedBase, Moving, Sphere, Surroundings
 from models.arrays import Array
 from ocp.local.touching import distances_along
 from ocp.planning.charts import Instant
-from ocp.planning.steps import Length
+from ocp.planning.steps import Length, Squares
 from ocp.planning.tight import drawn_tight
 from tests.ocp.planning.test_charts import moved, planar, sets_of
 
@@ -67,13 +67,15 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     return drawn_tight(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
 
 
-def drawn(start: Array = START, weight: float = 1.0, far: Any = 1.0, lower: Any = -9.0, upper: Any = 9.0) -> Array:
+def drawn(
+    start: Array = START, cost: Any = None, far: Any = 1.0, lower: Any = -9.0, upper: Any = 9.0, times: Any = TIMES
+) -> Array:
     """The way from a start drawn tight, whatever is around."""
     robot = MACHINE.robot
     steps = np.full((len(TIMES) - 1, robot.dof), far)
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
-    cost = Length(np.full(robot.dof, weight))
-    return drawn_tight(followed(start), INSTANTS, cost, TIMES, steps, bounds, None, (0.1, 1e-3))
+    cost = cost or Length(np.ones(robot.dof))
+    return drawn_tight(followed(start), INSTANTS, cost, times, steps, bounds, None, (0.1, 1e-3))
 
 
 def length(path: Array) -> float:
@@ -101,7 +103,16 @@ def test_from_all_along_a_valley_it_leads_to_its_bottom() -> None:
 
 @pytest.mark.parametrize("weight", [1e-4, 1e4])
 def test_the_unit_of_the_cost_does_not_matter(weight: float) -> None:
-    assert_allclose(drawn(weight=weight), drawn(), atol=1e-12)
+    assert_allclose(drawn(cost=Length(np.full(3, weight))), drawn(), atol=1e-12)
+
+
+def test_when_a_motion_begins_does_not_matter_nor_how_long_it_takes() -> None:
+    """With the squares of the rates for cost, which is larger in less time, by the same factor everywhere."""
+    found = drawn(cost=Squares(np.ones(3)))
+    energies = [float((np.diff(path, axis=0) ** 2).sum()) for path in (found, drawn(), followed())]
+    assert energies[0] < min(energies[1:])
+    for times in (TIMES + 1e3, 2.0 * TIMES):
+        assert_allclose(drawn(cost=Squares(np.ones(3)), times=times), found, atol=1e-9)
 
 
 def test_limits_of_joints_and_of_their_steps_are_kept_and_met() -> None:
