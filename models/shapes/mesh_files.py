@@ -30,10 +30,10 @@ def find_mesh(
 ) -> Path | None:
     """The file that a URDF calls by a relative or absolute path, file:// or package://; None where there is none.
 
-    package://NAME/REST is DIR/NAME/REST, or DIR/REST where DIR is the package itself, for DIR of the folders, then of
-    the URDF file's folder and those above it, and last of where packages are installed: those of ROS as
-    ROS_PACKAGE_PATH and AMENT_PREFIX_PATH name them, and those that pip installed beside this one (share/). A relative
-    path starts in any of the folders.
+    package://NAME/REST is DIR/REST where DIR is called NAME, the package itself, else DIR/NAME/REST, for DIR of the
+    folders, which may be the package whatever they are called, then of the URDF file's folder and those above it, and
+    last of where packages are installed: those of ROS as ROS_PACKAGE_PATH and AMENT_PREFIX_PATH name them, and those
+    that pip installed beside this one (share/). A relative path starts in any of the folders.
 
     Args:
         file: As the URDF has it.
@@ -54,9 +54,11 @@ def find_mesh(
     address = urlparse(file)
     if address.scheme in ("package", "model"):
         rest = unquote(address.path).lstrip("/")
-        packages = [place / rest for place in places if place in given or place.name == address.netloc]
-        candidates = [place / address.netloc / rest for place in places] + packages
-        candidates += [place / address.netloc / rest for place in _installed()]
+        candidates = []
+        for place in [*places, *_installed()]:
+            candidates += [place / rest] if place.name == address.netloc else []
+            candidates += [place / address.netloc / rest]
+            candidates += [place / rest] if place in given else []
     elif address.scheme == "file":
         candidates = [Path(unquote(address.path))]
     else:

@@ -288,6 +288,27 @@ def test_names_are_found_where_ros_finds_them(tmp_path: Path, monkeypatch: pytes
     assert find_mesh("x" * 5000, tmp_path) is None
 
 
+def test_of_packages_in_packages_that_of_the_description_is_taken(tmp_path: Path) -> None:
+    """Folders told before all others, and of the same names within each other the nearest above the description."""
+    mesh = binary_stl(CORNERS, FACES)
+    names = ("arm", "arm/arm", "arm/arm/arm", "told", "hall/arm")
+    files = [written_in(tmp_path / name / "meshes", mesh) for name in names]
+    described = tmp_path / "arm" / "arm" / "urdf"
+    name = "package://arm/meshes/a.stl"
+    assert find_mesh(name, described) == files[1]
+    assert find_mesh(name, tmp_path / "arm" / "urdf") == files[0]
+    assert find_mesh(name, described, [tmp_path / "told"]) == files[3]
+    assert find_mesh(name, described, [tmp_path / "hall"]) == files[4]
+    assert find_mesh(name, described, [tmp_path / "arm"]) == files[0]
+    files[0].unlink()
+    assert find_mesh(name, described, [tmp_path / "arm"]) == files[1]
+
+
+def written_in(folder: Path, contents: bytes) -> Path:
+    folder.mkdir(parents=True)
+    return written(folder, "a.stl", contents)
+
+
 def test_packages_are_found_where_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As ROS names them, and as pip installs those of example-robot-data; folders that are told come first."""
     name, places = "package://some_arm/a.stl", ("site/cmeel.prefix/share", "ament/share", "ros", "told")
