@@ -57,19 +57,19 @@ sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is kno
 	$(BIN)/python -m tests.sweep --workers $(WORKERS) --out "$(OUT)" $(ARGS)
 
 crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes and look for collisions with coal (ARGS="--only ur5 --count 20")
-	$(BIN)/python -W ignore -m tests.sweep.crowded --out "$(OUT)/crowded.jsonl" $(ARGS)
+	$(BIN)/python -W ignore -m tests.sweep.crowded --out "$(OUT)/sweeps/crowded.jsonl" $(ARGS)
 
-brute: $(VENV)/test.stamp ## 1000 coarse tasks searched, beside all sequences of postures of a fine grid (ARGS="--only two")
-	$(BIN)/python -W ignore -m tests.sweep.brute_force --out "$(OUT)/brute_force.jsonl" $(ARGS)
+brute: $(VENV)/test.stamp ## 1000 coarse tasks searched, beside all sequences of postures of a fine grid (ARGS="--again": those that older code did)
+	$(BIN)/python -W ignore -m tests.sweep.brute_force --out "$(OUT)/sweeps/brute_force.jsonl" $(ARGS)
 
 global: $(VENV)/test.stamp ## plan seeded tasks by search over all motions, beside 200 random starts each (ARGS="--only panda")
-	$(BIN)/python -W ignore -m tests.sweep.global_plans --out "$(OUT)/global_plans.jsonl" $(ARGS)
+	$(BIN)/python -W ignore -m tests.sweep.global_plans --out "$(OUT)/sweeps/global_plans.jsonl" $(ARGS)
 
 redundancy: $(VENV)/test.stamp ## plan the problems of a public benchmark of redundant arms, and check them (ARGS="--only panda__1cube")
-	$(BIN)/python -W ignore -m tests.sweep.redundancy $(ARGS)
+	$(BIN)/python -W ignore -m tests.sweep.redundancy --out "$(OUT)/sweeps/redundancy.jsonl" $(ARGS)
 
-passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--beyond 4": that cannot)
-	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/passages.jsonl" $(ARGS)
+passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--only beyond": that cannot)
+	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/sweeps/passages.jsonl" $(ARGS)
 
 faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batches of 500 plans, and fill a disk
 	$(BIN)/python -W ignore -m tests.sweep.faults

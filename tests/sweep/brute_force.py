@@ -1,6 +1,6 @@
 """Random coarse tasks of planar arms: the search beside the least over all sequences of postures of a fine grid.
 
-python -m tests.sweep.brute_force --out FILE [--count 1000] [--only two] [--minutes 60]
+python -m tests.sweep.brute_force --out FILE [--count 1000] [--only two] [--minutes 60] [--again]
 
 The bound must be above none of them, what is found as cheap, and nothing may be called impossible that the grid can do.
 Results are added line by line to a file; a case that is there already is not done again.
@@ -23,10 +23,11 @@ from ocp.planning.steps import Length, Squares, StepCost
 from ocp.tasks.equations import bind
 from tests.ocp.planning.test_charts import planar
 from tests.ocp.planning.test_values import INSTANTS, SECONDS, reached
-from tests.sweep.results import parser, results
+from tests.sweep.results import Sweep, parser
 
-KINDS = ("plain", "cut", "slow", "turning", "two")
-"""Limits that hardly matter; that cut the set of postures; slow joints; joints that turn without end; four joints."""
+KINDS = dict.fromkeys(("plain", "cut", "slow", "turning", "two"), 200)
+"""Cases of each kind: limits that hardly matter; that cut the set of postures; slow joints; joints that turn without
+end; four joints."""
 GRID, COARSE = 700, 36
 """Angles of the first joint of three; of each of the first two of four."""
 GAPS = {False: 0.03, True: 0.1}
@@ -38,7 +39,7 @@ AS_CHEAP = {False: 1.01, True: 1.02}
 
 def judged(kind: str, seed: int) -> dict[str, Any]:
     """One case: what was found, its bound, the least on the grid, and what is wrong."""
-    rng = np.random.default_rng([KINDS.index(kind), seed])
+    rng = np.random.default_rng([list(KINDS).index(kind), seed])
     two, cost = kind == "two", (Squares, Length)[seed % 2 if kind != "two" else 0]
     size = 4 if two else 3
     limit = {"cut": rng.uniform(1.0, 2.2), "turning": 7.0, "two": 1.6}.get(kind, 2.8)
@@ -82,7 +83,7 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
         wrong.append("dearer")
     if np.isfinite(steps) and bound < (1 - GAPS[two]) * steps:
         wrong.append("gap")
-    found = {"kind": kind, "seed": seed, "cost": cost.__name__, "steps": steps, "bound": bound, "least": least}
+    found = {"cost": cost.__name__, "steps": steps, "bound": bound, "least": least}
     return found | {"wrong": wrong, "seconds": time.process_time() - begun}
 
 
@@ -118,14 +119,12 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
 
 
 def main() -> None:
-    shown = []
-    for row in results(parser(__doc__, list(KINDS), 1000).parse_args(), list(KINDS), lambda *case: judged(*case[:2])):
+    sweep, shown = Sweep(__file__, parser(__doc__, KINDS).parse_args(), KINDS), []
+    for row in sweep.rows(lambda kind, seed, _: judged(kind, seed)):
         shown.append(row)
         if row["wrong"]:
             print(row, flush=True)
-    possible = sum(np.isfinite(row["steps"]) for row in shown)
-    wrong = sum(bool(row["wrong"]) for row in shown)
-    print(f"{len(shown)} cases, {possible} of which have a motion; {wrong} are wrong")
+    print(f"{sweep.told(shown)}; {sum(np.isfinite(row['steps']) for row in shown)} have a motion")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Random tasks among random boxes: what is planned is clear by an engine of others, and what can be planned is.
 
-python -m tests.sweep.crowded --out FILE [--count 300] [--only panda] [--postures 30] [--minutes 60]
+python -m tests.sweep.crowded --out FILE [--only panda] [--postures 30] [--minutes 60] [--again]
 
 Results are added line by line to a file; a task that is there already is not done again.
 """
@@ -23,11 +23,13 @@ from ocp.local.touching import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.planning.motions import pair
 from tests.ocp.tasks.space_tasks import panda, ur5
-from tests.sweep.results import Row, parser, results
+from tests.sweep.results import Row, Sweep, parser
 
 SECONDS = 3.0
 CLEARANCE = 0.01
 ROBOTS = {"panda": panda, "ur5": ur5, "two arms": pair}
+COUNTS = dict.fromkeys(sorted(ROBOTS), 100)
+"""Tasks of each."""
 COARSE, FINE = 1000, 60_000
 """Samples of a plan, of all pairs and of those that come near."""
 NEAR = 0.02
@@ -155,26 +157,27 @@ def result(robot: str, seed: int, postures: int) -> Row:
     found = planned(task)
     row: Row = {"seconds": time.process_time() - begun}
     if isinstance(found, Plan):
-        return row | {"cost": found.cost, "passed": found.audit().passed, "least": least_by_coal(found, task.boxes)}
+        passed, least = found.audit().passed, least_by_coal(found, task.boxes)
+        wrong = ["touches"] * (passed and least < CLEARANCE - 1e-6) + ["audit"] * (not passed)
+        return row | {"cost": found.cost, "passed": passed, "least": least, "wrong": wrong}
     other = by_postures(task, postures) if postures else None
-    return row | {"said": found, "other": None if other is None else other.cost}
+    return row | {
+        "said": found,
+        "other": None if other is None else other.cost,
+        "wrong": ["lost"] * (other is not None),
+    }
 
 
 def main() -> int:
-    given = parser(__doc__, sorted(ROBOTS), 300)
+    given = parser(__doc__, COUNTS)
     given.add_argument("--postures", type=int, default=30, help="of the search that the share solved is compared with")
     options = given.parse_args()
-    shown = []
-    for row in results(options, sorted(ROBOTS), lambda robot, seed, _: result(robot, seed, options.postures)):
+    sweep, shown = Sweep(__file__, options, COUNTS), []
+    for row in sweep.rows(lambda robot, seed, _: result(robot, seed, options.postures)):
         shown.append(row)
         print(row, flush=True)
-    solved = [row for row in shown if "cost" in row]
-    lost = sum(row.get("other") is not None for row in shown)
-    hits = sum(row["passed"] and row["least"] < CLEARANCE - 1e-6 for row in solved)
-    print(
-        f"{len(shown)} tasks, {len(solved)} solved, {lost} that a search of postures solves, {hits} that touch by coal"
-    )
-    return int(hits > 0)
+    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} solved")
+    return int(any("touches" in row["wrong"] for row in shown))
 
 
 if __name__ == "__main__":

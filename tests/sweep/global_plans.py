@@ -1,10 +1,10 @@
 """Seeded tasks planned by search over all motions, beside the best of many random starts.
 
-python -m tests.sweep.global_plans --out FILE [--only panda] [--count 40] [--starts 200] [--minutes 60] [--again]
+python -m tests.sweep.global_plans --out FILE [--only panda] [--starts 200] [--minutes 60] [--again]
 
 The global plan must never be dearer than the best of the starts, must cost at most a tenth of their processor time, and
 its bound must be within 2 % with one free direction, 10 % with two. Results are added line by line to a file; a task
-that is there already is not done again, or, with --again, only its global plan.
+that is there already is not done again, or, with --again, only its global plan, beside the starts of the older code.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from ocp import ProblemError, SolveError, TipTask, inverse_kinematics, plan
 from ocp.local.inverse_kinematics import Unreachable
 from tests.ocp.planning.test_charts import planar
 from tests.ocp.tasks.space_tasks import panda, ur5
-from tests.sweep.results import Row, parser, results
+from tests.sweep.results import Row, Sweep, parser
 
 SECONDS = 4.0
 KINDS = {"panda": (panda, 1), "ur5": (ur5, 1), "planar": (lambda: planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0), 2)}
 """Machines, and the directions that their tasks leave free: the whole pose, the roll free, and the place in a plane."""
+COUNTS = {"panda": 14, "ur5": 13, "planar": 13}
+"""Tasks of each."""
 GAPS = {1: 0.02, 2: 0.1}
 SHARE = 0.1
 LOOKED = 5
@@ -91,14 +93,14 @@ def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
     return {"best": best, "failed": failed, "starts": starts, "starts_seconds": time.process_time() - begun}
 
 
-def faults(row: dict[str, Any]) -> list[str]:
+def faults(kind: str, row: dict[str, Any]) -> list[str]:
     """What a task's result breaks of what is promised."""
     found = list[str]()
     if row["cost"] > row["best"] * (1 + 1e-6):
         found.append("dearer")
     if row["bound"] > min(row["best"], row["cost"]) * (1 + 1e-6):
         found.append("bound above")
-    if np.isfinite(row["cost"]) and row["bound"] < (1 - GAPS[KINDS[row["kind"]][1]]) * row["cost"]:
+    if np.isfinite(row["cost"]) and row["bound"] < (1 - GAPS[KINDS[kind][1]]) * row["cost"]:
         found.append("gap")
     if row["seconds"] > SHARE * row["starts_seconds"]:
         found.append("slow")
@@ -108,26 +110,25 @@ def faults(row: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    given = parser(__doc__, list(KINDS), 40)
+    given = parser(__doc__, COUNTS)
     given.add_argument("--starts", type=int, default=200)
-    given.add_argument("--again", action="store_true", help="the global plans of the tasks in the file once more")
     options = given.parse_args()
+    sweep, shown = Sweep(__file__, options, COUNTS), []
 
     def result(kind: str, seed: int, known: Row | None) -> Row:
-        names = ("best", "failed", "starts", "starts_seconds")
+        names = ("best", "failed", "starts", "starts_seconds", "starts_code")
         starts = {name: known[name] for name in names} if known else by_starts(kind, seed, options.starts)
-        return by_search(kind, seed) | starts
+        row = {"starts_code": sweep.code} | starts | by_search(kind, seed)
+        return row | {"wrong": faults(kind, row)}
 
-    wrong = done = 0
-    for row in results(options, list(KINDS), result):
-        done += 1
-        wrong += bool(faults(row))
+    for row in sweep.rows(result):
+        shown.append(row)
         print(
             f"{row['kind']:7s} {row['seed']:3d}  cost {row['cost']:.6f}  best of starts {row['best']:.6f}  bound "
-            f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {faults(row)}",
+            f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {row['wrong']}",
             flush=True,
         )
-    print(f"{done} tasks, {wrong} of which break what is promised")
+    print(sweep.told(shown))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Paths of floating arms that are feasible and lead the pseudo-inverse by a singularity: how many are planned.
 
 A motion is made first, its tip's path is the task: so it can be done. The pseudo-inverse loses a factor of 30 in
-manipulability on it, or breaks down. With `--beyond` paths lead out of reach, and are to be refused, soon.
+manipulability on it, or breaks down. Others lead out of reach, and are to be refused, soon.
 
-python -m tests.sweep.passages --out FILE [--count 40] [--search postures] [--beyond 4] [--minutes 60]
+python -m tests.sweep.passages --out FILE [--only beyond] [--minutes 60] [--again]
 
 Results are added line by line to a file; a path that is there already is not done again.
 """
@@ -24,10 +24,13 @@ from models.arrays import Array
 from models.spatial import quaternion_from_rotation
 from ocp import Plan, ProblemError, SolveError, TipTask, plan, resolve
 from tests.models.robot.trees import seven_joint_arm
-from tests.sweep.results import Row, parser, results
+from tests.sweep.results import Row, Sweep, parser
 
-KINDS = ["pose", "place"]
-"""What is asked of the tip: its whole pose leaves one direction free, its place four."""
+COUNTS = {"pose": 20, "place": 20, "beyond": 10}
+"""Paths that ask for the whole pose of the tip, which leaves one direction free, or its place, which leaves four; and
+of both by turns that lead out of reach."""
+BEYOND, SOON = 4.0, 10.0
+"""m out of reach, and s of processor time until that is said."""
 SECONDS = 5.0
 LOSS = 30.0
 """Factor of manipulability that the pseudo-inverse loses."""
@@ -126,26 +129,26 @@ def planned(given: Passage, **options: Any) -> Plan | str:
         return f"{type(error).__name__} {error}"[:300]
 
 
+def result(kind: str, seed: int) -> Row:
+    """A path planned, and what is wrong: not planned though it can be done, or the other way round, or late."""
+    beyond = kind == "beyond"
+    task = passage(seed if beyond else 2 * seed + (kind == "place"), BEYOND * beyond)
+    begun = time.process_time()
+    found = planned(task)
+    row: Row = {"seconds": time.process_time() - begun, "made_with": task.cost}
+    if isinstance(found, str):
+        late = row["seconds"] > SOON
+        return row | {"said": found, "wrong": ["late"] * late if beyond else ["not planned"]}
+    passed = found.audit().passed
+    return row | {"cost": found.cost, "passed": passed, "wrong": ["planned"] * beyond + ["audit"] * (not passed)}
+
+
 def main() -> None:
-    given = parser(__doc__, KINDS, 40)
-    given.add_argument("--search", default="postures")
-    given.add_argument("--beyond", type=float, default=0.0)
-    options = given.parse_args()
-
-    def result(kind: str, seed: int, _: Row | None) -> Row:
-        task = passage(2 * seed + KINDS.index(kind), options.beyond)
-        begun = time.process_time()
-        found = planned(task, search=options.search)
-        row: Row = {"seconds": time.process_time() - begun, "made_with": task.cost}
-        return row | (
-            {"said": found} if isinstance(found, str) else {"cost": found.cost, "passed": found.audit().passed}
-        )
-
-    shown = []
-    for row in results(options, KINDS, result):
+    sweep, shown = Sweep(__file__, parser(__doc__, COUNTS).parse_args(), COUNTS), []
+    for row in sweep.rows(lambda kind, seed, _: result(kind, seed)):
         shown.append(row)
         print(row, flush=True)
-    print(f"{sum('cost' in row for row in shown)} of {len(shown)} planned")
+    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} planned")
 
 
 if __name__ == "__main__":

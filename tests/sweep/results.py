@@ -1,52 +1,149 @@
-"""The results of a sweep, a line of JSON each in a file: a case that is there is not done again."""
+"""The results of a sweep, a line of JSON each in a file: a case that is there is not done again.
+
+Each says of which version and code it is. What is of other code than this is counted apart, for it is no evidence of
+this one, and done again where that is asked for. The table beside the files says what was found, by the code of it.
+"""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from statistics import median
 from typing import Any
+
+import ocp
 
 Case = tuple[str, int]
 """Kind and seed."""
 Row = dict[str, Any]
+TABLE = "sweeps.csv"
+ROOT = Path(ocp.__file__).parents[1]
+ABOVE = ("ocp/app/", "ocp/batch/", "ocp/files/")
+"""Rooms that no plan is made by."""
+MINUTE = 60.0
+"""s."""
 
 
-def parser(description: str | None, kinds: list[str], count: int) -> argparse.ArgumentParser:
+class Sweep:
+    """Cases of some kinds, and a file of what became of them.
+
+    Attributes:
+        code: Of what does them, as of `code_of`.
+    """
+
+    def __init__(self, file: str, given: argparse.Namespace, counts: Mapping[str, int]) -> None:
+        """
+        Args:
+            file: Of the module that does them.
+            given: Of `parser`.
+            counts: Cases of each kind.
+        """
+        self.given, self.counts, self.code = given, counts, code_of(Path(file))
+
+    def rows(self, result: Callable[[str, int, Row | None], Row]) -> Iterator[Row]:
+        """Every case, from the file or done now and added to it; the kinds in turn.
+
+        Args:
+            result: Of a case, given what the file has of it, None where it has nothing. What is promised and broken is
+                its ``wrong``, a list of words.
+        """
+        given, known, end = self.given, rows_of(self.given.out), time.time() + MINUTE * self.given.minutes
+        for kind, seed in self.cases():
+            row = known.get((kind, seed))
+            old = row is None or (given.again and row["code"] != self.code)
+            if old and time.time() < end:
+                made = {"kind": kind, "seed": seed, "version": ocp.__version__, "code": self.code}
+                known[kind, seed] = row = made | result(kind, seed, row)
+                _write(given.out, known)
+                write_table(given.out.parent)
+            if row is not None:
+                yield row
+
+    def cases(self) -> list[Case]:
+        """Kinds and seeds, in the order in which they are done."""
+        counts = {kind: count for kind, count in self.counts.items() if kind in (self.given.only or self.counts)}
+        found = [
+            (kind, seed)
+            for seed in range(max(counts.values()))
+            for kind, count in counts.items()
+            if seed < count and (self.given.seed is None or seed == self.given.seed)
+        ]
+        return found[: self.given.count]
+
+    def told(self, rows: list[Row]) -> str:
+        """How many of some rows are of this code, how many of older, and how many of each are wrong."""
+        words = []
+        for what, own in (("this code", True), ("older code", False)):
+            of = [row for row in rows if (row["code"] == self.code) is own]
+            words.append(f"{len(of)} of {what}, {sum(bool(row['wrong']) for row in of)} of them wrong")
+        return f"{len(rows)} of {len(self.cases())} cases: {'; '.join(words)}"
+
+
+def code_of(sweep: Path, root: Path = ROOT) -> str:
+    """Twelve hexadecimal digits that change with the sources of a sweep, of `models`, and of `ocp` but for ABOVE."""
+    digest = hashlib.sha256(sweep.read_bytes())
+    for package in ("models", "ocp"):
+        for file in sorted((root / package).rglob("*.py")):
+            place = file.relative_to(root).as_posix()
+            if not place.startswith(ABOVE):
+                digest.update(place.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def parser(description: str | None, kinds: Mapping[str, int]) -> argparse.ArgumentParser:
     """The options that all sweeps share."""
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
-    made.add_argument("--only", choices=kinds, action="append")
-    made.add_argument("--count", type=int, default=count, help="cases, of the kinds in turn")
+    made.add_argument("--only", choices=list(kinds), action="append")
+    made.add_argument("--seed", type=int, help="this one of each kind")
+    made.add_argument("--count", type=int, help="so many cases, of the kinds in turn")
     made.add_argument("--minutes", type=float, default=60.0, help="after which no further case is begun")
+    made.add_argument("--again", action="store_true", help="those whose results are of older code once more")
     return made
 
 
-def results(
-    given: argparse.Namespace, kinds: list[str], result: Callable[[str, int, Row | None], Row]
-) -> Iterator[Row]:
-    """Every case of a sweep, from the file or done now and added to it.
+def rows_of(file: Path) -> dict[Case, Row]:
+    """What a file has of each case."""
+    rows = map(json.loads, file.read_text().splitlines() if file.exists() else ())
+    return {(row["kind"], row["seed"]): row for row in rows}
 
-    Args:
-        given: Of `parser`.
-        kinds: All there are.
-        result: Of a case, given what the file has of it, None where it has nothing. A case of the file is done again
-            where `given.again` says so.
-    """
-    rows, end, again = dict[Case, Row](), time.time() + 60 * given.minutes, getattr(given, "again", False)
-    kinds = given.only or kinds
-    if given.out.exists():
-        rows = {(row["kind"], row["seed"]): row for row in map(json.loads, given.out.read_text().splitlines())}
-    for number in range(given.count):
-        kind, seed = kinds[number % len(kinds)], number // len(kinds)
-        known = rows.get((kind, seed))
-        if known is None or again:
-            if time.time() > end:
-                return
-            known = {"kind": kind, "seed": seed, **result(kind, seed, known)}
-            given.out.parent.mkdir(parents=True, exist_ok=True)
-            with given.out.open("a") as file:
-                file.write(json.dumps(known) + "\n")
-        yield known
+
+def _write(file: Path, rows: Mapping[Case, Row]) -> None:
+    """All lines at once: who is stopped meanwhile leaves the file as it was."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(".part")
+    part.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
+    part.replace(file)
+
+
+def write_table(folder: Path) -> None:
+    """What the files of a folder say, by sweep, kind and code: cases, how many break what is promised, and seconds."""
+    table = list[Row]()
+    for file in sorted(folder.glob("*.jsonl")):
+        rows = list(rows_of(file).values())
+        for kind, version, code in dict.fromkeys((row["kind"], row["version"], row["code"]) for row in rows):
+            own = [row for row in rows if (row["kind"], row["version"], row["code"]) == (kind, version, code)]
+            seconds, words = [row["seconds"] for row in own], [word for row in own for word in row["wrong"]]
+            table.append(
+                {
+                    "sweep": file.stem,
+                    "kind": kind,
+                    "version": version,
+                    "code": code,
+                    "cases": len(own),
+                    "wrong": sum(bool(row["wrong"]) for row in own),
+                    "cpu_s_median": f"{median(seconds):.3g}",
+                    "cpu_s_most": f"{max(seconds):.3g}",
+                    "what": "; ".join(f"{word} {words.count(word)}" for word in dict.fromkeys(words)),
+                }
+            )
+    if table:
+        with (folder / TABLE).open("w", newline="") as written:
+            writer = csv.DictWriter(written, list(table[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(table)
