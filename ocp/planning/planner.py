@@ -56,6 +56,8 @@ TRIED = 8
 
 AT_ONCE = 4
 """Ways through cells that are solved before the best of them is audited, where one that passes is enough."""
+IN_BRIEF, THOROUGHLY = 8, 4
+"""Of the ways of each search so many are tried, the cheapest first: there are hundreds, and each takes seconds."""
 
 
 @interruptible
@@ -229,15 +231,16 @@ def _through_cells(maker: Maker, followed: list[Followed], postures: Array, ever
                 local = coarse_motions(maker, ways, ways[0].joints[:, 0], True, local)
         return fine_motions(maker, local, first=False, every=True)
     told = list[Candidate]()
-    for brief in (True, False):
-        maker.brief = brief
-        for ways in found:
-            for begin in range(0, len(ways[0].cost), AT_ONCE):
-                some = [part.of(slice(begin, begin + AT_ONCE)) for part in ways]
-                told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
+    for most in (IN_BRIEF, THOROUGHLY):
+        maker.brief = most == IN_BRIEF
+        for begin in range(0, most, AT_ONCE):
+            for some in ([part.of(slice(begin, begin + AT_ONCE)) for part in ways] for ways in found):
+                if some[0].cost.size:
+                    told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
                 if any(not one.why for one in told):
                     return told
-    return told
+    why = f"not tried, for the {IN_BRIEF} cheapest of its search fail"
+    return told + [Candidate(one, np.nan, why) for ways in found for one in ways[0].joints[IN_BRIEF:, 0]]
 
 
 def _bounded(made: Plan, bound: float) -> Plan:

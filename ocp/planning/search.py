@@ -48,8 +48,6 @@ MOTIONS = 12
 """Classes of motions that are followed up, the cheapest first."""
 FAR = 3.0
 """Share of the least cost beyond which they are not."""
-WITHIN = (1.5, 1.5, 1.0)
-"""Share of the least cost within which bounds say that these may be, by the directions that are free."""
 SAME = 0.1
 """rad or m: motions nearer to each other than this everywhere are one."""
 WHOLE = 1e-9
@@ -249,7 +247,7 @@ class Search:
         rest: list[Values] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
-            far = (WITHIN[free] if coarse else share) * least  # beyond that nothing is looked for
+            far = (1.0 if coarse else share) * least  # beyond that nothing is looked for
             to_come = graph.to_come(rest, far)
             if coarse:
                 self._known = graph, to_come, None
@@ -281,13 +279,16 @@ class Search:
         """
         layers, coarse = self.layers, True
         while True:
-            alive = self.graph(layers, np.full(len(self.times) - 1, most)).alive()
+            graph = self.graph(layers, np.full(len(self.times) - 1, most))
+            path = self._tight(self._through_centers(graph), layers)
+            if path is not None:
+                return layers, path
+            alive = graph.alive()
             if not all(own.any() for own in alive):
                 return [], None
             layers = [charts.of(own) for charts, own in zip(layers, alive, strict=True)]
-            graph = self.graph(layers, np.full(len(self.times) - 1, most))
-            path = self._tight(self._through_centers(graph), layers)
-            if path is None and coarse:
+            if coarse:
+                graph = self.graph(layers, graph.most)
                 path = self._led(graph, graph.to_come())
             if path is not None or not self._may_be_halved(layers, FIRST):
                 return layers, path

@@ -25,7 +25,7 @@ __all__ = ["TaskSearch"]
 
 STARTS = 16
 """Random starts of inverse kinematics at each instant."""
-INSTANTS = 8
+INSTANTS = 4
 """Steps over the motion, at least."""
 TIGHT, AT_LIMIT = 0.9, 1e-3
 """Share of its greatest speed, and rad or m from the limit of its position, where a joint has hardly any room."""

@@ -33,10 +33,8 @@ FARTHEST = 1e6
 """rad or m: no step goes farther."""
 PAIRS = 200_000
 """Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
-ROUNDS, LOWER = 4, 3
-"""Times that the least of a step in a box is looked at nearer, and places on the way to it at first."""
-RISE = 0.02
-"""Share of what is left to be gained by which that has to raise it, or it is the last time."""
+NEARER, LOWER = 2, 3
+"""Times that the least of a step in a box is looked at nearer, and places on the way to it each time."""
 
 
 class Graph:
@@ -279,43 +277,23 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Value
         which = np.flatnonzero(np.isin(group, chosen))
         first, own_group = np.searchsorted(group[which], chosen), np.searchsorted(chosen, group[which])
         lean = slope[own_group]
-        known = values[:, which] - np.stack([(place[which] * lean).sum(axis=1) for place in places])
-        at = known.argmin(axis=0)
-        rows = np.arange(len(which))
-        place, most = (
-            np.stack([place[which] for place in places])[at, rows],
-            np.minimum.reduceat(known.min(axis=0), first),
-        )
-        best = Tangents(
-            *(np.stack(parts)[at, rows] for parts in zip(*(one.of(which) for one in tangents), strict=True))
-        )
+        seen = values[:, which] - np.stack([(place[which] * lean).sum(axis=1) for place in places])
+        most = np.minimum.reduceat(seen.min(axis=0), first)[own_group]
+        at, cells = seen.argmin(axis=0), np.arange(len(which))
+        best = Tangents(*(np.stack(p)[at, cells] for p in zip(*(one.of(which) for one in tangents), strict=True)))
         best = best.leaning(lean)
-        bend, box = (curves - common)[which], own.of(which)
-        found, before = best.least(box, bend), np.full(len(which), -np.inf)
-        for number in range(ROUNDS + 1):
-            # until it is out of the question, or hardly rises any more
-            room = most[own_group[rows]]
-            kept = np.flatnonzero(found[rows] - before[rows] > RISE * (room - found[rows]).clip(0.0))
-            kept = kept[found[rows[kept]] < room[kept]]
-            if not kept.size:
-                break
-            rows, place, best, bend, box = rows[kept], place[kept], best.of(kept), bend[kept], box.of(kept)
+        found, rows = best.least(own.of(which), (curves - common)[which]), cells
+        # what may be the least of its chart is looked at nearer, where it is the lowest for all that is known
+        for _ in range(NEARER):
+            kept = np.flatnonzero(found[rows] < most[rows])
+            rows, best, lean = rows[kept], best.of(kept), lean[kept]
             near = which[rows]
-            before[rows] = found[rows] if number else -np.inf
-            if not number:
-                for one in tangents:
-                    best, found[rows] = best.mixed(found[rows], one.of(near).leaning(lean[rows]), box, bend)
-                continue
-            part = steps.of(near)
+            part, box, bend = steps.of(near), own.of(near), (curves - common)[near]
+            place = best.lowest(box, bend)
             for _ in range(LOWER):
-                place = part.lower(place, lean[rows], common[near])
-            for looked_at in (place, None):
-                there = best.lowest(box, bend) if looked_at is None else looked_at
-                touched = part.at(there)
-                one = _tangents(there, touched, curves[near], common[near]).leaning(lean[rows])
-                best, found[rows] = best.mixed(found[rows], one, box, bend)
-                seen = touched[0] - _pressed(common[near], there) - (there * lean[rows]).sum(axis=1)
-                np.minimum.at(most, own_group[rows], seen)
+                place = part.lower(place, lean, common[near])
+            one = _tangents(place, part.at(place), curves[near], common[near]).leaning(lean)
+            best, found[rows] = best.mixed(found[rows], one, box, bend)
         return np.asarray(np.minimum.reduceat(found, first))
 
     every = np.arange(len(starts))
