@@ -234,8 +234,7 @@ class Search:
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
-        free = max(0, *(instant.sets.size for instant in self.instants))
-        share = 1 - GAPS[free]
+        share = 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
         layers, best = self.first(most)
         if not layers:
             return None, np.inf
@@ -247,7 +246,7 @@ class Search:
         rest: list[Values] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
-            far = (1.0 if coarse else share) * least  # beyond that nothing is looked for
+            far = least if coarse else share * least  # beyond that nothing is looked for: classes at first, then bounds
             to_come = graph.to_come(rest, far)
             if coarse:
                 self._known = graph, to_come, None

@@ -33,6 +33,8 @@ FARTHEST = 1e6
 """rad or m: no step goes farther."""
 PAIRS = 200_000
 """Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
+SAMPLE = 64
+"""Charts by which it is estimated how many there are."""
 NEARER, LOWER = 2, 3
 """Times that the least of a step in a box is looked at nearer, and places on the way to it each time."""
 
@@ -93,9 +95,9 @@ class Graph:
         way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
         way = min(way, FARTHEST)
         tree = self.space.tree(there.centers)
-        whole = self.space.tree(here.centers)
-        number = whole.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST))
-        share = max(16, len(here) * PAIRS // max(int(number), 1))
+        some = self.space.tree(here.centers[:: max(len(here) // SAMPLE, 1)])
+        number = some.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST)) / some.n
+        share = max(16, int(PAIRS / max(number, 1.0)))
         for first in range(0, len(here), share):
             part = np.arange(first, min(first + share, len(here)))
             own = self.space.tree(here.centers[part])
@@ -265,46 +267,24 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Value
     tangents = [_tangents(place, one, curves, common) for place, one in zip(places, touching, strict=True)]
     values = np.stack([value - _pressed(common, place) for (value, _), place in zip(touching, places, strict=True)])
     lowest = heights - _pressed_all(curve, places, starts)
-    slope, boxes = _rise([*lowest], half[starts]), own.of(starts)
-
-    def least_of(least: Array, slope: Array, chosen: Any) -> Array:
-        box = boxes.of(chosen)
-        ends = np.minimum(slope * box.low, slope * box.high).sum(axis=1)
-        return np.asarray(2 * least + (slope * middle[starts[chosen]]).sum(axis=1) + ends)
-
-    def under(slope: Array, chosen: Indices) -> Array:
-        """How far above the linear functions the steps of some charts lie. Shape (M,)."""
-        which = np.flatnonzero(np.isin(group, chosen))
-        first, own_group = np.searchsorted(group[which], chosen), np.searchsorted(chosen, group[which])
-        lean = slope[own_group]
-        seen = values[:, which] - np.stack([(place[which] * lean).sum(axis=1) for place in places])
-        most = np.minimum.reduceat(seen.min(axis=0), first)[own_group]
-        at, cells = seen.argmin(axis=0), np.arange(len(which))
-        best = Tangents(*(np.stack(p)[at, cells] for p in zip(*(one.of(which) for one in tangents), strict=True)))
-        best = best.leaning(lean)
-        found, rows = best.least(own.of(which), (curves - common)[which]), cells
-        # what may be the least of its chart is looked at nearer, where it is the lowest for all that is known
-        for _ in range(NEARER):
-            kept = np.flatnonzero(found[rows] < most[rows])
-            rows, best, lean = rows[kept], best.of(kept), lean[kept]
-            near = which[rows]
-            part, box, bend = steps.of(near), own.of(near), (curves - common)[near]
-            place = best.lowest(box, bend)
-            for _ in range(LOWER):
-                place = part.lower(place, lean, common[near])
-            one = _tangents(place, part.at(place), curves[near], common[near]).leaning(lean)
-            best, found[rows] = best.mixed(found[rows], one, box, bend)
-        return np.asarray(np.minimum.reduceat(found, first))
-
-    every = np.arange(len(starts))
-    least = under(slope, every)
-    # a level one instead where it is higher, in the middle and at its least together
-    flat = np.flatnonzero(least_of(least, slope, every) < 2 * np.min(lowest, axis=0))
-    if flat.size and r:
-        none = np.zeros((len(flat), r))
-        level = under(none, flat)
-        higher = least_of(level, none, flat) > least_of(least[flat], slope[flat], flat)
-        least[flat[higher]], slope[flat[higher]] = level[higher], 0.0
+    slope = _rise([*lowest], half[starts])
+    # how far above the linear functions the steps lie: by tangents at places where they are low
+    lean, rows = slope[group], np.arange(len(own))
+    seen = values - np.stack([(place * lean).sum(axis=1) for place in places])
+    room, at = np.minimum.reduceat(seen.min(axis=0), starts)[group], seen.argmin(axis=0)
+    best = Tangents(*(np.stack(parts)[at, rows] for parts in zip(*tangents, strict=True))).leaning(lean)
+    bends = curves - common
+    least = best.least(own, bends)
+    for _ in range(NEARER):  # those that may be the least of their chart
+        kept = np.flatnonzero(least[rows] < room[rows])
+        rows, best = rows[kept], best.of(kept)
+        part, box, bend, leaning = steps.of(rows), own.of(rows), bends[rows], lean[rows]
+        place = best.lowest(box, bend)
+        for _ in range(LOWER):
+            place = part.lower(place, leaning, common[rows])
+        other = _tangents(place, part.at(place), curves[rows], common[rows]).leaning(leaning)
+        best, least[rows] = best.mixed(least[rows], other, box, bend)
+    least = np.minimum.reduceat(least, starts)
     return Values(least, slope, curve)
 
 
