@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from models import FreeFloating, center_of_mass
+from models.arrays import Array
 from models.papers import paper_example
-from ocp import Plan, TipTask, Unreachable, plan
+from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
+from ocp.local.following import Followed
+from ocp.planning import planner
+from ocp.planning.candidates import Maker
 from ocp.planning.cells import CellSearch
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.planner import checked_asked
@@ -140,3 +144,30 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
     local = plan(machine, lines, start=START, search="start", clearance=None)
     assert found.cost <= local.cost * (1 + 1e-6)
     assert len(found.parts) == 3
+
+
+def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine, task, brief = paper_example(), example(4.0), list[bool]()
+    asked = checked_asked(machine, task, None, START, None, False, None, None, "postures", 0, 1.0)
+    sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).followed()]
+
+    def coarse(maker: Maker, followed: list[Followed], postures: Array, fine: bool) -> list[Candidate]:
+        return [Candidate(at, float(cost)) for at, cost in zip(postures, followed[0].cost, strict=True)]
+
+    def fails(maker: Maker, start: Array, *_: Any, **options: Any) -> Candidate:
+        brief.append(maker.brief)
+        return Candidate(start, np.nan, "fails")
+
+    monkeypatch.setattr(planner, "coarse_motions", coarse)
+    monkeypatch.setattr(Maker, "solved", fails)
+    with pytest.raises(SolveError, match="fails") as caught:
+        plan(machine, task, start=START, clearance=None)
+    assert sum(brief) == sum(min(size, 8) for size in sizes)
+    assert brief[-1] is False
+    rest = sum(max(size - 8, 0) for size in sizes)
+    assert f"{rest} of {len(brief) + rest} postures: not tried, for the 8 cheapest of its search fail" in str(
+        caught.value
+    )
+    assert len(brief) - sum(brief) - sum(min(size, 4) for size in sizes) in (0, 1)  # and the local motion at first
