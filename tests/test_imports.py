@@ -32,7 +32,7 @@ FLOORS = {
     ],
     "ocp": [
         ["errors", "curves", "console"],
-        ["storage"],
+        ["storage", "libraries"],
         ["problem", "schedule", "tasks"],
         ["solution"],
         ["direct", "audit", "local"],

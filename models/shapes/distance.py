@@ -163,7 +163,7 @@ def pair_function(one: type[Shape], other: type[Shape], rounding: float = 0.0) -
 
 
 @cache
-def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int) -> Any:
+def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int | None = None) -> Any:
     """Function (columns of ones, columns of others) -> distances of n pairs side by side, and their wrenches.
 
     Of the columns, one pair a row, shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6): (moment about
@@ -173,34 +173,63 @@ def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: 
     columns as wholes, which an interpreter does several times faster than pair after pair.
 
     Args:
-        one, other, rounding: As of `pair_function`. count: n.
+        one, other, rounding: As of `pair_function`. count: n; None for one pair, written out in scalars.
 
     Raises:
         ModelError: As of `pair_function`.
     """
     kinds = (one, other)
     pair_function(one, other, rounding)
-    given = [ca.MX.sym(kind.__name__, count, COLUMNS[kind]) for kind in kinds]
+    new = ca.SX.sym if count is None else ca.MX.sym
+    given = [new(kind.__name__, count or 1, COLUMNS[kind]) for kind in kinds]
     # the derivative by the shape of fewer numbers tells the wrench
     side = 0 if COLUMNS[one] <= COLUMNS[other] else 1
     points, directions = VECTORS[kinds[side]]
-    vectors = ca.MX.sym("vectors", count, 3 * (points + directions))
     rows = [ca.horzsplit(each) for each in given]
-    rows[side][: vectors.shape[1]] = ca.horzsplit(vectors)
+    held = Held()
+    vectors = held(given[side][:, : 3 * (points + directions)])
+    own = ca.horzsplit(vectors)
+    rows[side][: len(own)] = own
     first, second = (_core_of(kind, each) for kind, each in zip(kinds, rows, strict=True))
-    gap = _between(first, second, rounding, held=True)
+    gap = _between(first, second, rounding, held)
     for kind, each in zip(kinds, rows, strict=True):
         gap -= each[-1] if kind in (Sphere, Capsule) else 0
     slopes = ca.horzsplit(ca.gradient(ca.sum1(gap), vectors))
-    moment, force = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    moment, force = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(points + directions):
-        (x, y, z), (a, b, c) = rows[side][3 * k : 3 * k + 3], slopes[3 * k : 3 * k + 3]
-        moment = list(_add(_triple(moment), (y * c - z * b, z * a - x * c, x * b - y * a)))
-        force = list(_add(_triple(force), (a, b, c))) if k < points else force
-    wrench = ca.horzcat(*moment, *force) * (1 if side == 0 else -1)
-    inner = ca.Function("wrenches", [*given, vectors], [gap, wrench])
-    own = given[side][:, : vectors.shape[1]]
-    return ca.Function("wrenches", given, inner.call([*given, own], True, False))
+        arm, slope = _triple(own[3 * k : 3 * k + 3]), _triple(slopes[3 * k : 3 * k + 3])
+        moment = _add(moment, _cross(arm, slope))
+        force = _add(force, slope) if k < points else force
+    wrench = ca.horzcat(*(part if side == 0 else -part for part in (*moment, *force)))
+    return ca.Function("wrenches", given, ca.cse(held.released([gap, wrench])))
+
+
+class Held:
+    """Numbers that a derivative takes for constants: symbols, until they are released.
+
+    Where a distance is the least over places, or the largest over directions, these do not move it (envelope theorem).
+    """
+
+    def __init__(self) -> None:
+        self._symbols: list[Expression] = []
+        self._values: list[Expression] = []
+
+    def __call__(self, value: Expression) -> Expression:
+        """A symbol in the place of a value, which may hold other symbols."""
+        if not isinstance(value, ca.SX | ca.MX) or value.is_constant():
+            return value
+        self._symbols.append(type(value).sym("held", value.shape))
+        self._values.append(value)
+        return self._symbols[-1]
+
+    def tangent(self, value: Expression, arguments: Iterable[Expression], slopes: Iterable[Expression]) -> Expression:
+        """A value of arguments, by which it has these slopes."""
+        terms = (self(slope) * (x - self(x)) for x, slope in zip(arguments, slopes, strict=True))
+        return reduce(lambda a, b: a + b, terms, self(value))
+
+    def released(self, expressions: list[Expression]) -> list[Expression]:
+        """Expressions with the values in the places of the symbols."""
+        return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 
 @cache
@@ -268,8 +297,8 @@ def _written_out(
     return _between(first, second, rounding) - (one.swelling + other.swelling)
 
 
-def _between(one: Core, other: Core, rounding: float, held: bool = False) -> Expression:
-    """Signed distance of two cores; if held, without derivatives by way of where on segments the nearest points are."""
+def _between(one: Core, other: Core, rounding: float, held: Held | None = None) -> Expression:
+    """Signed distance of two cores; if held, derivatives take nearest points and which direction parts for given."""
     if isinstance(one, Plane):
         return _lowest(other, one.normal, one.point, rounding)
     if isinstance(other, Plane):
@@ -343,6 +372,10 @@ def _dot(a: Triple, b: Triple) -> Expression:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def _cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def _along(a: Triple, step: Expression, direction: Triple) -> Triple:
     return _triple(a[k] + step * direction[k] for k in range(3))
 
@@ -359,32 +392,53 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 # ---- apart: from squares to distances -----------------------------------------------------------------------------
 
 
-def _root(square: Expression, excess: float) -> Expression:
+def _root(square: Expression, excess: float, held: Held | None = None) -> Expression:
     """A lower bound of d where d^2 <= square <= d^2 + excess; for no excess d itself."""
-    if excess == 0:
-        return ca.sqrt(square + KINK**2) - KINK
-    return (square - excess) / ca.sqrt(square + excess)
+    root = ca.sqrt(square + (excess or KINK**2))
+    inverse = 1 / root
+    away = (square - excess) * inverse if excess else root - KINK
+    if held is None:
+        return away
+    slope = 0.5 * (square + 3 * excess) * inverse**2 * inverse if excess else 0.5 * inverse
+    return held.tangent(away, [square], [slope])
 
 
-def _negative_part(gap: Expression, rounding: float) -> Expression:
+def _negative_part(gap: Expression, rounding: float, held: Held | None = None) -> Expression:
     """min(gap, 0), or a smooth lower bound of it, at most rounding/4 below; from a gap of `rounding` on it is zero."""
     if rounding == 0:
-        return ca.fmin(gap, 0)
-    return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 / (4 * rounding)
+        low = ca.fmin(gap, 0)
+        return low if held is None else held.tangent(low, [gap], [gap < 0])
+    over = _clip(rounding - gap, 0.0, 2 * rounding)
+    low = ca.fmin(gap + rounding, 0) - over**2 * (0.25 / rounding)
+    return low if held is None else held.tangent(low, [gap], [over * (0.5 / rounding)])
 
 
-def _positive_part(gap: Expression, rounding: float) -> Expression:
+def _positive_part(gap: Expression, rounding: float, held: Held | None = None) -> Expression:
     """A smooth lower bound of max(gap, 0), at most rounding/2 below; up to a gap of zero it is zero."""
-    return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 / (2 * rounding)
+    within = _clip(gap, 0.0, rounding)
+    high = ca.fmax(gap - rounding, 0) + within**2 * (0.5 / rounding)
+    return high if held is None else held.tangent(high, [gap], [within * (1 / rounding)])
 
 
-def _highest(gaps: Sequence[Expression], rounding: float) -> Expression:
+def _highest(gaps: Sequence[Expression], rounding: float, held: Held | None = None) -> Expression:
     """The largest of gaps, or a smooth lower bound of it, at most `rounding` below."""
     most = reduce(ca.fmax, gaps)
     if rounding == 0 or len(gaps) == 1:
-        return most
+        return most if held is None else held.tangent(most, gaps, _first(gaps, most))
     width = rounding / log(len(gaps))
-    return most + width * ca.log(sum(ca.exp((gap - most) / width) for gap in gaps)) - rounding
+    shares = [ca.exp((gap - most) * (1 / width)) for gap in gaps]
+    whole = sum(shares)
+    high = most + width * ca.log(whole) - rounding
+    return high if held is None else held.tangent(high, gaps, [share * (1 / whole) for share in shares])
+
+
+def _first(values: Sequence[Expression], chosen: Expression) -> list[Expression]:
+    """1 for the first of values that is the chosen one, 0 for the others."""
+    left, found = 1.0, []
+    for value in values[:-1]:
+        found.append(left * (value == chosen))
+        left = left - found[-1]
+    return [*found, left]
 
 
 def _least(values: Sequence[Expression], rounding: float) -> Expression:
@@ -397,26 +451,26 @@ def _least(values: Sequence[Expression], rounding: float) -> Expression:
 # ---- rods ---------------------------------------------------------------------------------------------------------
 
 
-def _rods(one: Rod, other: Rod, rounding: float, held: bool) -> Expression:
+def _rods(one: Rod, other: Rod, rounding: float, held: Held | None) -> Expression:
     """Distance of points and segments; that of crossing segments is 0, which is their depth."""
     if len(one.points) < len(other.points):
         one, other = other, one
     p, q = one.points[0], other.points[0]
     gap = _subtract(p, q)
     if len(one.points) == 1:
-        return _root(_dot(gap, gap), 0.0)
+        return _root(_dot(gap, gap), 0.0, held)
     u = _subtract(one.points[1], p)
     if len(other.points) == 1:
         s = _clip(-_dot(u, gap) / (_dot(u, u) + KINK**2))
-        apart = _along(gap, _placed(s) if held else s, u)
-        return _root(_dot(apart, apart), 0.0)
+        apart = _along(gap, held(s) if held else s, u)
+        return _root(_dot(apart, apart), 0.0, held)
     v = _subtract(other.points[1], q)
     weight = rounding**2
     square = _segments(gap, u, v, weight, held)
-    return _root(square, weight / 2)
+    return _root(square, weight / 2, held)
 
 
-def _segments(gap: Triple, u: Triple, v: Triple, weight: float, held: bool) -> Expression:
+def _segments(gap: Triple, u: Triple, v: Triple, weight: float, held: Held | None) -> Expression:
     """Least over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
 
     s of the whole plane, cut to 0..1; then the best t for it, cut; then the best s for that (Ericson, Real-Time
@@ -427,7 +481,7 @@ def _segments(gap: Triple, u: Triple, v: Triple, weight: float, held: bool) -> E
     s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, PARALLEL * a * e))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
-    s, t = (_placed(s), _placed(t)) if held else (s, t)
+    s, t = (held(s), held(t)) if held else (s, t)
     apart = _along(_along(gap, s, u), -t, v)
     square = _dot(apart, apart)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
@@ -436,47 +490,58 @@ def _segments(gap: Triple, u: Triple, v: Triple, weight: float, held: bool) -> E
 # ---- rods and boxes -----------------------------------------------------------------------------------------------
 
 
-def _rod_block(rod: Core, block: Core, rounding: float, held: bool) -> Expression:
+def _rod_block(rod: Core, block: Core, rounding: float, held: Held | None) -> Expression:
     assert isinstance(rod, Rod)
     assert isinstance(block, Block)
     ends = [_into(_subtract(point, block.centre), block.axes) for point in rod.points]
     p = ends[0]
     if len(ends) == 1:
-        over = _triple(ca.fabs(p[k]) - block.half[k] for k in range(3))
-        outside = _triple(ca.fmax(entry, 0) for entry in over)
-        return _root(_dot(outside, outside), 0.0) + ca.fmin(reduce(ca.fmax, over), 0)
+        outside = _outside(p, block.half, held)
+        gap = _highest([ca.fabs(x) - h for x, h in zip(p, block.half, strict=True)], 0.0, held)
+        return _root(_dot(outside, outside), 0.0, held) + _negative_part(gap, 0.0, held)
     u = _subtract(ends[1], p)
     middle, weight = _along(p, 0.5, u), rounding**2
-    away = _root(_segment_box(middle, u, block.half, weight, held), weight / 4)
-    return away + _negative_part(_segment_box_gap(middle, u, block.half), rounding)
+    gap = _segment_box_gap(middle, u, block.half, held)
+    square = _segment_box(middle, u, block.half, weight, held)
+    if rounding == 0:  # what the rounding of numbers leaves of it has slopes where they overlap
+        square = square * (gap > 0)
+    return _root(square, weight / 4, held) + _negative_part(gap, rounding, held)
 
 
-def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float, held: bool) -> Expression:
+def _outside(x: Triple, half: Triple, held: Held | None) -> Triple:
+    """The way to a point from the nearest one of a box, in the box's axes."""
+    nearest = _triple(_clip(part, -h, h) for part, h in zip(x, half, strict=True))
+    return _subtract(x, _triple(map(held, nearest)) if held else nearest)
+
+
+def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float, held: Held | None) -> Expression:
     """Least over s in -1/2..1/2 of the squared distance of middle + s u to a box plus weight s^2, in the box's axes.
 
     Half of its derivative is weight s and of each axis u_k (x_k - what x_k is cut to by the box), which is zero while
     x_k is within the box and straight before and after. First the axis is added that is farthest in s from there where
     s = 0; then that of the others that is farthest where the first leads to; then the last, if it is beyond where these
     lead to. What is added later pulls no farther than an axis that was added is straight: the least is found in three
-    steps. The places that are looked at are kept from differentiation by a floor, which has none.
+    steps. The places that are looked at are kept from differentiation: held, or by a floor.
     """
     sizes, squares = _triple(ca.fabs(part) + KINK for part in u), _triple(part * part for part in u)
     s, pull, rise = 0.0, 0.0, weight + KINK**2
     left: Sequence[Expression] = (1.0, 1.0, 1.0)
     for step in range(3):
-        over = _triple(
-            keep * (x - _clip(x, -h, h)) for keep, x, h in zip(left, _along(middle, s, u), half, strict=True)
-        )
+        x = _along(middle, s, u)
+        nearest = _triple(_clip(part, -h, h) for part, h in zip(x, half, strict=True))
+        over = _triple(keep * (part - near) for keep, part, near in zip(left, x, nearest, strict=True))
         added = _farthest(over, sizes) if step < 2 else (1.0, 1.0, 1.0)
         for k in range(3):
             taken = added[k] * (over[k] != 0) if step else added[k]
-            pull, rise = pull + taken * (u[k] * over[k] - squares[k] * s), rise + taken * squares[k]
+            pull, rise = pull + taken * (u[k] * (middle[k] - nearest[k])), rise + taken * squares[k]
         left = [keep * (1 - taken) for keep, taken in zip(left, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
-        if step < 2 or held:
+        if held:
+            s = held(s)
+        elif step < 2:
             s = _placed(s)
-    outside = [x - _clip(x, -h, h) for x, h in zip(_along(middle, s, u), half, strict=True)]
-    square = sum(x * x for x in outside)
+    outside = _outside(_along(middle, s, u), half, held)
+    square = _dot(outside, outside)
     return square + weight * s**2 if weight else square
 
 
@@ -493,7 +558,7 @@ def _farthest(over: Triple, sizes: Triple) -> list[Expression]:
     return [first, second, 1 - first - second]
 
 
-def _segment_box_gap(middle: Triple, u: Triple, half: Triple) -> Expression:
+def _segment_box_gap(middle: Triple, u: Triple, half: Triple, held: Held | None = None) -> Expression:
     """Largest gap between a segment about a middle and a box along the faces' normals and those to u and an edge."""
     size = _triple(ca.fabs(part) for part in u)
     gaps = [ca.fabs(middle[k]) - size[k] / 2 - half[k] for k in range(3)]
@@ -502,19 +567,23 @@ def _segment_box_gap(middle: Triple, u: Triple, half: Triple) -> Expression:
     for i, j in ((0, 1), (1, 2), (2, 0)):
         reach = half[i] * size[j] + half[j] * size[i]
         gap = ca.fabs(middle[i] * u[j] - middle[j] * u[i]) - reach
-        gaps.append(_per_length(gap, squares[i] + squares[j], NO_EDGE * whole))
-    return reduce(ca.fmax, gaps)
+        gaps.append(_per_length(gap, squares[i] + squares[j], NO_EDGE * whole, held))
+    return _highest(gaps, 0.0, held)
 
 
-def _per_length(gap: Expression, square: Expression, least: Expression) -> Expression:
+def _per_length(gap: Expression, square: Expression, least: Expression, held: Held | None = None) -> Expression:
     """The gap along a vector of this squared length, where that is more than the least; else far below all others."""
-    return gap / ca.sqrt(square + 1e-60) - BARRED * (square <= least)
+    length = ca.sqrt(square + 1e-60)
+    inverse = 1 / length
+    share = gap * inverse
+    known = share if held is None else held.tangent(share, [gap, square], [inverse, -0.5 * share * inverse**2])
+    return known - BARRED * (square <= least)
 
 
 # ---- two boxes ----------------------------------------------------------------------------------------------------
 
 
-def _blocks(one: Block, other: Block, rounding: float, held: bool) -> Expression:
+def _blocks(one: Block, other: Block, rounding: float, held: Held | None) -> Expression:
     """The largest gap along 15 directions where they overlap, else the least of the distances of the 12 edges of one to
     the other and of the 8 corners of that to the first.
 
@@ -524,19 +593,22 @@ def _blocks(one: Block, other: Block, rounding: float, held: bool) -> Expression
     axes.
     """
     if rounding == 0:
-        gap = reduce(ca.fmax, _block_gaps(one, other))
-        square = reduce(ca.fmin, [*_edges_to(one, other, held), *_corners_to(other, one)])
-        return _root(square * (gap > 0), 0.0) + ca.fmin(gap, 0)
-    gaps = _block_gaps(one, other, rounding / sum((*one.half, *other.half)))
-    gap = _highest(gaps, rounding)
-    away = [_positive_part(gap, rounding)]
+        gap = _highest(_block_gaps(one, other, 0.0, held), 0.0, held)
+        squares = [*_edges_to(one, other, held), *_corners_to(other, one, held)]
+        square = reduce(ca.fmin, squares)
+        square = square if held is None else held.tangent(square, squares, _first(squares, square))
+        return _root(square * (gap > 0), 0.0, held) + _negative_part(gap, 0.0, held)
+    gaps = _block_gaps(one, other, rounding / sum((*one.half, *other.half)), held)
+    gap = _highest(gaps, rounding, held)
+    away = [_positive_part(gap, rounding, held)]
     for along in (gaps[:3], gaps[3:6]):
-        square = sum(_positive_part(each, rounding) ** 2 for each in along)
-        away.append(ca.sqrt(square + rounding**2) - rounding)
-    return _highest(away, rounding) + _negative_part(gap, rounding)
+        square = sum(_positive_part(each, rounding, held) ** 2 for each in along)
+        length = ca.sqrt(square + rounding**2)
+        away.append((length if held is None else held.tangent(length, [square], [0.5 / length])) - rounding)
+    return _highest(away, rounding, held) + _negative_part(gap, rounding, held)
 
 
-def _edges_to(one: Block, other: Block, held: bool) -> list[Expression]:
+def _edges_to(one: Block, other: Block, held: Held | None) -> list[Expression]:
     """Squares of the distances of the edges of one box to another."""
     centre, reaches = _in_axes_of(one, other)
     found = []
@@ -548,13 +620,13 @@ def _edges_to(one: Block, other: Block, held: bool) -> list[Expression]:
     return found
 
 
-def _corners_to(one: Block, other: Block) -> list[Expression]:
+def _corners_to(one: Block, other: Block, held: Held | None) -> list[Expression]:
     """Squares of the distances of the corners of one box to another."""
     centre, (x, y, z) = _in_axes_of(one, other)
     found = []
     for signs in product((-1.0, 1.0), repeat=3):
         corner = _along(_along(_along(centre, signs[0], x), signs[1], y), signs[2], z)
-        outside = _triple(ca.fmax(ca.fabs(part) - h, 0) for part, h in zip(corner, other.half, strict=True))
+        outside = _outside(corner, other.half, held)
         found.append(_dot(outside, outside))
     return found
 
@@ -565,7 +637,7 @@ def _in_axes_of(one: Block, other: Block) -> tuple[Triple, list[Triple]]:
     return centre, [_triple(h * part for part in _into(a, other.axes)) for a, h in zip(one.axes, one.half, strict=True)]
 
 
-def _block_gaps(one: Block, other: Block, slack: Expression = 0.0) -> list[Expression]:
+def _block_gaps(one: Block, other: Block, slack: Expression, held: Held | None) -> list[Expression]:
     """Gaps of two boxes along their 6 axes and the 9 across an edge of each (Gottschalk, Lin & Manocha 1996).
 
     With slack the sizes of cosines, which have kinks where boxes are aligned, are rounded up by as much at most.
@@ -580,7 +652,7 @@ def _block_gaps(one: Block, other: Block, slack: Expression = 0.0) -> list[Expre
         reach = one.half[i1] * sizes[j][i2] + one.half[i2] * sizes[j][i1]
         reach += other.half[j1] * sizes[j2][i] + other.half[j2] * sizes[j1][i]
         across = ca.fabs(gap[i2] * shares[j][i1] - gap[i1] * shares[j][i2]) - reach
-        found.append(_per_length(across, shares[j][i1] ** 2 + shares[j][i2] ** 2, NO_EDGE))
+        found.append(_per_length(across, shares[j][i1] ** 2 + shares[j][i2] ** 2, NO_EDGE, held))
     return found
 
 

@@ -24,9 +24,9 @@ import casadi as ca
 import numpy as np
 
 from ocp.direct.assembly import assemble, gather
-from ocp.direct.compiled import CompilerError, generated
 from ocp.direct.fragment import Fragment
 from ocp.errors import ProblemError
+from ocp.libraries import CompilerError, generated
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 

@@ -26,10 +26,10 @@ import numpy as np
 
 from ocp.console import Watch
 from ocp.direct.assembly import Derivatives, gather, inputs, mapped, nonzeros, repeat
-from ocp.direct.compiled import CompilerError, Library, built
 from ocp.direct.fragment import Fragment
 from ocp.direct.stages import Entries, Tables
 from ocp.errors import ProblemError
+from ocp.libraries import CompilerError, Library, built
 from ocp.problem.formulation import Formulation
 
 __all__ = ["NativeSolver", "why_not"]

@@ -10,9 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Cylinder, Frame, HalfSpace, Mesh, ModelError, Sphere
-from models.shapes.distance import column, distance, pair_function
+from models.shapes.distance import COLUMNS, column, distance, pair_function, pair_wrenches
 from models.shapes.shapes import SIDES, Shape
 from tests.models.shapes.shape_oracles import by_coal, by_differences, moved_distance, random_frame, random_shape
 
@@ -345,6 +346,34 @@ def test_second_derivatives_are_those_of_finite_differences(pair: tuple[type, ty
                 worst = max(worst, float(np.abs(found - fine).max() / (1 + np.abs(fine).max())))
     assert kept > 18
     assert worst < 1e-4
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+@pytest.mark.parametrize("pair", [pair for pair in PAIRS if set(pair) <= COLUMNS.keys()], ids=names)
+def test_wrenches_tell_at_what_rate_distances_grow(pair: tuple[type, type], rounding: float) -> None:
+    """By a twist of the first shape, in either order, side by side and one by one; away from kinks."""
+    rng = np.random.default_rng(18)
+    for kinds in {pair, pair[::-1]}:
+        shapes = [(random_shape(kinds[0], rng, 0.5), random_shape(kinds[1], rng, 0.5)) for _ in range(30)]
+        sides = [ca.horzcat(*map(column, side)).T for side in zip(*shapes, strict=True)]
+        gaps, wrenches = (np.array(part) for part in pair_wrenches(*kinds, rounding, 30)(*sides))
+        alone = pair_wrenches(*kinds, rounding).map(30)(*(ca.reshape(side.T, 1, -1) for side in sides))
+        np.testing.assert_allclose(np.array(alone[0]).ravel(), gaps.ravel(), atol=1e-12)
+        np.testing.assert_allclose(np.array(alone[1]).reshape(30, 6), wrenches, atol=1e-12)
+        np.testing.assert_allclose(gaps.ravel(), in_bulk(shapes, rounding), atol=1e-12)
+        twists = rng.normal(size=(30, 6))
+
+        def moved(step: float, shapes: Any = shapes, twists: Any = twists) -> Any:
+            turns = [Rotation.from_rotvec(step * twist[:3]).as_matrix() for twist in twists]
+            ways = zip(shapes, turns, twists, strict=True)
+            return in_bulk(
+                [(one.placed(turn, step * twist[3:]), other) for (one, other), turn, twist in ways], rounding
+            )
+
+        rough, fine = ((moved(h) - moved(-h)) / (2 * h) for h in (2e-5, 1e-5))
+        sure = np.abs(rough - fine) < 1e-7
+        assert sure.sum() > 20
+        np.testing.assert_allclose((wrenches * twists).sum(axis=1)[sure], fine[sure], atol=1e-6)
 
 
 def _differences(function: Any, x: Any, step: float) -> Any:

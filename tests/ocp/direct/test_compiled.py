@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ import numpy as np
 import pytest
 
 from models import cache
-from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare
+from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, prepare
 from ocp.console import OutOfTime, limited
 from ocp.direct import compiled
 from ocp.direct.assembly import Derivatives, derivatives
-from ocp.direct.compiled import Background, CompilerError, Library, built, code, kept, stop_compiling
+from ocp.direct.compiled import Background, stop_compiling
+from ocp.libraries import CompilerError, Library, built, code, kept
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
@@ -36,7 +38,7 @@ ROOT = Path(__file__).parents[3]
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and notices that have not been given yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    compiled.notice.cache_clear()
+    libraries.notice.cache_clear()
     return tmp_path / "cache" / "selfmotion"
 
 
@@ -148,7 +150,7 @@ def test_what_cannot_hold_together_is_named_in_the_same_words(shared: Path, solv
 
 
 def test_no_optimization_changes_no_number(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "LARGE", 0)
+    monkeypatch.setattr(libraries, "LARGE", 0)
     plans = [prepare(van_der_pol(), Collocation(6), compiled=how).solve() for how in (True, False)]
     np.testing.assert_array_equal(plans[0].variables, plans[1].variables)
 
@@ -172,7 +174,8 @@ import ctypes, sys, time, types
 for face in ("models", "ocp"):  # what the faces show is not needed, and takes a second
     sys.modules[face] = types.ModuleType(face)
     sys.modules[face].__path__ = [face]
-from ocp.direct.compiled import Background, Library, built
+from ocp.direct.compiled import Background
+from ocp.libraries import Library, built
 def number(value):
     return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
 """
@@ -203,16 +206,17 @@ def test_compilers_flags_and_contents_are_told_apart(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = number(1), number(2)
-    others = [Library(one.contents, one.text, **{key: ("-lx",)}) for key in ("include", "link")]
+    words = ("-lx",)
+    others = (replace(one, include=words), replace(one, link=words), replace(one, vectors=True))
     keys = [library.key for library in (one, two, *others)]
     monkeypatch.setenv("CC", script(tmp_path / "another", COUNTED))
     keys.append(one.key)
     newer = (tmp_path / "another").read_text().replace("ours 1", "ours 2")
     (tmp_path / "another").write_text(newer)
     assert one.key == keys[-1]  # asked once a process for its version
-    compiled._version.cache_clear()
+    libraries._version.cache_clear()
     keys.append(one.key)
-    assert len(set(keys)) == len(keys) == 6
+    assert len(set(keys)) == len(keys) == 7
 
 
 # ---- what goes wrong ---------------------------------------------------------------------------------------------
@@ -281,7 +285,7 @@ def test_what_is_not_defined_is_no_library() -> None:
 
 
 def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "MOST", 10)
+    monkeypatch.setattr(libraries, "MOST", 10)
     with pytest.raises(CompilerError, match="characters"):
         built(number(8))
 
