@@ -12,10 +12,11 @@ import functools
 import hashlib
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any
@@ -34,7 +35,7 @@ def key_of(version: str, *contents: Any) -> str:
     """A name for arrays or texts and the version of what is done with them: hexadecimal digits of SHA-256.
 
     Args:
-        version: What is done with them; `version_of` the package that does it, where its code changes often.
+        version: What is done with them; `version_of` the module that does it.
     """
     digest = hashlib.sha256(version.encode())
     for content in contents:
@@ -45,14 +46,21 @@ def key_of(version: str, *contents: Any) -> str:
 
 
 @functools.cache
-def version_of(package: str) -> str:
-    """Hexadecimal digits that tell the sources of a package's modules from any others: no change is forgotten."""
-    found = sorted((file.name, file.read_bytes()) for file in resources.files(package).iterdir() if file.is_file())
-    digest = hashlib.sha256()
-    for name, source in found:
-        if name.endswith(".py"):
-            digest.update(f"|{name} {len(source)}|".encode() + source)
-    return digest.hexdigest()
+def version_of(module: str) -> str:
+    """Hexadecimal digits that tell the source of a module, and of what it imports of its package, from any other.
+
+    So that no change of what a value was made by is forgotten. Imports are those written `from PACKAGE... import`.
+    """
+    sources: dict[str, str] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in sources:
+            continue
+        loader: Any = getattr(find_spec(name), "loader", None)
+        sources[name] = loader.get_source(name) or ""
+        waiting += re.findall(rf"^\s*from ({module.partition('.')[0]}[\w.]*) import", sources[name], re.MULTILINE)
+    return hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()
 
 
 def folder() -> Path:

@@ -76,7 +76,7 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
         message = f"cover: faces have shape {corners.shape}, expected (m, 3)"
         raise ModelError(message, name="faces", value=faces, limit=("m", 3))
     triangles = points[corners]
-    key = key_of(version_of("models.shapes"), "cover", triangles)
+    key = key_of(version_of(__name__), "cover", triangles)
     known = _read(kept(key), triangles.reshape(-1, 3))
     if known is None:
         known = fitted(triangles)

@@ -73,7 +73,7 @@ def kept_hull(points: Array) -> Hull:
 
     Args, Raises: As `convex_hull`.
     """
-    key = key_of(version_of("models.shapes"), "hull", points)
+    key = key_of(version_of(__name__), "hull", points)
     known = _read(kept(key), points)
     if known is None:
         known = convex_hull(points)

@@ -189,7 +189,7 @@ def _key(
             body.overhang,
             np.zeros(0) if body.mesh is None else body.mesh.points,
         ]
-    return key_of(version_of("models.shapes"), "\n".join(words), *parts)
+    return key_of(version_of(__name__), "\n".join(words), *parts)
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:

@@ -264,19 +264,31 @@ def test_keys_tell_contents_and_versions_apart() -> None:
     assert cache.key_of("1", one) == cache.key_of("1", one.copy()[::1])
 
 
-def test_a_version_changes_with_any_module_of_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_version_changes_with_a_module_and_all_that_it_imports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, by way of another, or within a function; not with what it does not import."""
     monkeypatch.syspath_prepend(str(tmp_path))
     package = tmp_path / "whole"
     package.mkdir()
-    (package / "__init__.py").write_text("", encoding="utf-8")
-    found = []
-    for name, text in (("a.py", "x = 1"), ("b.py", "x = 1"), ("a.py", "x = 2"), ("notes.txt", "none")):
-        (package / name).write_text(text, encoding="utf-8")
+    texts = {
+        "__init__": "",
+        "a": "from whole.b import x",
+        "b": "def f():\n    from whole.c import (\n        y,\n    )",
+        "c": "from whole.a import z",
+        "d": "from whole.a import z",
+    }
+    for name, text in texts.items():
+        (package / f"{name}.py").write_text(text, encoding="utf-8")
+    found = [cache.version_of("whole.a")]
+    for name in "abcd":
+        (package / f"{name}.py").write_text(texts[name] + "\n", encoding="utf-8")
         cache.version_of.cache_clear()
-        found.append(cache.version_of("whole"))
-    assert len(set(found)) == 3
-    assert found[2] == found[3]
-    assert cache.version_of("models.shapes") != cache.version_of("models.robot")
+        found.append(cache.version_of("whole.a"))
+    assert len(set(found)) == 4
+    assert found[3] == found[4]
+    kinds = [cache.version_of(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
+    assert len(set(kinds)) == 3
 
 
 @pytest.mark.parametrize(
