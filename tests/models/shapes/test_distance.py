@@ -255,6 +255,18 @@ def test_what_is_small_is_as_exact() -> None:
     assert number(distance(rod, crossing)) == pytest.approx(8e-5, abs=2e-12)
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("slope", [-2.0, 0.0, 0.5])
+def test_a_rod_across_an_edge_is_as_deep_as_it_is_at_any_size(scale: float, slope: float) -> None:
+    """0.01 beyond the edge at x = y = 0.1 of a box along z, square to it; the nearest face is 0.05 and more away."""
+    out, across = np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, slope])
+    middle = np.array([0.1, 0.1, 0.05]) - 0.01 * out
+    rod = Capsule(0.02, middle - 0.1 * across, middle + 0.08 * across)
+    for one, other in ((Box((0.2, 0.2, 0.6)), rod), (rod, Box((0.2, 0.2, 0.6)))):
+        found = number(distance(scaled(one, scale), scaled(other, scale)))
+        assert found == pytest.approx(-0.03 * scale, rel=1e-9, abs=2e-12)
+
+
 # ---- rounding -----------------------------------------------------------------------------------------------------
 
 

@@ -77,7 +77,7 @@ def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
 
 def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() -> None:
     """Square to each other, each turned about its length, and far from their middles."""
-    ends = {"lower": -1.0, "upper": 1.0}
+    ends: dict[str, Any] = {"lower": -1.0, "upper": 1.0}
     angles = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in (0.5, 0.4)]
     across = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     beam = CollisionShape("box", (2.0, 0.2, 0.3), rotation=angles[0])
