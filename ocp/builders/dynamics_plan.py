@@ -132,17 +132,18 @@ def within_limits(
 
     touching: Solution | None = None  # what was planned before, the bodies not held apart enough
 
-    def run(clear: Kept) -> Solution:
+    def planned(problem: Problem, guess: Solution | None) -> Solution:
         nonlocal touching
-        problem = declare(clear)
-        for guess in dict.fromkeys((touching, None)):
-            try:
-                return _first_that_holds(problem, mesh, settings, tolerances, guess)
-            except SolveError as error:
-                touching = error.solution if of_clearance(error.name) else None
-                if guess is None or touching is not None:
-                    raise
-        raise AssertionError("the last attempt returns or raises")
+        try:
+            return _first_that_holds(problem, mesh, settings, tolerances, guess)
+        except SolveError as error:
+            touching = error.solution if of_clearance(error.name) else None
+            if guess is None or touching is not None:
+                raise
+        return planned(problem, None)
+
+    def run(clear: Kept) -> Solution:
+        return planned(declare(clear), touching)
 
     try:
         return keeping_clear(clear, run)

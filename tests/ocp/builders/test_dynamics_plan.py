@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Link, center_of_mass, planar_chain, with_load
+from models import (
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    Link,
+    Sphere,
+    Surroundings,
+    center_of_mass,
+    planar_chain,
+    with_load,
+)
 from models.arrays import Array
-from ocp import Effort, FreeTime, Leg, Limits, ProblemError, Solution, SolveError, dynamics_phases, plan_dynamics
+from ocp import (
+    Collocation,
+    Effort,
+    FreeTime,
+    Leg,
+    Limits,
+    ProblemError,
+    Solution,
+    SolveError,
+    dynamics_phases,
+    plan_dynamics,
+)
+from ocp.builders.clearance import Clear
 from tests.ocp.builders.test_dynamics import MASS, WAY, slider, torques_along
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
@@ -157,3 +180,25 @@ def test_legs_that_do_not_fit_are_refused() -> None:
     ):
         with pytest.raises(ProblemError, match=words):
             dynamics_phases(MACHINE, START, legs, **more)
+
+
+def test_what_touches_on_a_leg_is_held_apart_there() -> None:
+    """The tip goes round a ball in its way, by plain geometry, on the way out and back to where it begins."""
+    chain, tip, ball, sizes = planar_chain([0.5, 0.4], [2.0, 1.5]), np.array([0.4, 0.0, 0.0]), 0.06, 0.11
+    shape = CollisionShape("sphere", (sizes - ball,), translation=tip)
+    links = [replace(link, collisions=(shape,)) if link.name == "link2" else link for link in chain.links]
+    machine = FixedBase(replace(chain, links=tuple(links)))
+    legs = [Leg([0.6, 0.3], 1.0, end="free"), Leg(START, 1.0)]
+
+    def way(clear: Clear | None) -> Array:
+        """Of the tip, there and back. Shape (402, 3)."""
+        plan = plan_dynamics(machine, START, legs, clear=clear, method=Collocation(6, 4, scheme="legendre"))
+        assert plan.audit().passed
+        both = [plan.phase(name).at_fraction(np.linspace(0, 1, 201))["joints"] for name in ("leg 1", "leg 2")]
+        return np.array([np.array(ca.DM(machine.tip_pose(ca.DM(0, 1), q).position)).ravel() for q in np.vstack(both)])
+
+    free = way(None)
+    place = free[100] * (1 + 0.08 / np.linalg.norm(free[100]))
+    assert np.linalg.norm(free - place, axis=1).min() < sizes - 0.01
+    held = way(Clear(Surroundings(machine, [Sphere(ball, place)])))
+    assert np.linalg.norm(held - place, axis=1).min() >= sizes - 1e-9
