@@ -31,7 +31,16 @@ from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
 from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem
 from ocp.builders.dynamics_plan import within_limits
-from ocp.builders.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum, require_room
+from ocp.builders.grasping import (
+    Cone,
+    Grasp,
+    checked_pair,
+    grasp_wrench,
+    motion_of,
+    pair_momentum,
+    require_reach,
+    require_room,
+)
 from ocp.builders.standing.problem import FreeTime
 from ocp.builders.target_clearance import ClearOfTarget
 from ocp.console import interruptible
@@ -102,7 +111,8 @@ def capture_problem(
     Raises:
         ProblemError: Machines that are none, a target with joints, sizes and values as of `dynamics_problem`, a
             clearance between bodies without shapes; or "momentum": rest is asked for, and the wheels cannot hold the
-            momentum of both: `value` is its size, `limit` what they hold at most, N m s.
+            momentum of both: `value` is its size, `limit` what they hold at most, N m s; or "reach": the target is
+            farther off, `value`, than the arm is long, `limit`, m, and nothing pushes the chaser there.
     """
     given = _Capture.of(chaser, target, start_joints, asked)
     begin, after = given.approach(approach), given.detumbling(detumble, None)
@@ -286,6 +296,9 @@ class _Capture:
             chaser, self.joints, duration, start_base=self.base, end="free", clear=asked.get("clear"),
             start="rest" if start is None else start, **self.shared,
         )  # fmt: skip
+        if not self.thrusters:
+            times = (duration.lower, duration.upper) if isinstance(duration, FreeTime) else (duration, duration)
+            require_reach(chaser, target, (self.base, self.joints, self.target_base), times)
         base, joints, _ = motion_of(problem)
         none = ca.DM(0, 1)
         goal = problem.state(

@@ -23,7 +23,8 @@ from ocp.problem.problem import Problem
 from ocp.tasks.limits import Limits
 
 __all__ = [
-    "Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum", "require_room",
+    "Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum",
+    "require_reach", "require_room",
 ]  # fmt: skip
 
 MOST_WHEELS = 12
@@ -178,6 +179,49 @@ def require_room(pair: FreeFloating, limits: Limits | None) -> None:
             "the chaser against that of the target, or rest=False help"
         )
         raise ProblemError(words, name="momentum", value=size, limit=most)
+
+
+def require_reach(
+    chaser: FreeFloating, target: FreeFloating, start: tuple[Any, Any, Any], times: tuple[float, float]
+) -> None:
+    """Raise where the grasp is too far off for the arm at any time: both centres of mass go on as they do.
+
+    The tip is no farther from the chaser's centre of mass than all joints in a line take it.
+
+    Args:
+        start: Base, joints, and configuration of the target. times: Of the grasp, the least and the greatest, s.
+    """
+    robot, body = chaser.robot, target.robot
+    middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
+    arm = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
+    arm += float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
+    base, joints, goal = (ca.DM(np.asarray(each, dtype=float)) for each in start)
+    centers = [
+        center_of_mass(body, ca.DM(0, 1), target.world_from_base(goal)),
+        center_of_mass(robot, joints, chaser.world_from_base(base)),
+    ]
+    way = np.array(centers[0] - centers[1]).ravel()
+    spatial = np.eye(6)[:, chaser.twist_rows]
+    speeds = [spatial @ np.asarray(one.conserved_momentum) / one.robot.total_mass for one in (target, chaser)]
+    drift = (speeds[0] - speeds[1])[3:]
+    nearest = -float(way @ drift) / float(drift @ drift) if drift.any() else 0.0
+    off = float(np.linalg.norm(way + min(max(nearest, times[0]), times[1]) * drift))
+    if off > arm * (1 + ROOM):
+        words = (
+            f"capture: the centres of mass of chaser and target are {off:.4g} m apart or more, and the arm reaches "
+            f"{arm:.4g} m at most: {off - arm:.4g} m are missing. Start nearer, let them drift together, or give "
+            "thrusters"
+        )
+        raise ProblemError(words, name="reach", value=off, limit=arm)
+
+
+def _longest(robot: Robot, link: str, point: Any) -> float:
+    """How far a point of a link is from the root's origin at most, m; inf beyond a slide without limits."""
+    found = float(np.linalg.norm(point))
+    for joint in robot.path_to(link):
+        slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0
+        found += float(np.linalg.norm(joint.translation)) + slides
+    return found
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:

@@ -23,13 +23,14 @@ from ocp import (
     dynamics_problem,
     plan_capture,
 )
-from ocp.builders.grasping import grasp_wrench, joined, pair_momentum
+from ocp.builders.grasping import grasp_wrench, joined, pair_momentum, require_reach
 from ocp.builders.target_clearance import hand_of
 from tests.models.machines.test_actuators import satellite
 from tests.models.robot.trees import Array
 from tests.ocp.builders.captures import (
     CONE,
     GRASP,
+    PLANAR_START,
     capture,
     planar_capture,
     planar_chaser,
@@ -281,6 +282,26 @@ def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
     with pytest.raises(ProblemError) as caught:
         capture_problem(**capture(1.001 * spin))
     assert caught.value.limit == pytest.approx(most)
+
+
+def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
+    """The arm is 1.8 m long, and the centre of mass no farther than 8 kg of it take it; 0.4 m to the grasp."""
+    asked = planar_capture() | {"target_base": [4.5, 0.0, 0.0], "rest": False}
+    with pytest.raises(ProblemError, match="are missing") as caught:
+        capture_problem(**asked)
+    assert caught.value.name == "reach"
+    hub = asked["chaser"].robot
+    first = np.array(ca.DM(center_of_mass(hub, PLANAR_START, asked["chaser"].world_from_base(np.zeros(3))))).ravel()
+    assert caught.value.value == pytest.approx(np.linalg.norm([4.5, 0.0, 0.0] - first))
+    stretched = 1.8 + 0.4 + (4.0 * 0.4 + 3.0 * 1.15 + 1.0 * 1.65) / hub.total_mass
+    assert caught.value.limit == pytest.approx(stretched)
+    start = np.zeros(3), PLANAR_START, asked["target_base"]
+    require_reach(asked["chaser"], planar_target(velocity=(-0.1, 0.0)), start, (5.0, 40.0))
+    for velocity, latest in ((-2.0, 40.0), (-0.1, 10.0), (0.1, 40.0)):  # it passes too early, comes too late, or leaves
+        with pytest.raises(ProblemError, match="are missing"):
+            require_reach(asked["chaser"], planar_target(velocity=(velocity, 0.0)), start, (5.0, latest))
+    push = {"thrusters": [Thruster("hub", (1, 0, 0), 1.0)], "approach": 10.0, "detumble": 10.0}
+    capture_problem(**(asked | push))
 
 
 def test_what_cannot_be_captured_is_refused_by_name() -> None:
