@@ -21,7 +21,7 @@ velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow =
 [cost]
 weights = { elbow = 4 }             # of squared joint rates; 1 of all others
 [search]
-kind = "postures"                   # or "start", "global"
+kind = "postures"                   # or "start", "global"; "pieces": the fewest motions, where one does not do
 # start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
 [surroundings]
 clearance = 0.01                    # m; ignored = [["link1", "link3"]]; srdf = "..."; folders = ["..."]
@@ -90,7 +90,7 @@ class Task:
 
     Attributes:
         machine: Read from the robot's file. task: Of its tip.
-        options: Keywords of `ocp.plan`.
+        options: Keywords of `ocp.plan`; of `ocp.plan_in_pieces` where it is to be done `in_pieces`.
         outputs: Files to write, by kind of OUTPUTS. period: Of samples in them, s.
         file, urdf: Names of the task's own file and of the robot's.
     """
@@ -102,6 +102,7 @@ class Task:
     period: float
     file: str
     urdf: Path
+    in_pieces: bool = False
 
 
 def read_task(file: FileName) -> Task:
@@ -130,7 +131,8 @@ def read_task(file: FileName) -> Task:
             table.done()
     outputs, period = _outputs(root.table("output", "a table [output]"), folder)
     root.done()
-    return Task(machine, task, options, outputs, period, str(file), urdf)
+    in_pieces = options.pop("in_pieces", False)
+    return Task(machine, task, options, outputs, period, str(file), urdf, in_pieces)
 
 
 @contextmanager
@@ -264,9 +266,17 @@ def _check_joints(entries: Entries, name: str, told: dict[str, float], names: tu
 
 
 def _search(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = {"search": entries.choice("kind", ("postures", "start", "global"), "postures")}
-    found |= {"cyclic": entries.flag("cyclic"), "seed": entries.count("seed", "a whole number, 0 or more", 0)}
-    if entries.choice("pace", ("given", "free"), "given") == "free":
+    kind = entries.choice("kind", ("postures", "start", "global", "pieces"), "postures")
+    cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
+    found: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
+    if kind == "pieces":
+        for name, told in (("cyclic", cyclic), ("pace", pace == "free")):
+            if told:
+                raise entries.wrong(name, 'kind = "pieces" keeps the path\'s own pace and closes nothing; leave it out')
+        found["in_pieces"] = True
+    else:
+        found |= {"search": kind, "cyclic": cyclic}
+    if pace == "free":
         found["horizon"] = "free"
     if "start" in entries:
         told = entries.numbers_by_name("start", "a table of joints and positions: start = { elbow = 1.2 }")

@@ -178,6 +178,8 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),
         ('kind = "start"', 'kind = "best"', 12, 'one of "postures", "start", "global"'),
+        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "leave it out"),
+        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "leave it out"),
         ('kind = "start"', "start = { elbw = 1 }", 12, "no joint 'elbw'"),
         ('kind = "start"', "start = { elbow = 1 }", 12, "start lacks shoulder, wrist, slide"),
         ('kind = "start"', 'kind = "start"\nseed = -1', 13, "seed must be a whole number"),
@@ -225,6 +227,40 @@ def test_a_place_out_of_reach_is_bad_input_and_no_motion_is_a_failure(
     assert status == 1
     assert json.loads(out)["error"] == "no motion passes its audit"
     assert not (tmp_path / "seam.npz").exists()
+
+
+LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link name="upper"/><link name="lower"/>
+<link name="tip"/>
+<joint name="lift" type="prismatic"><parent link="ground"/><child link="column"/><axis xyz="0 0 1"/>
+ <limit lower="-0.1" upper="0.1" velocity="3" effort="9"/></joint>
+<joint name="shoulder" type="revolute"><parent link="column"/><child link="upper"/><axis xyz="0 0 1"/>
+ <limit lower="-0.9" upper="0.9" velocity="3" effort="9"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><axis xyz="0 0 1"/>
+ <origin xyz="0.5 0 0"/><limit lower="-1.8" upper="1.8" velocity="3" effort="9"/></joint>
+<joint name="end" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0.4 0 0"/></joint></robot>"""
+"""The shoulder limited: on either side of a line across the elbow has to be on the other one."""
+
+
+def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them(tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "robot.urdf").write_text(LIFTED)
+    (tmp_path / "line.toml").write_text(
+        "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
+        "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
+        "[search]\nkind = 'pieces'\n[surroundings]\nlook = false\n[output]\ncsv = 'line.csv'\n"
+    )
+    status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
+    assert status == 0, err
+    told = json.loads(out)
+    assert len(told["reconfigurations"]) == told["fewest"] == 1
+    first, way, last = (Plan.load(tmp_path / f"line-{number}.npz") for number in (1, 2, 3))
+    names = {f"line-{number}.{kind}" for number in (1, 2, 3) for kind in ("npz", "csv")}
+    assert {Path(file).name for file in told["written"]} == names
+    assert told["duration"] == pytest.approx(first.horizon + way.horizon + last.horizon)
+    assert first.horizon + last.horizon == pytest.approx(2.0)
+    assert told["cost"] == pytest.approx(first.cost + last.cost)
+    for before, after in ((first, way), (way, last)):  # each goes on where the one before ends
+        np.testing.assert_allclose(before.at(before.horizon)["joints"], after.at(0.0)["joints"], atol=1e-6)
+    assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
 
 
 # ---- what is printed -----------------------------------------------------------------------------------------------
