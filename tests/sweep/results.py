@@ -122,7 +122,10 @@ def _write(file: Path, rows: Mapping[Case, Row]) -> None:
 
 
 def write_table(folder: Path) -> None:
-    """What the files of a folder say, by sweep, kind and code: cases, how many break what is promised, and seconds."""
+    """What the files of a folder say, by sweep, kind and code: cases, how many break what is promised, and seconds.
+
+    And by which words; of a case that is alone of its kind its figures.
+    """
     table = list[Row]()
     for file in sorted(folder.glob("*.jsonl")):
         rows = list(rows_of(file).values())
@@ -139,7 +142,12 @@ def write_table(folder: Path) -> None:
                     "wrong": sum(bool(row["wrong"]) for row in own),
                     "cpu_s_median": f"{median(seconds):.3g}",
                     "cpu_s_most": f"{max(seconds):.3g}",
-                    "what": "; ".join(f"{word} {words.count(word)}" for word in dict.fromkeys(words)),
+                    "broken": "; ".join(f"{word} {words.count(word)}" for word in dict.fromkeys(words)),
+                    "figures": "; ".join(
+                        f"{name} {value:.6g}"
+                        for name, value in own[0].items()
+                        if isinstance(value, float) and name != "seconds" and len(own) == 1
+                    ),
                 }
             )
     if table:

@@ -19,7 +19,7 @@ def swept(file: Path, *options: str, code: str = "") -> tuple[Sweep, list[Row], 
 
     def result(kind: str, seed: int, known: Row | None) -> Row:
         done.append((kind, seed))
-        return {"seconds": 1.0, "wrong": ["dear"] * (kind == "large"), "before": known}
+        return {"seconds": 1.0, "length": 2.5, "wrong": ["dear"] * (kind == "large"), "before": known}
 
     return sweep, list(sweep.rows(result)), done
 
@@ -47,8 +47,11 @@ def test_the_table_counts_the_last_result_of_each_case_by_the_code_of_it(tmp_pat
     swept(file, code="old")
     code = swept(file, "--again", "--only", "large")[0].code
     with (tmp_path / TABLE).open() as table:
-        found = [(row["kind"], row["code"], row["cases"], row["wrong"], row["what"]) for row in csv.DictReader(table)]
-    assert found == [("small", "old", "3", "0", ""), ("large", code, "1", "1", "dear 1")]
+        found = [
+            (row["kind"], row["code"], row["cases"], row["wrong"], row["broken"], row["figures"])
+            for row in csv.DictReader(table)
+        ]
+    assert found == [("small", "old", "3", "0", "", ""), ("large", code, "1", "1", "dear 1", "length 2.5")]
 
 
 def test_what_was_done_is_in_the_file_when_the_next_case_is_stopped(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from ocp import TipTask, inverse_kinematics
 from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions, _rim
 from ocp.planning.search import Search
 from ocp.planning.steps import Largest, Length, Sheets, Squares, StepCost, Values, least_in_box
-from ocp.planning.value import _lowest
+from ocp.planning.value import _lowest, _rise
 from ocp.tasks.equations import bind
 from tests.ocp.planning.test_charts import planar
 
@@ -225,6 +225,24 @@ def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: 
             assert within.any()
             for bounds, cost_of in ((again[k], value[k][at]), (passed[k], total - value[k][at])):
                 assert (bounds.at(flat)[within] <= cost_of + 1e-9).all()
+
+
+@pytest.mark.parametrize("free", [1, 2])
+@pytest.mark.parametrize("bend", [-1.0, 0.0, 1.0])
+def test_a_bound_leans_as_what_it_bounds_from_end_to_end_and_where_that_bends_up_as_little_as_it_can(
+    free: int, bend: float
+) -> None:
+    rng = np.random.default_rng(free)
+    slope, half = rng.normal(size=(50, free)), rng.uniform(0.1, 1.0, (50, free))
+
+    def value(places: Array) -> Array:
+        return np.asarray((places * (slope + bend / 2 * places)).sum(axis=1))
+
+    sides = [side * half * np.eye(free)[axis] for axis in range(free) for side in (-1.0, 1.0)]
+    found = _rise([value(place) for place in (np.zeros_like(half), *sides)], half)
+    # of the lines below a parabola at its ends and its middle the flattest; of one that bends down the chord
+    flattest = np.sign(slope) * np.maximum(np.abs(slope) - bend * half / 2, 0.0)
+    np.testing.assert_allclose(found, flattest if bend > 0 else slope, atol=1e-12)
 
 
 @pytest.mark.parametrize("free", [1, 2])
