@@ -64,6 +64,7 @@ class Library:
             library is kept.
         include: Folders of headers. link: What the compiler is told behind the C, such as ``-lm``.
         vectors: Loops become instructions of this machine's processor that do several numbers at once.
+        flags: What the compiler is told of how much to optimize, such as ``-O3``; else little, what is LARGE less.
     """
 
     contents: tuple[str, ...]
@@ -71,6 +72,7 @@ class Library:
     include: tuple[str, ...] = ()
     link: tuple[str, ...] = ("-lm",)
     vectors: bool = False
+    flags: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -81,7 +83,8 @@ class Library:
         """
         machine = (platform.machine(), sys.platform, ca.__version__, str(LARGE))
         own = processor() if self.vectors else ()
-        return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, *own, *self.include, *self.link, *self.contents)
+        told = (*FLAGS, *own, *self.flags, *self.include, *self.link)
+        return cache.key_of(VERSION, *machine, *compiler(), *told, *self.contents)
 
 
 def code(functions: Iterable[Any], source: str = "") -> str:
@@ -214,7 +217,7 @@ def _compiled(text: str, library: Library, ask: Callable[[], Any], nice: int) ->
     if len(text) > MOST:
         raise CompilerError(f"{len(text)} characters of C are more than {MOST}")
     levels = ("-O2", "-O1") if library.vectors else ("-O1", "-O0")
-    speed = (levels[len(text) > LARGE], *(processor()[1:] if library.vectors else ()))
+    speed = (*(library.flags or (levels[len(text) > LARGE],)), *(processor()[1:] if library.vectors else ()))
     place = Path(tempfile.mkdtemp(prefix="selfmotion-"))
     process = None
     try:

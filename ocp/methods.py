@@ -67,8 +67,9 @@ def prepare(
         solver: ``ipopt``, ``native`` (fatrop from stage to stage through its C interface: built and solved in a time
             that grows with the intervals alone; needs a C compiler once a machine), ``fatrop`` (the same by CasADi's
             plugin, slow to build; takes no coupling of controls at the end) or ``sleqp`` (an active-set method, to
-            confirm a plan, started there). Where ``native`` cannot be had, or misses its tolerance, it is ipopt that
-            solves; ``Solution.solver`` says which did. For the indirect method, of the direct solution that seeds it.
+            confirm a plan, started there). Where ``native`` cannot be had, fails or misses its tolerance, it is ipopt
+            that solves; ``Solution.solver`` says which did. For the indirect method, of the direct solution that seeds
+            it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Whether the functions of the problem and their derivatives go through the machine's C compiler (that
             of the environment's CC, else cc), which makes solves several times faster and changes no number. What was

@@ -50,6 +50,12 @@ class Program:
         """The derivatives as arrays."""
         return Numbers(self)
 
+    @cached_property
+    def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each nonzero of the Jacobian."""
+        row, column = self.jacobian.sparsity_out(1).get_triplet()
+        return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
+
 
 class Numbers:
     """Values and derivatives of a program as arrays of numpy and scipy; those at the last point are kept.
@@ -111,7 +117,6 @@ class Written:
         self._indices = [
             tuple(np.array(part, dtype=np.int32) for part in (one.row(), one.colind())) for one in patterns
         ]
-        self._buffer, self._run = function.buffer()
 
     def __call__(self, *given: np.ndarray) -> list[Any]:
         """Its values: columns as arrays (n,), the others as matrices of their own.
@@ -119,14 +124,15 @@ class Written:
         Raises:
             RuntimeError: The function fails, as an integrator does.
         """
+        buffer, run = self._function.buffer()  # for this call: what it works in takes more memory than what it writes
         found = [np.zeros(size) for size in self._sizes]
         kept = [np.ascontiguousarray(each, dtype=float).ravel() for each in given]
         for i, each in enumerate(kept):
-            self._buffer.set_arg(i, each.data)
+            buffer.set_arg(i, each.data)
         for i, each in enumerate(found):
-            self._buffer.set_res(i, each.data)
-        self._run()
-        if self._buffer.ret():
+            buffer.set_res(i, each.data)
+        run()
+        if buffer.ret():
             raise RuntimeError(f"{self._function.name()} cannot be evaluated")
         return [
             whole(data, index[0], shape[0]) if shape[1] == 1 else sp.csc_array((data, *index), shape=shape)

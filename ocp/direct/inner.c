@@ -8,6 +8,7 @@
    w = (u, x): the values at the points of an interval and its end. Newton's method finds z at each w. With E = dz/dw
    = -D_z^-1 D_w a row r has the slope r_w + r_z E; with the multipliers -D_z^-T L_z of the inner rows the Lagrangian L
    no longer moves with z, and the curvature is that of L along (1, E). */
+#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -15,12 +16,12 @@
 #include "fatrop/ocp/OCPCInterface.h"
 
 #define VAST 1e20
-#define WILD 1e15 /* derivatives from which on nothing is sure */
-#define GROWTH 60 /* powers of ten along the horizon: their squares' squares overflow, and fatrop loops for ever */
+#define WILD (1 / DBL_EPSILON) /* derivatives beside which 1 is rounding */
+#define GROWTH (DBL_MAX_10_EXP / 4) /* powers of ten along the horizon: squares' squares overflow, fatrop loops for ever */
 #define SETTLED 1e-13 /* of the inner rows */
 #define ROUNDING 1e-9 /* below which inner rows that fall no more stand at their rounding */
-#define CHORDS 8      /* steps with the factors of an earlier point */
-#define STEPS 30      /* of Newton's method, and halvings of each */
+#define GAIN 0.1 /* of what is left, by each step with the factors of an earlier point: slower, and new ones are quicker */
+#define STEPS DBL_MANT_DIG /* of Newton's method, and halvings of each, whose last changes nothing */
 #define EXPORT __attribute__((visibility("default")))
 
 enum { VALUE, GRADIENT, JACOBIAN, HESSIAN, KINDS };
@@ -221,16 +222,15 @@ static int beside(program *s) {
       s->x[s->inner_variable[i]] = sum * s->a[s->inner_variable[i]];
     }
   }
-  for (count = 0; count < CHORDS; ++count) {
+  for (count = 0;; ++count) { /* what is left becomes nothing, or falls no more */
     double size = 0.0;
     rows_at(s, !count || !s->plain);
     for (k = 0; k < s->stages; ++k) size = fmax(size, size_of(s, k));
     if (settled(size, last)) return 1;
-    if (!(size < 0.3 * last)) return 0;
+    if (!(size < GAIN * last)) return 0;
     last = size;
     for (k = 0; k < s->stages; ++k) step(s, k);
   }
-  return 0;
 }
 
 /* Inner variables by Newton's method from the last ones that were found, each stage with a step of its own. */

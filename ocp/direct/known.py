@@ -20,7 +20,10 @@ __all__ = ["Known"]
 
 
 class Known:
-    """Which variables of a program are known in advance, and which rows only look at such."""
+    """Which variables of a program are known in advance, and which rows only look at such.
+
+    What is joined to a given variable, as the end of the last interval is to a given end, is known too.
+    """
 
     def __init__(self, form: Formulation, fragment: Fragment, program: Program) -> None:
         state = fragment.variable_role == "state"
@@ -31,12 +34,19 @@ class Known:
         self.declared = np.isin(
             fragment.row_bounds, np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
         )
-        rows, columns = program.jacobian.sparsity_out(1).get_triplet()
-        self.rows, self.columns = np.array(rows, dtype=int), np.array(columns, dtype=int)
+        self.rows, self.columns = program.jacobian_entries
+        # rows of two variables, linear, as those that join the end of an interval to the next node
+        linear, column, _ = fragment.linear
+        alike = [np.bincount(index, minlength=fragment.n_rows)[linear] == 2 for index in (linear, self.rows)]
+        both = np.flatnonzero(alike[0] & alike[1])
+        pairs = both[np.argsort(linear[both], kind="stable")].reshape(-1, 2)
+        self.joins, self.joined = linear[pairs[:, 0]], column[pairs]
 
     def relaxed(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Arguments of a solver without the limits that only look at what is known."""
         given = arguments["lbx"] == arguments["ubx"]
+        equal = arguments["lbg"][self.joins] == arguments["ubg"][self.joins]
+        given[self.joined[equal & given[self.joined].any(axis=1)]] = True
         unknown = ~(self.variables | given)
         idle = self.declared & (np.bincount(self.rows, unknown[self.columns], len(self.declared)) == 0)
         own = dict(arguments)

@@ -74,7 +74,7 @@ def library() -> Any:
             raise OSError(f"casadi brings no {name}")
     text = "\n".join(source.read_text(encoding="utf-8") for source in SOURCES)
     link = (f"-L{home}", "-lfatrop", "-l:libblasfeo.so", f"-Wl,-rpath,{home}", "-lm")
-    made = ctypes.CDLL(str(built(Library((text,), lambda: text, (str(home / "include"),), link))))
+    made = ctypes.CDLL(str(built(Library((text,), lambda: text, (str(home / "include"),), link, flags=("-O3",)))))
     address, number = ctypes.c_void_p, ctypes.c_int
     for name, result, given in (
         ("stages_create", address, [address]),
@@ -147,9 +147,11 @@ class _Kept:
 
     def entries(self, entries: Entries, stage: np.ndarray, stages: int) -> _Entries:
         """Entries in C, those of one stage after those of the other; ``stage`` of each."""
-        order = np.argsort(stage, kind="stable")
-        first = np.searchsorted(stage[order], np.arange(stages + 1))
-        return _Entries(self.keep(first), *(self.keep(part[order]) for part in entries))
+        if np.any(np.diff(stage) < 0):
+            order = np.argsort(stage, kind="stable")
+            stage, entries = stage[order], entries.select(order)
+        first = np.searchsorted(stage, np.arange(stages + 1))
+        return _Entries(self.keep(first), *(self.keep(part) for part in entries))
 
 
 # ---- the solver --------------------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ from ocp.errors import (
     NOT_NUMBERS,
     Interrupted,
     ProblemError,
+    SolveError,
     about,
     checked_choice,
     checked_count,
@@ -277,6 +278,8 @@ class Prepared:
         Raises:
             ProblemError: Wrong arguments. SolveError: There is no plan, and why.
         """
+        if "_plain" in self.__dict__ and tighter is None and self._plain._fits(guess):
+            return self._plain.solve(parameters, guess, check, None, time_limit, shift=shift)
         ahead = checked_count("solve: shift", shift, least=0, most=self.method.intervals - 1)
         if ahead and not (self._fits(guess) and self.method.mesh is None):
             words = "solve: shift asks for a plan of this very problem, method and mesh, of equal intervals, as guess"
@@ -330,7 +333,9 @@ class Prepared:
             point = guess.variables[later(fragment, ahead)[0]]
         told = names_told(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
-        if self.solver_name == "native":
+        if self.solver_name == "native" and not self._is_enough(first):
+            if tighter is None:
+                return self._handed_over(first, parameters, self._moved(point, p) if ahead else guess, check)
             first = self._confirmed(first, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
@@ -382,13 +387,38 @@ class Prepared:
             "ubg": upper[fragment.row_bounds],
         }
 
+    def _is_enough(self, first: Attempt) -> bool:
+        """Whether native met its tolerance, or ended as it was asked to."""
+        status = first.outcome.status
+        asked = "max_iter" in self._own_options and status.startswith("Maximum_Iterations_Exceeded")
+        return status == "Solve_Succeeded" or status.startswith(OUT_OF_TIME) or asked
+
+    @cached_property
+    def _plain(self) -> Prepared:
+        """The same for ipopt, without stages, of which it would have more variables and take more iterations."""
+        options = {name: value for name, value in self._own_options.items() if name in COMMON}
+        return Prepared(self.problem, self.method, "ipopt", options, self._made_of[4], self._scaling)
+
+    def _moved(self, point: np.ndarray, p: np.ndarray) -> Solution:
+        """A start of this program as a guess for any."""
+        cost, rows = self.program.numbers.values(point, p)
+        return self._solution(Outcome(point, cost, rows, np.zeros(rows.shape), False, "", 0, 0.0), p, GUESS)
+
+    def _handed_over(self, first: Attempt, parameters: ByName, guess: Guess, check: bool) -> Solution:
+        """What ipopt finds; what native did, where that is a plan and ipopt finds none."""
+        try:
+            found = self._plain.solve(parameters, guess, check)
+        except SolveError:
+            if first.found is None:
+                raise
+            return first.found
+        if first.found is not None and not found.success:
+            return first.found
+        seconds = {"build": self.seconds, "solve": first.outcome.seconds + found.seconds["solve"]}
+        return dataclasses.replace(found, seconds=seconds)
+
     def _confirmed(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> Attempt:
-        """What native found; where it missed its tolerance or failed, what ipopt finds from the same start."""
-        outcome = first.outcome
-        out_of_time = outcome.status.startswith(OUT_OF_TIME)
-        asked = "max_iter" in self._own_options and outcome.status.startswith("Maximum_Iterations_Exceeded")
-        if outcome.status == "Solve_Succeeded" or out_of_time or asked:
-            return first
+        """What ipopt finds from the same start with bounds of this very program; what native did, where that is all."""
         second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
         return second if second.found is not None or first.found is None else first
 

@@ -98,22 +98,21 @@ class Pattern:
     Attributes:
         rows, columns: Of the nonzeros of the Jacobian. to, source: Of each the state whose rate the row is, and the
             entry of (states, controls) that it is derived in; -1 where there is none, or it is the state itself.
-        width: Of the interval of each, as a fraction. label: A number for the label of each row.
+        width: Of the interval of each row, as a fraction. label: A number for the label of each.
     """
 
     def __init__(self, form: Formulation, fragment: Fragment, program: Program) -> None:
         self.form, self.fragment, self.program = form, fragment, program
-        rows, columns = (np.array(part, dtype=int) for part in program.jacobian.sparsity_out(1).get_triplet())
-        self.rows, self.columns = rows, columns
+        self.rows, self.columns = rows, columns = program.jacobian_entries
         kinds = ("dynamics", "continuity")
         states = {f"{kind} of {label}": i for kind in kinds for i, label in enumerate(form.state_labels)}
-        owner = np.array([states.get(label, -1) for label in fragment.row_labels])
+        owner = np.array([states.get(label, -1) for label in fragment.row_labels], dtype=np.int32)
         to = np.where(fragment.row_bounds == form.bounds.places["zero"][0], owner, -1)[rows]
         role = fragment.variable_role[columns]
         source = fragment.variable_entry[columns] + np.where(role == "control", form.nx, 0)
         inner = (to >= 0) & ((role == "state") | (role == "control")) & (to != source)
-        self.to, self.source = np.where(inner, to, -1), np.where(inner, source, -1)
-        self.width = np.diff(fragment.mesh)[np.clip(fragment.row_stages[rows], 0, len(fragment.mesh) - 2)]
+        self.to, self.source = (np.where(inner, each, -1).astype(np.int32) for each in (to, source))
+        self.width = np.diff(fragment.mesh)[np.clip(fragment.row_stages, 0, len(fragment.mesh) - 2)]
         _, self.label = np.unique(fragment.row_labels, return_inverse=True)
 
 
@@ -215,7 +214,8 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
         entries = np.abs(slopes[1].data)
         keep = (pattern.to >= 0) & np.isfinite(entries) & (entries > 0)
         # a row sees the rate over its interval
-        np.maximum.at(found, (pattern.to[keep], pattern.source[keep]), entries[keep] / pattern.width[keep])
+        width = pattern.width[pattern.rows[keep]]
+        np.maximum.at(found, (pattern.to[keep], pattern.source[keep]), entries[keep] / width)
     return found
 
 

@@ -124,16 +124,16 @@ class Tables:
             counts = [count + size for count, size in zip(counts, sizes, strict=True)]
         self.counts = counts
         nothing = np.zeros(0, dtype=int)
-        self.value_row = np.concatenate([nothing, *value_rows])
-        self.slope_of = np.concatenate([nothing, *slope_of])
+        self.value_row = np.concatenate([nothing, *value_rows], dtype=np.int32)
+        self.slope_of = np.concatenate([nothing, *slope_of], dtype=np.int32)
         at, column, _ = self.fragment.linear
-        row = np.concatenate([nothing, *(a for a, _ in jac), at])
-        where = np.concatenate([nothing, *(b for _, b in jac), column])
-        self.jacobian = Entries(row, where, np.arange(row.size))
-        upper = np.concatenate([nothing, *(at[0] for at, _ in hess)])
-        lower = np.concatenate([nothing, *(at[1] for at, _ in hess)])
+        row = np.concatenate([nothing, *(a for a, _ in jac), at], dtype=np.int32)
+        where = np.concatenate([nothing, *(b for _, b in jac), column], dtype=np.int32)
+        self.jacobian = Entries(row, where, np.arange(row.size, dtype=np.int32))
+        upper = np.concatenate([nothing, *(at[0] for at, _ in hess)], dtype=np.int32)
+        lower = np.concatenate([nothing, *(at[1] for at, _ in hess)], dtype=np.int32)
         doubled = np.concatenate([np.zeros(0), *(twice for _, twice in hess)])
         by_stage = np.argsort(self.stage[upper], kind="stable")
-        self.hessian = Entries(upper, lower, np.arange(upper.size)).select(by_stage)
+        self.hessian = Entries(upper, lower, np.arange(upper.size, dtype=np.int32)).select(by_stage)
         # what stands for both its mirror images on the diagonal comes twice
         self.half = np.where((upper == lower) & (doubled == 1.0), 0.5, 1.0)[by_stage]

@@ -99,7 +99,7 @@ def cases() -> list[tuple[str, Problem, Any]]:
 def again(name: str, problem: Problem, method: Any, repeats: int) -> dict[str, Any]:
     """One row: a solve from an earlier plan, by IPOPT interpreted from its values, and from its limits; native cold."""
     loose = {"limit": 50.0}
-    plain, ipopt = prepare(problem, method, compiled=False), prepare(problem, method, compiled=True)
+    plain, ipopt = (prepare(problem, method, solver="ipopt", compiled=how) for how in (False, True))
     native = prepare(problem, method, solver="native", compiled=True)
     free = ipopt.solve(loose)
     near, then = ({"limit": float(-share * free["rates"][:, LIMITED].min())} for share in (0.95, 0.949))

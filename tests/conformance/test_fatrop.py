@@ -36,7 +36,9 @@ every_run = pytest.mark.parametrize(
 def solved(case: Case, run: Run) -> tuple[Solution, Solution]:
     """By IPOPT, by fatrop."""
     problem = case.build()
-    return solve(problem, run.method), solve(problem, run.method, solver="fatrop")
+    by = ("ipopt", "fatrop")
+    a, b = (solve(problem, run.method, solver=solver) for solver in by)
+    return a, b
 
 
 @every_run

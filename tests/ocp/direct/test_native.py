@@ -237,9 +237,15 @@ def test_ipopt_takes_over_by_name_where_the_tolerance_is_missed() -> None:
     problem.dynamics(v, u)
     problem.horizon(1.0)
     problem.minimize(running=u**2 / 2)
-    plan = solve(problem, Collocation(12), solver="native")
+    prepared = built(problem, Collocation(12))
+    plan, alone = prepared.solve(), solve(problem, Collocation(12))
     assert plan.solver == "ipopt"
     assert plan.cost == pytest.approx(4.0, abs=2e-3)
+    # by the program that ipopt has alone, not by that of the stages
+    assert plan.iterations == alone.iterations
+    np.testing.assert_array_equal(plan.variables, alone.variables)
+    assert prepared.solve(guess=plan).cost == pytest.approx(plan.cost, rel=1e-9)
+    assert prepared.solve(guess=plan, shift=2).success
 
 
 def test_more_equalities_in_a_stage_than_variables_are_refused_and_do_not_end_the_process() -> None:
