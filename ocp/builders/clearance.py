@@ -31,12 +31,12 @@ from ocp.problem.values import constant
 from ocp.solution import Solution
 
 __all__ = [
-    "CLEARANCE", "LOOKS", "MARGIN", "ROUNDING", "Clear", "Keeping", "Kept", "clearance_of", "keeping_clear",
+    "APART", "CLEARANCE", "LOOKS", "MARGIN", "ROUNDING", "Clear", "Keeping", "Kept", "clearance_of", "keeping_clear",
     "of_clearance", "touching_error", "widened",
 ]  # fmt: skip
 
-CLEARANCE = "clearance"
-"""Name of what the audit proves, and of the constraints, with the suffix of a stretch of time."""
+CLEARANCE, APART = "clearance", "apart"
+"""Names of what the audit proves, and of the constraints, with the suffix of a stretch of time."""
 ROUNDING = 3e-3
 """m: of the distances that are held."""
 LOOKS = 6
@@ -137,7 +137,7 @@ class Clear:
             pairs = sorted(self.margins)
             apart = _said(partial(around.distances, pairs=pairs, rounding=ROUNDING), base, joints, time)
             least = [around.clearance + self.margins[pair] for pair in pairs]
-            problem.path(f"apart{suffix}", apart, lower=least, unit="m")
+            problem.path(f"{APART}{suffix}", apart, lower=least, unit="m")
 
     def touches(self, base: Array, joints: Array, times: Array) -> list[Touch]:
         """The pairs that come nearer than they may at some samples of a motion, see `ocp.local.touching.touches`."""

@@ -21,7 +21,7 @@ from models.shapes.distance import distance
 from models.shapes.rigid_parts import RigidParts
 from models.spatial import Frame
 from ocp.audit.clearance import Clearance
-from ocp.builders.clearance import CLEARANCE, MARGIN, ROUNDING, widened
+from ocp.builders.clearance import APART, CLEARANCE, MARGIN, ROUNDING, widened
 from ocp.errors import ProblemError, checked_nonnegative
 from ocp.local.touching import hulls_of
 from ocp.problem.hulls import Hull
@@ -103,7 +103,7 @@ class ClearOfTarget:
         if self.margins:
             held = sorted(self.margins)
             least = [around.clearance + self.margins[pair] for pair in held]
-            problem.path("apart", self._distances(own, placed, held, ROUNDING), lower=least, unit="m")
+            problem.path(APART, self._distances(own, placed, held, ROUNDING), lower=least, unit="m")
 
     def require_room(self, base: Any, joints: Any, goal: Any) -> None:
         """Raise where bodies are nearer than they may be at the start already.

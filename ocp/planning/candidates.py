@@ -12,7 +12,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.audit.audit import Audit, Finding
-from ocp.builders.clearance import LOOKS, Clear
+from ocp.builders.clearance import APART, LOOKS, Clear
 from ocp.builders.tool_motion import CLOCK, ToolMotion, tool_motion_problem
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
@@ -23,6 +23,7 @@ from ocp.local.touching import Touch
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
 from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, misfits_of
+from ocp.problem.values import constant
 from ocp.refinement import refine, split
 from ocp.solution import Solution
 
@@ -44,7 +45,7 @@ LOOKED_AT = 33
 """Places at which motions are compared."""
 PLACES = 16
 """Of each interval, at which it is looked for."""
-APART = 24
+HELD = 24
 """Intervals of a coarse mesh on which bodies are held apart, where its pieces are fewer."""
 MESHES, PIECES = 6, 4
 """Meshes, each cut where the tips stray from the one before, into so many pieces of an interval at most."""
@@ -63,6 +64,8 @@ FAR = 10.0
 SOLVER = {"max_iter": 150}
 ROUGH = {"max_iter": 60, "tol": 1e-4, "mu_init": 1e-3}
 """On the coarse mesh, from a guess that does its tasks."""
+OWN_BARRIER, LEAST_BARRIER = 0.1, 1e-10
+"""With which ipopt begins by itself, and its tolerance, at which it ends."""
 
 TOUCHES = "touches"
 """How the reason begins why a motion is not the plan whose bodies come too near."""
@@ -76,6 +79,25 @@ def _mesh(motion: ToolMotion, degree: int, least: int) -> Collocation:
 
 def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:
     return mesh.with_mesh(solution.state_interpolant.breaks)
+
+
+def _options(motion: ToolMotion, mesh: Collocation, cost: float, options: dict[str, Any]) -> dict[str, Any]:
+    """Options of a solve with bodies held apart from a motion of some cost: no barrier that is worth more than that.
+
+    An interior-point method with a barrier mu goes to where the cost is above the least by mu for each limit (Boyd,
+    Vandenberghe 2004, section 11.2.2). Where that is more than the whole cost of the motion that it begins from, the
+    barrier alone says where it goes: far away from the bodies, on the other side of others.
+    """
+    declared = motion.problem.declared
+    if not any(name.startswith(APART) for name in declared.path) or not NOTHING * motion.horizon < cost < np.inf:
+        return options
+    limits = [(each.lower, each.upper) for each in (*declared.states.values(), *declared.controls.values())]
+    limits += [(each.lower, each.upper) for each in declared.path.values()]
+    sides = 0
+    for low, high in ((constant(low), constant(high)) for low, high in limits):
+        sides += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
+    most = cost / (sides * mesh.intervals * mesh.degree)
+    return {**options, "mu_init": max(min(options.get("mu_init", OWN_BARRIER), most), LEAST_BARRIER)}
 
 
 def _failing(audit: Audit) -> list[Finding]:
@@ -106,9 +128,8 @@ def coarse_motions(
         if costs[number] > FAR * least:
             found.append(Candidate(joints, float(costs[number]), "far dearer by its local motion"))
             continue
-        guess = motion.guess(followed, number)
-        maker.guesses[tuple(joints)] = number, guess
-        solution = prepared.solve(guess=guess, check=False)
+        maker.followed[tuple(joints)] = [part.of(slice(number, number + 1)) for part in followed]
+        solution = prepared.solve(guess=motion.guess(followed, number), check=False)
         if solution.success:
             least = min(least, solution.cost)
             found.append(Candidate(joints, solution.cost, "", solution))
@@ -151,8 +172,7 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool
     With `every` of a number of those, too, that are dearer than one that passes; of those that become one, one is told.
 
     Of one that touches something, the bodies that touch are held apart on the coarse mesh first: that may cost more
-    than another motion does. Where none is left, postures that lead to one motion without obstacles are told apart:
-    held apart, from their own local motions, they may pass on other sides.
+    than another motion does. Where none is left, each posture's own local motion is gone on from, see `_other_sides`.
     """
     told = [one for one in coarse if one.why and one.why != ALIKE]
     alike = [one for one in coarse if one.why == ALIKE]
@@ -200,24 +220,34 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool
                 least = min(least, solved.cost)
                 break
     if failures and not np.isfinite(least):
-        told += _other_sides(maker, alike)
+        told = _once_each(told + _other_sides(maker, coarse))
     named = {tuple(one.start) for one in told}
     return told + [replace(one, solution=None) for one in alike if tuple(one.start) not in named]
 
 
-def _other_sides(maker: Maker, alike: list[Candidate]) -> list[Candidate]:
-    """What becomes of postures that lead to motions known to touch, each from its own local motion; ends with one."""
+def _once_each(told: list[Candidate]) -> list[Candidate]:
+    """Of what is told of one posture the last."""
+    return list({tuple(one.start): one for one in told}.values())
+
+
+def _other_sides(maker: Maker, coarse: list[Candidate]) -> list[Candidate]:
+    """What becomes of postures whose motions touch, each from its own local motion; ends with one that passes.
+
+    Where nothing is in the way postures slide along their self-motion into one motion, however clear they were. Their
+    local motions pass on other sides; those that are clear, or nearest to it, are gone on from first.
+    """
     told: list[Candidate] = []
     clear = maker.asked.clear
     assert clear is not None
-    for one in sorted(alike, key=lambda one: maker.guesses[tuple(one.start)][0]):
-        if len(told) == FAILURES:
+    ways = [(one, maker.local_touches(one.start)) for one in coarse if maker.touches(one.solution)]
+    ways.sort(key=lambda way: min((touch.distance for touch in way[1]), default=np.inf), reverse=True)
+    for one, local in ways[:FAILURES]:
+        pairs = {touch.pair: touch for touch in (*maker.touches(one.solution), *local)}
+        guess = maker.motion.guess(maker.followed[tuple(one.start)], 0)
+        bent, held = maker.bent(one, clear, list(pairs.values()), guess)
+        told.append(bent if bent.why else maker.solved(one.start, bent.solution, clear=held))
+        if not told[-1].why:
             break
-        if touching := maker.touches(one.solution):
-            bent, held = maker.bent(one, clear, touching, maker.guesses[tuple(one.start)][1])
-            told.append(bent if bent.why else maker.solved(one.start, bent.solution, clear=held))
-            if not told[-1].why:
-                break
     return told
 
 
@@ -226,8 +256,7 @@ class Maker:
 
     def __init__(self, asked: Asked, start: Array, reference: Array) -> None:
         self.asked, self.start, self.reference = asked, start, reference
-        self.free = bool(np.isnan(start).any())
-        self.guesses: dict[tuple[float, ...], tuple[int, Any]] = {}  # by postures: their places, the local motions
+        self.followed: dict[tuple[float, ...], list[Followed]] = {}  # by postures: their local motions
         self.brief = False  # whether what finer meshes do not bring to its way is given up, for there are others
         self._barred: dict[float, str] = {}
         self._made: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
@@ -250,15 +279,30 @@ class Maker:
             clear=clear,
         )
 
-    def made(self, clear: Clear | None, fine: bool) -> tuple[ToolMotion, Collocation, Prepared]:
-        """The problem with some bodies held apart, a mesh for it, and both prepared."""
+    def made(self, clear: Clear | None, fine: bool, cost: float = np.inf) -> tuple[ToolMotion, Collocation, Prepared]:
+        """The problem with some bodies held apart, a mesh for it, and both prepared for guesses of about a cost."""
         held = () if clear is None else tuple(sorted(clear.margins.items()))
         if (held, fine) not in self._made:
-            motion = self.declared(self.start, clear) if held else self.motion
-            mesh = _mesh(motion, FINE if fine else COARSE, APART if held and not fine else LEAST_INTERVALS)
-            prepared = mesh.prepare(motion.problem, options=SOLVER if fine else ROUGH)
+            motion = self.declared(self._start(clear), clear) if held else self.motion
+            mesh = _mesh(motion, FINE if fine else COARSE, HELD if held and not fine else LEAST_INTERVALS)
+            prepared = mesh.prepare(motion.problem, options=_options(motion, mesh, cost, SOLVER if fine else ROUGH))
             self._made[held, fine] = motion, mesh, prepared
         return self._made[held, fine]
+
+    def _start(self, clear: Clear | None) -> Array:
+        """Joints at the start, nan where they are free: what bodies that are held apart ride on is not ignorable."""
+        if clear is None or not clear.margins or self.asked.start is not None:
+            return self.start
+        moves = clear.surroundings.levers.joints[sorted(clear.margins)].any(axis=0)
+        return np.where(moves, np.nan, self.start)
+
+    def local_touches(self, start: Array) -> list[Touch]:
+        """The bodies that come too near in the local motion from a posture, the worst first."""
+        clear, found = self.asked.clear, list[Touch]()
+        if clear is not None:
+            for part in self.followed[tuple(start)]:
+                found += clear.touches(part.base[0], part.joints[0], part.t)
+        return sorted(found, key=lambda touch: touch.distance)
 
     def touches(self, solution: Solution | None) -> list[Touch]:
         """The bodies that come too near in a motion, at the places where that is looked for."""
@@ -298,7 +342,7 @@ class Maker:
         """A motion on the coarse mesh with what touches held apart, one pair after the other, or why there is none."""
         for _ in range(LOOKS):
             clear = clear.holding([touch.pair for touch in touching])
-            solution = self.made(clear, fine=False)[2].solve(guess=guess, check=False)
+            solution = self.made(clear, fine=False, cost=candidate.cost)[2].solve(guess=guess, check=False)
             if not solution.success:
                 why = f"{TOUCHES}: {touching[0]}; held apart, no motion was found"
                 return replace(candidate, why=why, solution=None), clear
@@ -313,15 +357,24 @@ class Maker:
     ) -> Candidate:
         """A motion from a guess, and what is wrong with it; with `thorough` from other starts, too, and why if none.
 
-        Bodies that come too near are held apart, farther each time, and it is solved again. What does not cost less
-        than `most` is not looked at any further.
+        Bodies that come too near are held apart, farther each time, and it is solved again, over the coarse mesh where
+        it is not found otherwise. What does not cost less than `most` is not looked at any further.
         """
         touch, apart = "", clear or self.asked.clear
+        touched: Candidate | None = None
         for _ in range(LOOKS):
             candidate, farther = self._solved(start, guess, thorough, apart, most)
-            if farther is None:
+            if farther is not None:
+                touch, apart, guess, touched = candidate.why, farther, candidate.solution, candidate
+                continue
+            if touched is None or apart is None or not np.isnan(candidate.cost):
                 break
-            touch, apart, guess = candidate.why, farther, candidate.solution
+            if not (touching := self.touches(touched.solution)):
+                break
+            bent, apart = self.bent(touched, apart, touching, touched.solution)  # over a coarse mesh it may be found
+            if bent.why:
+                break
+            guess, touched = bent.solution, None
         if touch and candidate.why and not candidate.why.startswith(touch):
             candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}")
         return candidate
@@ -334,7 +387,8 @@ class Maker:
         Where many starts do equally well, no one of them is decided to be the best; then the motion is judged from the
         start that was found.
         """
-        motion, mesh, prepared = self.made(clear, fine=True)
+        cost = guess.cost if isinstance(guess, Solution) else np.inf
+        motion, mesh, prepared = self.made(clear, fine=True, cost=cost)
         try:
             named = clear is not None and bool(clear.margins)  # then what is in the way is named already
             solution = prepared.solve(guess=guess, check=thorough and not named)
@@ -347,10 +401,12 @@ class Maker:
                 apart = clear.holding([touch.pair for touch in touching])
                 return Candidate(start, solution.cost, f"{TOUCHES}: {touching[0]}", solution), apart
             solution, audit = self._audited(motion, mesh, solution)
-            if self.free and audit.feasible and audit.optimal is None:
+            if np.isnan(self._start(clear)).any() and audit.feasible and audit.optimal is None:
                 first = solution[f"joints{motion.stretches[0].suffix}"][0]
                 held = self.declared(first, clear)
-                again, other = self._audited(held, mesh, solve(held.problem, _mesh_of(mesh, solution), guess=solution))
+                same = _mesh_of(mesh, solution)
+                options = _options(held, same, solution.cost, {})
+                again, other = self._audited(held, mesh, solve(held.problem, same, guess=solution, options=options))
                 if other.passed and again.cost <= solution.cost * (1 + SAME) + NOTHING * motion.horizon:
                     solution, audit = again, other
         except SolveError as error:
@@ -378,7 +434,9 @@ class Maker:
         if _failing(audit):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RefinementWarning)
-                solution = refine(motion.problem, _mesh_of(mesh, solution), guess=solution, options=SOLVER)
+                same = _mesh_of(mesh, solution)
+                options = _options(motion, same, solution.cost, SOLVER)
+                solution = refine(motion.problem, same, guess=solution, options=options)
             audit = solution.audit()
             if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution)) is not solution:
                 solution, audit = finer, finer.audit()
@@ -391,10 +449,12 @@ class Maker:
             if strays.max() <= TIP:
                 break
             # where something binds or lets go it is smooth to the second order
-            finer = np.ceil(np.sqrt(strays / TIP)).clip(2, PIECES).astype(int)
-            pieces = np.where(strays > TIP / len(strays), finer, 1)
+            more = np.ceil(np.sqrt(strays / TIP)).clip(2, PIECES).astype(int)
+            pieces = np.where(strays > TIP / len(strays), more, 1)
             cut = split(solution.state_interpolant.breaks, pieces, strays, MOST)
-            found = solve(motion.problem, mesh.with_mesh(cut), guess=solution, options=SOLVER)
+            finer = mesh.with_mesh(cut)
+            options = _options(motion, finer, solution.cost, SOLVER)
+            found = solve(motion.problem, finer, guess=solution, options=options)
             before, strays = strays.max(), self._strays(motion, found)
             if strays.max() > max(OUT_OF_REACH, NEARER * before):
                 break

@@ -31,6 +31,8 @@ __all__ = ["Demand", "driven_plan", "limits_drives", "without_drives"]
 DRIVES = ("acceleration", "jerk", "torque", "power")
 LOOKED_AT = 2001
 """Times at which it is looked what a motion takes, and fractions of a guess."""
+SAME_PLACE = 1e-9
+"""rad or m: of a joint where it is held."""
 SAME = 1e-5
 """Share of its cost by which a motion without the limits may be dearer than one within them, and become cheaper."""
 
@@ -156,6 +158,10 @@ def _brief(error: SolveError) -> str:
 def _solved(asked: Asked, start: Array | None, reference: Array, moved: Plan, limits: Limits) -> Solution:
     """A motion within the limits, from one without; judged from its own start where many are as good."""
     bounds = limits.bounds(asked.machine)
+    if (
+        asked.start is None and start is not None
+    ):  # what it began elsewhere with is not ignorable: bodies are held apart
+        start = np.where(np.abs(moved.at(0.0)["joints"] - start) <= SAME_PLACE, start, np.nan)
 
     def declared(begin: Array | None, clear: Clear | None) -> ToolMotion:
         return tool_motion_problem(

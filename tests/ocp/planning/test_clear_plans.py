@@ -42,6 +42,8 @@ from ocp import (
     solve,
 )
 from ocp.local.touching import distances_along
+from ocp.planning.candidates import Maker
+from ocp.planning.planner import checked_asked
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.planning.motions import DOWN, bent_seam
 from tests.ocp.planning.test_charts import planar
@@ -156,6 +158,42 @@ def test_what_no_task_moves_stands_in_the_middle_of_its_range_or_where_it_is_cle
     assert abs(beside.at(0.0)["joints"][place] - 0.5) > 0.3
     assert least_apart(beside, [ball]) >= 0
     assert_allclose(beside.cost, free.cost, rtol=1e-6)
+
+
+def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> None:
+    """A flag in the way of a planar arm, clear of it at the start alone: turned aside before, it costs nothing."""
+    arm = planar(np.array([0.4, 0.3, 0.3])).robot
+    pole = CollisionShape("capsule", (0.03, 0.2), translation=(0, 0.15, 0), rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    ball = CollisionShape("sphere", (0.04,))
+    links = tuple(link if link.name == "base" else replace(link, collisions=(ball,)) for link in arm.links)
+    flag = Joint(
+        "flag", "revolute", "base", "pole", (0.35, 0.1, 0), axis=(0, 0, 1), lower=-3.0, upper=3.0, velocity=1.0
+    )
+    robot = Robot((*links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
+    task = TipTask(position=lambda t: [0.6 - 0.2 * t, 0.25], rows=[3, 4], duration=1.0)
+    bare, clear = (plan(FixedBase(robot), task, clearance=each) for each in (None, 0.01))
+    place = robot.joint_names.index("flag")
+    assert bare.at(0.0)["joints"][place] == 0
+    assert least_apart(bare, ()) < 0
+    assert least_apart(clear, ()) >= 0.01 - 1e-6
+    assert abs(clear.at(0.0)["joints"][place]) > 0.2
+    assert_allclose(clear.cost, bare.cost, rtol=1e-4)
+
+
+def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
+    """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
+    around = Surroundings(ARM, [POST])
+    asked = checked_asked(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
+    maker = Maker(replace(asked, clear=Clear(around)), START, START)
+    pair = around.labels.index(("link6", "obstacle 0"))
+    cost = 0.25
+    prepared = maker.made(Clear(around).holding([pair]), fine=False, cost=cost)[2]
+    bounds = prepared.formulation.bound_values(np.zeros(0))
+    places = [getattr(prepared.fragment, f"{of}_bounds") for of in ("variable", "row")]
+    free = [np.isfinite(side[at][bounds[0][at] < bounds[1][at]]).sum() for at in places for side in bounds]
+    begins = prepared._own_options["mu_init"]
+    assert_allclose(begins * sum(free), cost, rtol=0.05)  # the nodes at which the motion begins aside
+    assert "mu_init" not in maker.made(None, fine=True)[2]._own_options
 
 
 def space_arm(panel: bool) -> FreeFloating:
