@@ -116,9 +116,13 @@ def _tightened(
         # as in the secant method, each bound by itself; one that its neighbours moved says nothing
         share = (before - beyond) / np.where(move > 0, move, np.inf)
         followed = np.where((beyond > 0) & (share > LEAST_SHARE), np.minimum(share, 1.0), followed)
-        drawn_before, before, guess = drawn, beyond, solution
-        drawn = np.minimum(drawn + np.where(beyond > tolerance / 2, beyond / followed, 0.0), most)
-        move = drawn - drawn_before
+        before, guess = beyond, solution
+        # a bound that no point of an interval stands at is first drawn in as far as they are away from it
+        rows = prepared.program.numbers.values(solution.variables, p)[1]
+        room = _room({"x": solution.variables, "g": rows}, places, low, high, drawn.shape)
+        stands = np.clip(np.where(np.isfinite(room), room, 0.0), drawn, most)
+        move = np.minimum(np.where(beyond > tolerance / 2, beyond / followed, 0.0), most - stands)
+        drawn = np.where(move > 0, stands + move, drawn)
     told = f"problem {form.name!r}: after {MOST_ROUNDS} rounds {remains}; take more intervals"
     raise SolveError(told, solution, limit=tolerance, **details)
 
@@ -165,6 +169,24 @@ def _places(
         own = left if kind == "x" else np.clip(fragment.row_stages, 0, last)
         entry = entry_of[index]
         found[kind] = entry, np.where(alone[entry], own, left), np.where(alone[entry], own, right)
+    return found
+
+
+def _room(
+    values: dict[str, np.ndarray],
+    places: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    low: np.ndarray,
+    high: np.ndarray,
+    shape: tuple[int, ...],
+) -> np.ndarray:
+    """How near the points of every interval come to the bounds below and above, (2, N, m); inf without a point."""
+    found = np.full(shape, np.inf)
+    for kind, (entry, left, right) in places.items():
+        given = entry >= 0
+        at, value = entry[given], values[kind][given]
+        for side, away in enumerate((value - low[at], high[at] - value)):
+            for interval in (left, right):
+                np.minimum.at(found[side], (interval[given], at), away)
     return found
 
 

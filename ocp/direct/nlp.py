@@ -37,6 +37,8 @@ IPOPT = {
     "max_iter": 1000,
     "bound_relax_factor": 0.0,
     "honor_original_bounds": "yes",
+    # the order that MUMPS chooses itself takes up to ten times as long where phases are joined
+    "mumps_pivot_order": 0,
     # MUMPS' own 1e-6 loses the sign of eigenvalues on spatial machines, for which IPOPT then regularises
     "mumps_pivtol": 1e-3,
     "print_level": 0,

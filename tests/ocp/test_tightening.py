@@ -119,6 +119,30 @@ def test_few_solves_are_enough(method: Any, monkeypatch: pytest.MonkeyPatch) -> 
     assert len(solved) <= 4
 
 
+def test_a_limit_that_no_point_stands_at_is_drawn_in_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gate so narrow that all points have 0.2 of room: straight on the way would pass 0.01 beyond it."""
+    problem = Problem("gate")
+    x, u = problem.state("x", initial=0.0, terminal=1.0), problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    gate = 0.21 * ca.exp(-(((problem.time - 0.365) / 0.014) ** 2))
+    problem.path("gate", x - problem.time + gate, upper=0.2)
+    problem.minimize(running=u**2)
+    solves = []
+    run = Prepared.solve
+
+    def counted(*args: Any, **named: Any) -> Solution:
+        solves.append(run(*args, **named))
+        return solves[-1]
+
+    monkeypatch.setattr(Prepared, "solve", counted)
+    tight = tighten(problem, Collocation(5, degree=3))
+    t = np.linspace(0.3, 0.43, 1301)
+    room = 0.2 - 0.21 * np.exp(-(((t - 0.365) / 0.014) ** 2)) - (tight.at_fraction(t)["x"].ravel() - t)
+    assert -1e-5 <= room.min() < 2e-3
+    assert len(solves) <= 5
+
+
 def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
     drawn = np.zeros((2, 3, 1))
     drawn[0, :, 0], drawn[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]

@@ -102,7 +102,7 @@ def steps_problem(
         start_joints: In the robot's order, with the feet on their footholds; `standing_posture` finds some. (n,).
         balance: "static" asks for "balance" all the way; not in stances with a grip.
         margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m.
-        clearance: Height of a sole above the ground in the middle of its way, m; 16 s^2 (1 - s)^2 of it at the share s.
+        clearance: Height of a sole above the ground in the middle of its way, m; 64 s^3 (1 - s)^3 of it at the share s.
         weights: Of the parts of the cost.
         limits: Of joints and ground. `vertical_force` is the least of any sole that is held, N; nothing if None.
 
@@ -269,7 +269,7 @@ def _swing(
     if foot.sole is not None and swing.lifted is not None:
         before = float(np.asarray(swing.lifted.position)[2])
         after = before if swing.landing is None else float(np.asarray(swing.landing.position)[2])
-        way = 16 * (share * (1 - share)) ** 2 if swing.landing is not None else share**2 * (3 - 2 * share)
+        way = 64 * (share * (1 - share)) ** 3 if swing.landing is not None else share**2 * (3 - 2 * share)
         ground = before + (after - before) * share
         least = clearance * ((1 + GRAZED) * way - GRAZED)
         heights = stance.sole_corners(swing.name, joints)[2, :].T - ground - least
