@@ -156,6 +156,17 @@ def test_the_overhang_is_the_farthest_point_from_the_hull() -> None:
         assert each.overhang >= 0.9 * distances.max()
 
 
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (3.0, -2.0, 5.0), (-4.0, -4.0, -4.0)])
+def test_what_lies_within_the_hull_does_not_stand_out_of_it(shift: tuple[float, float, float]) -> None:
+    """Of capsules from the middle of a cube of 2 m on, one that ends in it, and two beyond a face by 0.1 m and 3 m."""
+    cube = convex_hull(np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T + shift)
+    triangles = cube.vertices[cube.faces]
+    for beyond, out in ((0.3, 0.0), (0.8, 0.1), (3.7, 3.0)):
+        for axis in np.vstack([np.eye(3), -np.eye(3)]):
+            found = covering._overhang(Capsule(0.3, shift, shift + beyond * axis), triangles)
+            assert 0.9 * out <= found <= out + 1e-12
+
+
 def test_flat_and_tiny_meshes_are_covered() -> None:
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

@@ -93,7 +93,7 @@ def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() ->
 @pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])
 def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
     """From the least that is asked for up to the distance; what is nearer is exact."""
-    around = Surroundings(machines()["slider"], (*OBSTACLES, MOVING))
+    around = Surroundings(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
     base, joints = postures(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
     found = distances_along(around, base, joints, TIMES, near)
