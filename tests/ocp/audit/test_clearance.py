@@ -90,6 +90,16 @@ def test_the_nearest_two_at_a_time() -> None:
     assert nearest_at(free, solve(free, Collocation(3, 2)), 0.5) is None
 
 
+def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None:
+    """One is nearer, and may be; the other one is farther off, and not far enough."""
+    posts = {f"post {k}": Hull(-1, np.array([[0.5, y, 0.0]]), 0.0) for k, y in enumerate((0.3, -0.6))}
+    problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [0, 2, -1]], [0.1, 0.7])
+    near, far = proof(problem).pairs[::-1]
+    assert (near.bodies[1], far.bodies[1]) == ("post 0", "post 1")
+    assert near.missed == 0
+    assert far.missed == pytest.approx(0.2, abs=0.01)
+
+
 @pytest.mark.parametrize(("thickness", "horizon"), [(1e-2, 1e2), (1e-4, 1.0), (1e-6, 1e-2), (1e-6, 1e2)])
 def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float, horizon: float) -> None:
     wall = np.array([[0.437, y, z] for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -237,6 +247,17 @@ def test_what_comes_too_near_between_the_places_looked_at_first_is_found(pieces:
         found = swinging(low, pieces, smooth, asked=0.1 * (0.25 / pieces) ** 2 / 2).worst
         assert found is not None
         assert found.missed > 0
+
+
+@pytest.mark.parametrize("pieces", [1, 5, 300])
+def test_nothing_is_looked_at_beyond_the_ends(pieces: int) -> None:
+    """Where it would come nearer after the end, or had come before the start, the end or the start is nearest."""
+    for low, time in ((1.3, 1.0), (-0.3, 0.0)):
+        found = swinging(low, pieces, asked=-0.5).worst
+        assert found is not None
+        assert found.time == time
+        assert found.distance == pytest.approx(1 + 0.3 * np.sin(0.03), abs=1e-12)
+        assert found.least <= found.distance
 
 
 @pytest.mark.parametrize("unit", [1e-2, 1.0, 1e2])
