@@ -306,14 +306,14 @@ def test_a_proof_leaves_room_for_rounding(short: float, reason: str | None) -> N
     ids=["corner", "other corner", "between", "middle", "beyond a limit"],
 )
 def test_hulls_that_meet_in_few_postures_are_checked(place: tuple[float, float], reason: str | None) -> None:
-    """Cubes of 0.04 m on slides of -1 to 1 m, of which one passes by this place alone; their covers always touch."""
+    """Cubes of 0.016 m on slides of -1 to 1 m, of which one passes by this place alone; their covers always touch."""
     links = tuple(Link(f"link{k}") for k in range(3))
     slide: dict[str, Any] = {"lower": -1.0, "upper": 1.0}
     joints = (
         Joint("x", "prismatic", "link0", "link1", axis=(1, 0, 0), **slide),
         Joint("y", "prismatic", "link1", "link2", axis=(0, 1, 0), **slide),
     )
-    corners = 0.02 * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    corners = 0.008 * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
     ball = Sphere(4.0, (0, 0, 0))
     bodies = (
         Body("link0", ball, 4.0, LinkMesh(corners + np.array([*place, 0.0]))),
