@@ -79,6 +79,20 @@ def test_wheels_are_known_by_their_symmetry() -> None:
     assert "loose" not in wheels_of(Robot(more.links, more.joints, "panel"))
 
 
+@pytest.mark.parametrize("inertia", [1e-6, 0.02, 300.0])
+def test_a_rotor_is_a_disc_and_its_symmetry_is_judged_by_its_size(inertia: float) -> None:
+    """About its axis what is told, across it 0.6 of that; a part in a million beside that is no symmetry."""
+    body = Robot((Link("hub", 80.0, (0, 0, 0), np.eye(3)),), ())
+    disc = inertia * np.diag([0.6, 0.6, 1.0])
+    wheel = with_wheels(body, [[0, 0, 2.0]], inertia)
+    gyro = with_gyros(body, [[0, 1, 0]], [[0, 0, -1]], 1.0, inertia)
+    for robot, name in ((wheel, "wheel1"), (gyro, "gyro1_rotor")):
+        np.testing.assert_allclose(np.asarray(robot.links[-1].inertia), disc, rtol=1e-14, atol=0)
+        assert wheels_of(robot) == pytest.approx({name: inertia})
+        uneven = replace(robot.links[-1], inertia=disc + inertia * np.diag([1e-6, 0.0, 0.0]))
+        assert wheels_of(replace(robot, links=(*robot.links[:-1], uneven))) == {}
+
+
 def pyramid(**limits: Any) -> Robot:
     """A body with four gyros on the sides of a pyramid, whose momenta cancel at zero."""
     tilt = np.arctan(np.sqrt(2.0))
