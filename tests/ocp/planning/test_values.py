@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -149,6 +150,45 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     near = somewhere()
     lower = steps.lower(near, np.zeros((count, free)), np.zeros((count, free, free)))
     assert (steps.at(lower)[0] <= steps.at(near)[0] + 1e-9).all()
+
+
+@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_and_a_cubic_more(
+    kind: Any, free: int
+) -> None:
+    rng = np.random.default_rng(5)
+    count, n, seconds, half = 100, 4, 0.7, 0.2
+    weights = rng.uniform(0.5, 2.0, n)
+    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
+    rim = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free))
+
+    def bent() -> tuple[Charts, Any]:
+        """Charts, and how far the sets are from places (P, g, r) on them. Shape (P, g, n)."""
+        bends, cubes = rng.normal(size=(count, n, free, free)), 0.02 * rng.normal(size=(count, n, free))
+
+        def stray(at: Array) -> Array:
+            cubic = np.einsum("pna,pga->pgn", cubes, (at / half) ** 3)
+            return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2 + cubic)
+
+        return replace(flat_charts(rng, count, scale, free, half), strays=stray(rim)), stray
+
+    (out, away), (into, beyond) = bent(), bent()
+    after = Values(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
+    delta = 0.3 * rng.normal(size=(count, n))
+    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    grid = np.array(list(product(np.linspace(0, 1, 31 if free > 1 else 501), repeat=free)))
+    there = into.low[:, None] + (into.high - into.low)[:, None] * grid
+    to_come = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
+    ends, gaps = np.einsum("pnr,pgr->pgn", into.tangents, there) + beyond(there), []
+    for shares in rng.choice([0.0, 0.3, 0.8, 1.0], size=(12, 2, count, free)):
+        place, other = out.low + (out.high - out.low) * shares
+        start = np.einsum("pnr,pr->pn", out.tangents, other) + away(other[:, None])[:, 0]
+        costs = (cost.of(delta[:, None] + ends - start[:, None], seconds) + to_come).min(axis=1)
+        value, slope = steps.at(place)
+        way = other - place
+        below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
+        gaps.append(costs - below)
+    assert np.min(gaps) >= -1e-9
 
 
 @pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
