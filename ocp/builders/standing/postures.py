@@ -141,7 +141,8 @@ def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
     for swing in swings:
         if swing.lifted is None or swing.landing is None:
             continue
-        middle = (np.asarray(swing.lifted.position) + np.asarray(swing.landing.position)) / 2
+        ends = np.array([swing.lifted.position, swing.landing.position])
+        middle = np.append(ends[:, :2].mean(axis=0), ends[:, 2].max())
         found[swing.name] = Foothold(middle + lift * np.asarray(swing.landing.rotation)[:, 2], swing.landing.rotation)
     return found
 

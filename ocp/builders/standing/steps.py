@@ -25,6 +25,7 @@ import numpy as np
 from models.arrays import Array
 from models.errors import ModelError
 from models.machines.stance import Stance
+from models.paths import rest_to_rest
 from models.robot.indices import joint_limit_index
 from ocp.builders.standing.postures import PLACED, check_placed, first_guess, hold
 from ocp.builders.standing.problem import FreeTime
@@ -103,6 +104,7 @@ def steps_problem(
         balance: "static" asks for "balance" all the way; not in stances with a grip.
         margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m.
         clearance: Height of a sole above the ground in the middle of its way, m; 64 s^3 (1 - s)^3 of it at the share s.
+            Ground that is higher at the end of the way rises in its first half, lower ground falls in the second.
         weights: Of the parts of the cost.
         limits: Of joints and ground. `vertical_force` is the least of any sole that is held, N; nothing if None.
 
@@ -270,7 +272,9 @@ def _swing(
         before = float(np.asarray(swing.lifted.position)[2])
         after = before if swing.landing is None else float(np.asarray(swing.landing.position)[2])
         way = 64 * (share * (1 - share)) ** 3 if swing.landing is not None else share**2 * (3 - 2 * share)
-        ground = before + (after - before) * share
+        # over the higher of both in the middle: where the ground rises in between is not told
+        risen = ca.fmin(2 * share, 1) if after > before else ca.fmax(2 * share - 1, 0)
+        ground = before + (after - before) * rest_to_rest(risen)
         least = clearance * ((1 + GRAZED) * way - GRAZED)
         heights = stance.sole_corners(swing.name, joints)[2, :].T - ground - least
         rows = _apart(heights, joints)

@@ -19,11 +19,13 @@ from ocp.builders.standing import (
     StepsMotion,
     plan_steps,
     resolve_steps,
+    standing_posture,
     steps_motion,
     steps_problem,
     walk,
 )
-from scripts.robots.steps import bent, planar_biped, planar_feet, planar_steps
+from ocp.problem.formulation import Formulation
+from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
 from tests.models.robot.trees import numeric, numeric_poses
 from tests.ocp.builders.bipeds import FRICTION, mirrored, talos_steps
 from tests.ocp.builders.steps_replay import replay
@@ -214,6 +216,24 @@ def test_the_pseudo_inverse_says_in_which_phase_a_leg_is_stretched() -> None:
     steps = planar_steps(1, 0.5, 0.6, length=2.0)
     with pytest.raises(SolveError, match="'2 left': the pseudo-inverse breaks down at"):
         resolve_steps(steps, bent(steps))
+
+
+@pytest.mark.parametrize("height", [0.05, 0.0, -0.05])
+def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float) -> None:
+    """What it has to clear does not move while the sole is still, or already, at rest; and is below it in between."""
+    feet = {side: Foothold.level(0, 0) for side in SIDES}
+    phases = walk(feet, [("right", Foothold.level(0.2, 0, height=height))], shift=0.5, swing=0.8)
+    steps = Steps(planar_biped(), planar_feet(), phases)
+    form = Formulation.of(steps_problem(steps, bent(steps), clearance=0.02))
+    lands = standing_posture(steps.standing(2), bent(steps)[steps.order(steps.stances[1])])
+    states, controls = np.zeros((3, form.nx)), np.zeros((3, form.nu))
+    states[:, form.states["2 left.joints"]] = bent(steps)[steps.order(steps.stances[1])]
+    states[2, form.states["2 left.joints"]] = lands
+    share = np.array([0.02, 0.5, 0.98])
+    rows = form.sampled([form.path.expression], states, controls, share, 1.0, form.parameter_vector({}))[0]
+    room = rows[:, form.path.of("2 left.right clearance")]
+    assert room[[0, 2]].min() > 0
+    assert room[1].min() == pytest.approx(-0.02 - max(height, 0.0), abs=1e-9)
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------------
