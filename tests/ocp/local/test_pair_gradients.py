@@ -30,6 +30,7 @@ from models import (
 from ocp import ProblemError, compiled_distances, libraries
 from ocp.libraries import Library, built
 from ocp.local.pair_gradients import SOURCE
+from ocp.local.touching import distances_along
 from tests.models.robot.trees import random_robot
 
 SIZES = {"sphere": (0.08,), "capsule": (0.05, 0.3), "box": (0.1, 0.2, 0.3), "cylinder": (0.06, 0.3)}
@@ -121,6 +122,19 @@ def test_gradients_are_finite_differences_of_distances(few: tuple[Surroundings, 
         slopes = np.array(function(base, q, time)[1]) @ rates
         np.testing.assert_allclose(slopes[sure], fine[sure], atol=1e-6)
     assert kept > 8 * len(rough)
+
+
+def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[Surroundings, list[int], Any]) -> None:
+    """However many there are: they are measured side by side, and what is left over one by one."""
+    around, pairs, _ = few
+    known = around.distance_gradients(pairs=pairs)
+    for count in (3, 64, 150):
+        samples = list(configurations(around, count, count))
+        base, joints, times = (np.array(part) for part in zip(*samples, strict=True))
+        found = distances_along(around, base, joints, times)
+        np.testing.assert_allclose(
+            found[:, pairs].T, np.hstack([np.array(known(*one)[0]) for one in samples]), atol=1e-9
+        )
 
 
 def test_either_output_can_be_asked_for_alone(few: tuple[Surroundings, list[int], Any]) -> None:
