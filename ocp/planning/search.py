@@ -48,6 +48,8 @@ MOTIONS = 12
 """Classes of motions that are followed up, the cheapest first."""
 FAR = 3.0
 """Share of the least cost beyond which they are not."""
+WITHIN = (1.5, 1.5, 1.0)
+"""Share of the least cost within which classes are kept to be followed up, by the directions that are free."""
 SAME = 0.1
 """rad or m: motions nearer to each other than this everywhere are one."""
 WHOLE = 1e-9
@@ -234,7 +236,8 @@ class Search:
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
-        share = 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
+        free = max(0, *(instant.sets.size for instant in self.instants))
+        share = 1 - GAPS[free]
         layers, best = self.first(most)
         if not layers:
             return None, np.inf
@@ -246,7 +249,8 @@ class Search:
         rest: list[Values] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
-            far = least if coarse else share * least  # beyond that nothing is looked for: classes at first, then bounds
+            # beyond that nothing is looked for: classes at first, then bounds
+            far = (WITHIN[free] if coarse else share) * least
             to_come = graph.to_come(rest, far)
             if coarse:
                 self._known = graph, to_come, None
