@@ -107,8 +107,9 @@ class Clearance:
 
     Attributes:
         name: Of the separation.
-        pairs: How near each pair comes, the nearest to what is allowed first, whose bound is close; of those beyond it
-            the bounds say that they are no nearer than that one.
+        pairs: How near each pair comes: those that miss what is asked, or may, the worst first; then by what was found,
+            the nearest to what is allowed first. Of that one the bound is close, of others it says that they are no
+            nearer than that one.
         settled: Whether every pair's least distance was told from what is asked, one way or the other.
         looked: Number of intervals of pairs that were looked at.
     """
@@ -252,7 +253,8 @@ class _Search:
             if level >= 0:
                 inside = block << level < self.pieces
                 pair, block = pair[inside], block[inside]
-        found = sorted(self._found(np.minimum(lower, self.best)), key=lambda one: one.least - one.asked)
+        found = self._found(np.minimum(lower, self.best))
+        found.sort(key=lambda one: (-one.missed, one.distance - one.asked))
         return Clearance(self.apart.name, tuple(found), settled, looked)
 
     def at(self, time: float) -> list[Nearest]:

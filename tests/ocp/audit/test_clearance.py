@@ -100,6 +100,16 @@ def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None
     assert far.missed == pytest.approx(0.2, abs=0.01)
 
 
+def test_the_nearest_pair_is_named_however_loose_the_bound_of_another() -> None:
+    """What is far off is told by a bound alone, which may be below the least distance of the nearest pair."""
+    far = {f"far {k}": Hull(-1, np.array([[0.4, y, 0.0]]), 0.0) for k, y in enumerate(np.linspace(0.31, 0.9, 200))}
+    hulls = {"ball": BALL, "near": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.0), **far}
+    found = proof(flight([0, 0, 0], [1, 0, 0], hulls, [[0, k, -1] for k in range(1, len(hulls))], 0.0))
+    assert found.worst is not None
+    assert found.worst.bodies == ("ball", "near")
+    assert found.worst.distance == min(one.distance for one in found.pairs)
+
+
 @pytest.mark.parametrize(("thickness", "horizon"), [(1e-2, 1e2), (1e-4, 1.0), (1e-6, 1e-2), (1e-6, 1e2)])
 def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float, horizon: float) -> None:
     wall = np.array([[0.437, y, z] for y in (-1, 1) for z in (-1, 1)], dtype=float)
