@@ -352,7 +352,7 @@ def _clear(found: list[Posture], nearest: list[Touch | None], surroundings: Surr
         f"each of the {len(found)} postures found touches; the one that does least: {touch}",
         found[best].joints,
         found[best].misfit,
-        name=touch.bodies[0],
+        name=" and ".join(touch.bodies),
         value=touch.distance,
         limit=surroundings.clearance,
         time=time,

@@ -12,17 +12,18 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.audit.audit import Audit, Finding
+from ocp.audit.clearance import Nearest
 from ocp.builders.clearance import APART, LOOKS, Clear
 from ocp.builders.tool_motion import CLOCK, ToolMotion, tool_motion_problem
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.local.following import Followed
-from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import Touch
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
-from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, misfits_of
+from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, clear_postures, misfits_of, others_told
 from ocp.problem.values import constant
 from ocp.refinement import refine, split
 from ocp.solution import Solution
@@ -185,13 +186,12 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool
         touching = [touch for touch in maker.touches(candidate.solution) if touch.pair not in held]
         every = every and audited < EVERY and candidate.cost <= FAR * least
         if (candidate.cost > least * (1 + beyond) and not every) or (first and np.isfinite(least)):
-            why = f"{TOUCHES}: {touching[0]}" if touching else "dearer on a coarse mesh"
-            told.append(replace(candidate, why=why, solution=None))
+            dear = replace(candidate, why="dearer on a coarse mesh", solution=None)
+            told.append(_touching(candidate, touching[0]) if touching else dear)
             continue
         if touching and clear is not None:
             if failures == FAILURES or (barred := maker.barred(touching[0].time)):
-                why = f"{TOUCHES}: {touching[0]}{barred and f'; {barred}'}"
-                told.append(replace(candidate, why=why, solution=None))
+                told.append(_touching(candidate, touching[0], barred))
                 continue
             bent, clear = maker.bent(candidate, clear, touching, candidate.solution)
             failures += bool(bent.why)
@@ -223,6 +223,13 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool
         told = _once_each(told + _other_sides(maker, coarse))
     named = {tuple(one.start) for one in told}
     return told + [replace(one, solution=None) for one in alike if tuple(one.start) not in named]
+
+
+def _touching(
+    candidate: Candidate, touch: Touch | Nearest, more: str = "", solution: Solution | None = None
+) -> Candidate:
+    """The same, which is not the plan because two bodies touch, and what more is known of that."""
+    return replace(candidate, why=f"{TOUCHES}: {touch}{more and f'; {more}'}", solution=solution, touch=touch)
 
 
 def _once_each(told: list[Candidate]) -> list[Candidate]:
@@ -258,7 +265,7 @@ class Maker:
         self.asked, self.start, self.reference = asked, start, reference
         self.followed: dict[tuple[float, ...], list[Followed]] = {}  # by postures: their local motions
         self.brief = False  # whether what finer meshes do not bring to its way is given up, for there are others
-        self._barred: dict[float, str] = {}
+        self._clear: dict[float, int | Unreachable | None] = {}
         self._made: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
         self.motion = self.declared(start, asked.clear)
         self.why: SolveError | None = None  # what the last solve failed of
@@ -322,21 +329,14 @@ class Maker:
 
     def barred(self, time: float) -> str:
         """That no posture which does the tasks at a time is clear; "" where one is, or where that is not known."""
-        asked = self.asked
-        if time not in self._barred:
-            tasks = [task for task in asked.tasks if task.is_pose and task.begin <= time <= task.end]
-            self._barred[time] = ""
-            if asked.clear is not None and tasks and not asked.machine.base_size:
-                around: dict[str, Any] = {
-                    "surroundings": asked.clear.surroundings,
-                    "limits": asked.limits.joints,
-                    "seed": asked.seed,
-                }
-                try:
-                    inverse_kinematics(asked.machine, tasks, time=time, **around)
-                except Unreachable as error:
-                    self._barred[time] = f"at {time:.4g} s {error}"
-        return self._barred[time]
+        clear = self._clear_at(time)
+        return f"at {time:.4g} s {clear}" if isinstance(clear, Unreachable) else ""
+
+    def _clear_at(self, time: float) -> int | Unreachable | None:
+        """How many postures that do the tasks at a time are clear, or why none is; None where that is not known."""
+        if time not in self._clear:
+            self._clear[time] = clear_postures(self.asked, time)
+        return self._clear[time]
 
     def bent(self, candidate: Candidate, clear: Clear, touching: list[Touch], guess: Any) -> tuple[Candidate, Clear]:
         """A motion on the coarse mesh with what touches held apart, one pair after the other, or why there is none."""
@@ -344,13 +344,12 @@ class Maker:
             clear = clear.holding([touch.pair for touch in touching])
             solution = self.made(clear, fine=False, cost=candidate.cost)[2].solve(guess=guess, check=False)
             if not solution.success:
-                why = f"{TOUCHES}: {touching[0]}; held apart, no motion was found"
-                return replace(candidate, why=why, solution=None), clear
+                return _touching(candidate, touching[0], "held apart, no motion was found"), clear
             again = [touch for touch in self.touches(solution) if touch.pair not in clear.margins]
             if not again:
                 return replace(candidate, cost=solution.cost, why="", solution=solution), clear
             touching, guess = again, solution
-        return replace(candidate, why=f"{TOUCHES}: {touching[0]}", solution=None), clear
+        return _touching(candidate, touching[0]), clear
 
     def solved(
         self, start: Array, guess: Any, thorough: bool = False, clear: Clear | None = None, most: float = np.inf
@@ -360,12 +359,13 @@ class Maker:
         Bodies that come too near are held apart, farther each time, and it is solved again, over the coarse mesh where
         it is not found otherwise. What does not cost less than `most` is not looked at any further.
         """
-        touch, apart = "", clear or self.asked.clear
+        touch, near, apart = "", None, clear or self.asked.clear
         touched: Candidate | None = None
         for _ in range(LOOKS):
             candidate, farther = self._solved(start, guess, thorough, apart, most)
             if farther is not None:
-                touch, apart, guess, touched = candidate.why, farther, candidate.solution, candidate
+                touch, near, apart = candidate.why, candidate.touch, farther
+                guess, touched = candidate.solution, candidate
                 continue
             if touched is None or apart is None or not np.isnan(candidate.cost):
                 break
@@ -376,7 +376,7 @@ class Maker:
                 break
             guess, touched = bent.solution, None
         if touch and candidate.why and not candidate.why.startswith(touch):
-            candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}")
+            candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}", touch=near)
         return candidate
 
     def _solved(
@@ -399,7 +399,7 @@ class Maker:
             touching = [touch for touch in self.touches(solution) if clear and touch.pair not in clear.margins]
             if clear is not None and touching:
                 apart = clear.holding([touch.pair for touch in touching])
-                return Candidate(start, solution.cost, f"{TOUCHES}: {touching[0]}", solution), apart
+                return _touching(Candidate(start, solution.cost), touching[0], solution=solution), apart
             solution, audit = self._audited(motion, mesh, solution)
             if np.isnan(self._start(clear)).any() and audit.feasible and audit.optimal is None:
                 first = solution[f"joints{motion.stretches[0].suffix}"][0]
@@ -416,8 +416,9 @@ class Maker:
             return Candidate(start, np.nan, str(error).split("\n")[0], error.solution), None
         missed = [near for proof in audit.clearances.values() for near in proof.pairs if near.missed > 0]
         if clear is not None and missed:
-            why = f"{TOUCHES}: {max(missed, key=lambda near: near.missed)}"
-            return Candidate(start, solution.cost, why, solution), clear.widened(list(audit.clearances.values()))
+            worst_pair = max(missed, key=lambda near: near.missed)
+            candidate = _touching(Candidate(start, solution.cost), worst_pair, solution=solution)
+            return candidate, clear.widened(list(audit.clearances.values()))
         if audit.passed:
             return Candidate(start, solution.cost, "", solution), None
         worst = audit.failures[0] if audit.failures else None
@@ -483,6 +484,18 @@ class Maker:
         nodes = solution.state_interpolant.breaks
         return np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(PLACES) / PLACES).ravel(), 1.0)
 
+    def _failed(self, told: list[Candidate]) -> SolveError:
+        """That no motion passes; where bodies touch, it is about the cheapest motion in which they do."""
+        error = failed(told, self.why)
+        touching = [(np.inf if np.isnan(one.cost) else one.cost, one.touch) for one in told if one.touch is not None]
+        if not touching or self.asked.clear is None:
+            return error
+        touch = min(touching, key=lambda one: one[0])[1]
+        words = "; ".join([f"{error}\nthe cheapest that touches: {touch}", *others_told(self._clear_at(touch.time))])
+        limit = self.asked.clear.surroundings.clearance
+        found: dict[str, Any] = {"value": touch.distance, "limit": limit, "time": touch.time}
+        return SolveError(words, error.solution, error.conflicts, name=" and ".join(touch.bodies), **found)
+
     def plan(self, told: list[Candidate]) -> Plan:
         """The plan of the cheapest motion that passes, with the others and why they are not the plan.
 
@@ -491,7 +504,7 @@ class Maker:
         """
         passing = [one for one in told if not one.why]
         if not passing:
-            raise failed(told, self.why)
+            raise self._failed(told)
         best = min(passing, key=lambda one: one.cost)
         ended = [one if one is best or one.why else replace(one, why=DEARER) for one in told]
         ended.sort(key=lambda one: (one is not best, np.inf if np.isnan(one.cost) else one.cost))

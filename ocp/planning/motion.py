@@ -16,9 +16,11 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
+from ocp.audit.clearance import Nearest
 from ocp.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_positive, floats, unknown_name
+from ocp.local.touching import Touch
 from ocp.planning.machines import machine_of, written_machine
 from ocp.schedule.trajectory import JointTrajectory
 from ocp.solution import Solution
@@ -47,12 +49,14 @@ class Candidate:
         cost: Of the motion; nan where none was found, and where `solution` is None an estimate on a coarse mesh.
         why: Why it is not the plan; "" for the plan itself.
         solution: Of the motion, where it was solved on the fine mesh.
+        touch: The two bodies that come too near, how near and when, where that is why; None in a plan that was loaded.
     """
 
     start: Array
     cost: float
     why: str = ""
     solution: Solution | None = None
+    touch: Touch | Nearest | None = None
 
     def __repr__(self) -> str:
         start = np.array2string(self.start, precision=3, separator=", ", max_line_width=200)

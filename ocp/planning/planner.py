@@ -37,7 +37,15 @@ from ocp.planning.cells import CellSearch, follows
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.driven import driven_plan, limits_drives, without_drives
 from ocp.planning.motion import Candidate, Plan
-from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled, touches_at_the_start
+from ocp.planning.postures import (
+    Asked,
+    clear_postures,
+    followed_from,
+    others_told,
+    postures_at_the_start,
+    settled,
+    touches_at_the_start,
+)
 from ocp.planning.standing import plan_to_stand
 from ocp.planning.task_search import TaskSearch
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights
@@ -160,8 +168,10 @@ def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
     postures = postures_at_the_start(asked)
     if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
         words = f"start: {touch}; start clear of everything, or name what may touch: ignored=[{touch.bodies}]"
+        words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
         limit = asked.clear.surroundings.clearance if asked.clear else 0.0
-        raise ProblemError(words, name=touch.bodies[0], value=touch.distance, limit=limit, time=touch.time)
+        name = " and ".join(touch.bodies)
+        raise ProblemError(words, name=name, value=touch.distance, limit=limit, time=touch.time)
     given = asked.start
     if given is None:
         given, postures = settled(asked, postures)

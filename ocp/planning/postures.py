@@ -21,7 +21,10 @@ from ocp.tasks.equations import bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Asked", "followed_from", "misfits_of", "placed", "postures_at_the_start", "settled", "touches_at_the_start"]
+__all__ = [
+    "Asked", "clear_postures", "followed_from", "misfits_of", "others_told", "placed", "postures_at_the_start",
+    "settled", "touches_at_the_start",
+]  # fmt: skip
 
 LEAST_INTERVALS = 8
 """Of a motion, where its pieces are fewer."""
@@ -92,6 +95,30 @@ def touches_at_the_start(asked: Asked, postures: Array) -> list[Touch | None]:
     nearest, labels = apart.argmin(axis=1).tolist(), around.labels
     found = [Touch(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
     return [touch if touch.distance < around.clearance else None for touch in found]
+
+
+def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
+    """How many postures that do the tasks at a time (s) are clear, or why none is.
+
+    None where that says nothing: no pose is asked for then, or the base may come from elsewhere.
+    """
+    tasks = [task for task in asked.tasks if task.is_pose and task.begin <= time <= task.end]
+    if asked.clear is None or not tasks or asked.machine.base_size:
+        return None
+    around: dict[str, Any] = {"surroundings": asked.clear.surroundings, "limits": asked.limits.joints}
+    try:
+        return len(inverse_kinematics(asked.machine, tasks, time=time, seed=asked.seed, **around))
+    except Unreachable as error:
+        return error
+
+
+def others_told(clear: int | Unreachable | None) -> list[str]:
+    """Whether another posture is clear, in words; nothing where that is not known."""
+    if clear is None:
+        return []
+    if isinstance(clear, Unreachable):
+        return [f"no other posture is clear then: {clear}"]
+    return [f"clear then, and not on a motion that was found: {clear} other posture{'s' if clear > 1 else ''}"]
 
 
 def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:

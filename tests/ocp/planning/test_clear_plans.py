@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path as File
@@ -304,13 +305,21 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
 def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
     with pytest.raises(ProblemError, match=r"start: link6 and obstacle 0 overlap by 0\.0") as caught:
         plan(ARM, line(), start=START, obstacles=[Sphere(0.08, FIRST - (0.1, 0, 0))])
-    assert caught.value.name == "link6"
+    assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < 0
+    assert caught.value.time == 0
+    assert re.search(r"clear then, .*: \d+ other postures", str(caught.value))
 
 
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
-    with pytest.raises(SolveError, match=r"link6 and obstacle 0 overlap by 0\.\d+ m at [12]\.?\d* s"):
-        plan(ARM, line(), start=START, search="start", obstacles=[Sphere(0.1, FIRST + WAY)])
+    with pytest.raises(SolveError, match=r"link6 and obstacle 0 overlap by 0\.\d+ m at [12]\.?\d* s") as caught:
+        plan(ARM, line(), start=START, search="start", obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+    assert caught.value.name == "link6 and obstacle 0"
+    assert caught.value.value < caught.value.limit == 0.01
+    assert 1 <= caught.value.time <= SECONDS
+    last = str(caught.value).split("\n")[-1]
+    assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
+    assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
 
 
 def test_postures_that_touch_are_left_out_or_named() -> None:
@@ -322,7 +331,7 @@ def test_postures_that_touch_are_left_out_or_named() -> None:
     assert len(clear) == sum(each >= 0.01 for each in apart) < len(every)
     with pytest.raises(Unreachable, match=r"touches.*link6 and obstacle 0 overlap") as caught:
         inverse_kinematics(ARM, at, surroundings=Surroundings(ARM, [Sphere(0.2, FIRST)]))
-    assert caught.value.name == "link6"
+    assert caught.value.name == "link6 and obstacle 0"
 
 
 def test_a_local_motion_tells_how_near_it_comes() -> None:
