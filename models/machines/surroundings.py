@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_flag, checked_nonnegative
+from models.arrays import MOST, Array, checked_array, checked_flag, checked_nonnegative, checked_rotation
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gradients
@@ -25,7 +25,7 @@ from models.shapes.distance import COLUMNS, column, distance, pair_function, sof
 from models.shapes.intervals import bounds
 from models.shapes.pairs import TOLD, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
-from models.shapes.shapes import KINDS, HalfSpace, Shape, checked_shape
+from models.shapes.shapes import KINDS, Box, HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
 PIECES = 512
@@ -48,7 +48,8 @@ class Moving:
         rotation: The same of its axes, as columns. Shape (3, 3). None: those of the world.
 
     Raises:
-        ModelError: No shape, a half-space, functions that give something else, or that change with anything but time.
+        ModelError: No shape, a half-space, functions that give something else, or that change with anything but time;
+            a rotation that is none.
     """
 
     shape: Shape
@@ -81,21 +82,36 @@ class Moving:
                 raise ModelError(message, name=what, value=value.shape, limit=shape)
             parts.append(value)
         object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
+        for what, part in zip(("position", "rotation"), parts, strict=True):
+            if not ca.symvar(part):
+                checked_array(ca.DM(part).full(), part.shape, "moving", what)
+        self._check_rotation(0.0)
 
     def frame(self, time: Expression) -> Frame:
         """Of its shape in world, at a time (s)."""
         return Frame(*self._at(time))
 
+    def _check_rotation(self, time: float) -> None:
+        """Raise where there is a rotation at a time (s) that is none."""
+        turn = self._at(time)[0].full()
+        if np.isfinite(turn).all():
+            try:
+                checked_rotation(turn, "moving", "rotation")
+            except ModelError as error:
+                raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error
+
     def fastest(self, begin: float, end: float) -> tuple[float, float]:
         """Bounds of speed and acceleration of its points between two times, m/s and m/s^2.
 
         Raises:
-            ModelError: They are not bounded, as far as interval arithmetic can tell.
+            ModelError: They are not bounded, as far as interval arithmetic can tell; a rotation that is none.
         """
         time = ca.SX.sym("time")
         turn, place = self._at(time)
         points = ca.densify(ca.mtimes(turn, ca.SX(self.shape.core.T)) + ca.repmat(place, 1, len(self.shape.core)))
         cuts = np.linspace(begin, end, PIECES + 1)
+        for at in cuts[[0, PIECES // 2, PIECES]].tolist():
+            self._check_rotation(at)
         found, value = [], ca.vec(points)
         for what in ("speed", "acceleration"):
             value = ca.jacobian(value, time)
@@ -167,8 +183,10 @@ class Surroundings:
         given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, Moving)) else self.obstacles
         found = _listed(given, "obstacles")
         for number, one in enumerate(found):
-            if not isinstance(one, Moving):
-                checked_shape(one, "surroundings", f"obstacles[{number}]")
+            shape = one.shape if isinstance(one, Moving) else checked_shape(one, "surroundings", f"obstacles[{number}]")
+            if isinstance(shape, Box) and not np.isfinite(shape.size).all():
+                message = f"surroundings: obstacles[{number}] is a box without ends; give a HalfSpace or its size"
+                raise ModelError(message, name=f"obstacles[{number}]", value=shape.size)
         object.__setattr__(self, "obstacles", found)
         near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
         object.__setattr__(self, "clearance", near)

@@ -232,6 +232,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "a pair of one": ({"ignored": ["link2"]}, "ignored"),
     "an unknown obstacle": ({"ignored": [("link2", "obstacle 7")]}, "obstacle 7"),
     "obstacles in a word": ({"obstacles": "box"}, "obstacles"),
+    "a box without ends": ({"obstacles": [Box((np.inf, 1, 1), (5, 5, 5))]}, r"obstacles\[0\] is a box without ends"),
 }
 
 
@@ -252,12 +253,20 @@ def test_what_is_refused(case: str) -> None:
         ({"position": lambda t: ca.vertcat(t, ca.SX.sym("y"), 0)}, "position"),
         ({"rotation": lambda t: ca.SX.eye(2)}, "rotation"),
         ({"position": lambda t: 1 / 0}, "position"),
+        ({"position": lambda t: (np.nan, 0, 0)}, "position .* is not finite"),
+        ({"rotation": lambda t: 2 * ca.SX.eye(3)}, "rotation .* is not a rotation matrix"),
     ],
 )
 def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
     good: dict[str, Any] = {"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0)}
     with pytest.raises(ModelError, match=word):
         Moving(**{**good, **given})
+
+
+def test_a_rotation_that_grows_with_time_is_none() -> None:
+    moving = Moving(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0), lambda t: (1 + t) * ca.SX.eye(3))
+    with pytest.raises(ModelError, match=r"rotation .* at 0\.5 s"):
+        moving.fastest(0.0, 1.0)
 
 
 def test_a_motion_without_a_bound() -> None:
