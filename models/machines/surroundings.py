@@ -270,6 +270,13 @@ class Surroundings:
         """Names of the two bodies of each pair."""
         return tuple((self.bodies[one].name, self.bodies[other].name) for one, other, _ in self.pairs)
 
+    def told_as(self, pair: int) -> tuple[str, str]:
+        """How a pair is named in `ignored`: by the links that its bodies belong to, or as an obstacle."""
+        placed = [self.bodies[body] for body in self.pairs[pair, :2]]
+        own = range(len(self._carriers))
+        one, other = (self._carriers[body.frame] if body.frame in own else body.name for body in placed)
+        return one, other
+
     @property
     def moves_by_itself(self) -> bool:
         """Whether an obstacle moves."""

@@ -167,11 +167,12 @@ def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
     machine = asked.machine
     postures = postures_at_the_start(asked)
     if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
-        words = f"start: {touch}; start clear of everything, or name what may touch: ignored=[{touch.bodies}]"
+        assert asked.clear is not None
+        around, name = asked.clear.surroundings, " and ".join(touch.bodies)
+        ignored = [around.told_as(touch.pair)]
+        words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
         words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
-        limit = asked.clear.surroundings.clearance if asked.clear else 0.0
-        name = " and ".join(touch.bodies)
-        raise ProblemError(words, name=name, value=touch.distance, limit=limit, time=touch.time)
+        raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)
     given = asked.start
     if given is None:
         given, postures = settled(asked, postures)

@@ -236,6 +236,15 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+def test_a_pair_is_ignored_by_the_names_that_it_is_told_as() -> None:
+    machine = FixedBase(armoured_arm())
+    around = Surroundings(machine, [Sphere(0.1, (0.3, 0, 0.3)), Moving(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0.3))])
+    for pair in range(len(around.pairs)):
+        without = Surroundings(machine, around.obstacles, ignored=[around.told_as(pair)])
+        assert set(without.labels) < set(around.labels)
+        assert around.labels[pair] not in without.labels
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_what_is_refused(case: str) -> None:
     given, word = BAD[case]
