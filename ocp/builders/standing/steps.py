@@ -102,7 +102,9 @@ def steps_problem(
         steps: The robot and its stances.
         start_joints: In the robot's order, with the feet on their footholds; `standing_posture` finds some. (n,).
         balance: "static" asks for "balance" all the way; not in stances with a grip.
-        margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m.
+        margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m. It has to cover
+            by how much the machine leans out where ground and joints give, which are rigid here; most where it stays
+            near an edge, and at corners of a sole, as in a walk in balance.
         clearance: Height of a sole above the ground in the middle of its way, m; 64 s^3 (1 - s)^3 of it at the share s.
             Ground that is higher at the end of the way rises in its first half, lower ground falls in the second.
         weights: Of the parts of the cost.

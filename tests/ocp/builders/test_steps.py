@@ -24,6 +24,7 @@ from ocp.builders.standing import (
     steps_problem,
     walk,
 )
+from ocp.builders.standing.loads import motion_of, sampled
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
 from tests.models.robot.trees import numeric, numeric_poses
@@ -32,6 +33,7 @@ from tests.ocp.builders.steps_replay import replay
 from tests.ocp.problem.test_phases import failed, moved
 
 MARGIN = 0.01
+FIRM = 0.03  # m: with this much TALOS stands still on the corner of a sole, see below; a walk in balance stays there
 GROUND: dict[str, Any] = {"margin": MARGIN, "limits": Limits(friction=FRICTION)}
 
 
@@ -236,6 +238,27 @@ def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float)
     assert room[1].min() == pytest.approx(-0.02 - max(height, 0.0), abs=1e-9)
 
 
+def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> StepsMotion:
+    """Nothing moves: the first foot is held, the center of mass this far inside its rear and outer, or inner, edges."""
+    stance = steps.stances[1]
+    assert stance.support is not None
+    over = np.asarray(stance.support.vertices).min(axis=0) + margin
+    posture = standing_posture(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
+    still = np.zeros_like(posture)
+    one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
+    found = sampled(one, one.stances[0], (posture, still, still), {})
+    return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **found}])
+
+
+def test_ground_that_gives_takes_a_centimeter_of_the_margin_at_the_corner_of_a_sole() -> None:
+    """It is as good as rigid to the plan; in the simulation it sinks by a millimeter, and joints on servos give too."""
+    steps = talos_steps(1, 1.0, 1.0)
+    least = on_the_corner_of_a_sole(steps, MARGIN, 2.5)
+    assert least.balance.min() == pytest.approx(MARGIN, abs=1e-3)
+    assert replay(least, FRICTION).fell
+    assert_stands(on_the_corner_of_a_sole(steps, FIRM, 2.5), planar=False)
+
+
 # ---- what is refused -------------------------------------------------------------------------------------------------
 
 
@@ -282,11 +305,13 @@ def test_two_steps_of_the_planar_biped_stand(balance: str, shift: float, swing: 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("balance", "shift", "swing"), [("dynamic", 0.8, 0.8), ("static", 2.0, 2.0)])
-def test_two_steps_of_talos_stand(balance: str, shift: float, swing: float) -> None:
+@pytest.mark.parametrize(
+    ("balance", "shift", "swing", "margin"), [("dynamic", 0.8, 0.8, MARGIN), ("static", 2.0, 2.0, FIRM)]
+)
+def test_two_steps_of_talos_stand(balance: str, shift: float, swing: float, margin: float) -> None:
     steps = talos_steps(2, shift, swing)
-    plan, motion = planned(steps, balance=balance, clearance=0.04)
+    plan, motion = planned(steps, balance=balance, margin=margin, clearance=0.04)
     assert plan.audit().feasible
-    assert_feet_hold(steps, motion)
-    assert (motion.balance.min() > MARGIN - 1e-3) == (balance == "static")
+    assert_feet_hold(steps, motion, margin)
+    assert (motion.balance.min() > margin - 1e-3) == (balance == "static")
     assert_stands(motion, planar=False)
