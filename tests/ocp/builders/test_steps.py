@@ -239,7 +239,7 @@ def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float)
 
 
 def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> StepsMotion:
-    """Nothing moves: the first foot is held, the center of mass this far inside its rear and outer, or inner, edges."""
+    """Nothing moves: the first foot is held, the center of mass this far inside its rear and right edges."""
     stance = steps.stances[1]
     assert stance.support is not None
     over = np.asarray(stance.support.vertices).min(axis=0) + margin
