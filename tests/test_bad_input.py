@@ -31,6 +31,7 @@ MADE_BY_THE_PACKAGE = {
     "Finding",
     "Footprint",
     "Frame",
+    "Gyro",
     "JointPath",
     "JointRates",
     "TorqueRates",

@@ -34,7 +34,7 @@ from models.arrays import (
 )
 from models.errors import ModelError
 from models.robot.dynamics import Wrench
-from models.robot.kinematics import link_frames
+from models.robot.kinematics import joint_vector, link_frames
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, on_scalars
@@ -195,8 +195,9 @@ class Gyro(NamedTuple):
 
 def gyros_of(robot: Robot) -> tuple[Gyro, ...]:
     """Wheels of a finite speed that a joint without end carries alone, across its axis, in the order of the joints."""
+    wheels = wheels_of(robot)
     found, moving = [], {joint.child: joint for joint in robot.moving_joints}
-    for name, inertia in wheels_of(robot).items():
+    for name, inertia in wheels.items():
         wheel = robot.joint(name)
         gimbal = moving.get(wheel.parent)
         if gimbal is None or gimbal.kind != "continuous" or not np.isfinite(wheel.velocity):
@@ -218,14 +219,14 @@ def gyro_matrix(robot: Robot, q: Expression) -> Expression:
     Args:
         q: Joint positions. Shape (dof, 1).
     """
-    frames = link_frames(robot, q)
-    columns = []
-    for gyro in gyros_of(robot):
+    gyros, joints = gyros_of(robot), joint_vector(robot, q)
+    frames, columns = link_frames(robot, joints), []
+    for gyro in gyros:
         gimbal, wheel = robot.joint(gyro.gimbal), robot.joint(gyro.rotor)
         axis = np.asarray(wheel.rotation) @ np.asarray(wheel.axis)
         crossed = gyro.momentum * np.cross(np.asarray(gimbal.axis), axis)
         columns.append(ca.mtimes(frames[gimbal.child].rotation, ca.DM(crossed)))
-    return ca.densify(ca.horzcat(type(q)(3, 0), *columns))
+    return ca.densify(ca.horzcat(type(joints)(3, 0), *columns))
 
 
 def wheels_of(robot: Robot) -> dict[str, float]:

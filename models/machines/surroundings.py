@@ -15,7 +15,15 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_array, checked_flag, checked_nonnegative, checked_rotation
+from models.arrays import (
+    MOST,
+    Array,
+    checked_array,
+    checked_flag,
+    checked_indices,
+    checked_nonnegative,
+    checked_rotation,
+)
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gradients
@@ -304,7 +312,11 @@ class Surroundings:
         Args:
             base, q: Configuration of the machine. time: s.
             pairs: Which; all if None. rounding: As of `distance`, m.
+
+        Raises:
+            ModelError: Pairs that there are none of, a rounding below zero.
         """
+        chosen, rounding = self._asked(pairs, rounding)
         frames = [*self._frames(base, q, time), None]
         columns: dict[int, Expression] = {}
 
@@ -322,8 +334,8 @@ class Surroundings:
             return distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding)
 
         found = []
-        for pair in range(len(self.pairs)) if pairs is None else pairs:
-            each = [between(*both) for both in self._covers.get(int(pair), (self.pairs[pair, :2].tolist(),))]
+        for pair in chosen:
+            each = [between(*both) for both in self._covers.get(pair, (self.pairs[pair, :2].tolist(),))]
             found.append(each[0] if len(each) == 1 else soft_minimum(each, rounding / 4 + FINEST))
         return ca.vertcat(*found) if found else expression(q)[:0]
 
@@ -336,19 +348,23 @@ class Surroundings:
         `distances` and its Jacobian; `ocp.compiled_distances` is the same compiled. Of a base with a quaternion,
         gradients hold along rates that keep it a unit.
 
-        Args:
-            pairs, rounding: As of `distances`.
+        Args, Raises: As of `distances`.
         """
         return self.pair_gradients(pairs=pairs, rounding=rounding).function()
 
     def pair_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> PairGradients:
         """What `distance_gradients` is put together from."""
-        chosen = [int(pair) for pair in (range(len(self.pairs)) if pairs is None else pairs)]
+        chosen, rounding = self._asked(pairs, rounding)
         groups = [self._covers.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in chosen]
         softness = rounding / 4 + FINEST
-        return pair_gradients(
-            self.machine, self.bodies, self._carriers, self._moving, groups, float(rounding), softness
-        )
+        return pair_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
+
+    def _asked(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
+        """Pairs by their places, and a rounding, checked."""
+        every, owner = np.arange(len(self.pairs)), "surroundings"
+        given = every if pairs is None else every[:0] if np.size(pairs) == 0 else pairs
+        chosen = checked_indices(given, len(every), owner, "pairs").ravel().tolist()
+        return chosen, checked_nonnegative(rounding, owner, "rounding", "m")
 
     @cached_property
     def levers(self) -> Levers:
