@@ -362,7 +362,7 @@ class Surroundings:
     def _asked(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Pairs by their places, and a rounding, checked."""
         every, owner = np.arange(len(self.pairs)), "surroundings"
-        given = every if pairs is None else every[:0] if np.size(pairs) == 0 else pairs
+        given = every if pairs is None else every[:0] if isinstance(pairs, list | tuple) and not pairs else pairs
         chosen = checked_indices(given, len(every), owner, "pairs").ravel().tolist()
         return chosen, checked_nonnegative(rounding, owner, "rounding", "m")
 
