@@ -356,25 +356,15 @@ class Maker:
     ) -> Candidate:
         """A motion from a guess, and what is wrong with it; with `thorough` from other starts, too, and why if none.
 
-        Bodies that come too near are held apart, farther each time, and it is solved again, over the coarse mesh where
-        it is not found otherwise. What does not cost less than `most` is not looked at any further.
+        Bodies that come too near are held apart, farther each time, and it is solved again. What does not cost less
+        than `most` is not looked at any further.
         """
         touch, near, apart = "", None, clear or self.asked.clear
-        touched: Candidate | None = None
         for _ in range(LOOKS):
             candidate, farther = self._solved(start, guess, thorough, apart, most)
-            if farther is not None:
-                touch, near, apart = candidate.why, candidate.touch, farther
-                guess, touched = candidate.solution, candidate
-                continue
-            if touched is None or apart is None or not np.isnan(candidate.cost):
+            if farther is None:
                 break
-            if not (touching := self.touches(touched.solution)):
-                break
-            bent, apart = self.bent(touched, apart, touching, touched.solution)  # over a coarse mesh it may be found
-            if bent.why:
-                break
-            guess, touched = bent.solution, None
+            touch, near, apart, guess = candidate.why, candidate.touch, farther, candidate.solution
         if touch and candidate.why and not candidate.why.startswith(touch):
             candidate = replace(candidate, why=f"{touch}; held apart: {candidate.why}", touch=near)
         return candidate

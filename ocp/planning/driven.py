@@ -158,9 +158,8 @@ def _brief(error: SolveError) -> str:
 def _solved(asked: Asked, start: Array | None, reference: Array, moved: Plan, limits: Limits) -> Solution:
     """A motion within the limits, from one without; judged from its own start where many are as good."""
     bounds = limits.bounds(asked.machine)
-    if (
-        asked.start is None and start is not None
-    ):  # what it began elsewhere with is not ignorable: bodies are held apart
+    if asked.start is None and start is not None:
+        # a joint that began elsewhere is not ignorable: bodies are held apart by it
         start = np.where(np.abs(moved.at(0.0)["joints"] - start) <= SAME_PLACE, start, np.nan)
 
     def declared(begin: Array | None, clear: Clear | None) -> ToolMotion:
