@@ -30,13 +30,14 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Refinement, Solution, stack
 
-__all__ = ["refine", "split"]
+__all__ = ["refine", "refined", "split"]
 
 LIMITS = [name for name, given in signature(judge).parameters.items() if given.kind is Parameter.KEYWORD_ONLY]
 KINDS = ("integration", "equalities", "limits", "cost", "other")
 TARGET_SHARE = 0.5  # of its limit, which an interval is split for
 MOST_PIECES = 4  # that an interval is split into at once
 LEAST_WIDTH = 1e-9  # of an interval, as a share of the horizon
+TOLERANCE, MOST_INTERVALS = 1e-6, 400
 MOST_ROUNDS = 12
 PATIENCE = 2  # rounds that may pass without any row coming nearer to its limit
 NEARER = 0.8  # of what it was: a row that fell so much is falling
@@ -46,10 +47,10 @@ def refine(
     problem: Problem,
     method: DirectMethod,
     *,
-    tolerance: float = 1e-6,
+    tolerance: float = TOLERANCE,
     limits: ByName = None,
     breaks: Sequence[float] = (),
-    max_intervals: int = 400,
+    max_intervals: int = MOST_INTERVALS,
     parameters: ByName = None,
     solver: str = "ipopt",
     options: ByName = None,
@@ -109,31 +110,54 @@ def refine(
             value=max_intervals,
             limit=method.intervals,
         )
+    given = {"parameters": parameters, "solver": solver, "options": options}
+    with limited(time_limit):
+        first = _first(problem, method, {**given, "guess": guess}, settings, time_limit)
+        return _refined(problem, method, first, tolerance, given, settings, max_intervals)[0]
+
+
+def refined(
+    problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None
+) -> tuple[Solution, Audit]:
+    """As `refine`, from a plan that was solved on the method's mesh and audited already; with the last one's audit."""
+    return _refined(problem, method, (solution, audit), TOLERANCE, {"options": options}, {}, MOST_INTERVALS)
+
+
+def _refined(
+    problem: Problem,
+    method: DirectMethod,
+    first: tuple[Solution, Audit],
+    tolerance: float,
+    given: dict[str, Any],
+    settings: dict[str, Any],
+    max_intervals: int,
+) -> tuple[Solution, Audit]:
+    """The last of the plans, and its audit; RefinementWarning as `refine` says."""
+    solution, audit = first
+    form = Formulation.of(problem)
+    p = form.parameter_vector(solution.parameters)
     intervals: list[int] = []
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     best: dict[str, float] = {}
     idle, late = 0, False
-    given = {"parameters": parameters, "solver": solver, "options": options}
-    with limited(time_limit):
-        solution, audit = _first(problem, method, {**given, "guess": guess}, settings, time_limit)
-        while True:
-            rows = _rows(form, p, solution, audit, tolerance, method)
-            beyond = [row for row in rows if not row.value <= 1.0]
-            intervals.append(method.intervals)
-            for kind, values in errors.items():
-                values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
-            nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
-            best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
-            idle = 0 if nearer else idle + 1
-            finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
-            if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
-                break
-            method = method.with_mesh(finer)
-            found = _next(problem, method, {**given, "guess": solution}, settings)
-            if found is None:
-                late = True
-                break
-            solution, audit = found
+    while True:
+        rows = _rows(form, p, solution, audit, tolerance, method)
+        beyond = [row for row in rows if not row.value <= 1.0]
+        intervals.append(method.intervals)
+        for kind, values in errors.items():
+            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+        nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
+        best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
+        idle = 0 if nearer else idle + 1
+        finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
+        if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
+            break
+        method = method.with_mesh(finer)
+        found = _next(problem, method, {**given, "guess": solution}, settings)
+        if found is None:
+            late = True
+            break
+        solution, audit = found
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
@@ -151,9 +175,8 @@ def refine(
         words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
         warnings.warn(RefinementWarning(words, name="undecided", value=audit.undecided), stacklevel=2)
     told = {kind: tuple(values) for kind, values in errors.items()}
-    return dataclasses.replace(
-        solution, refinement=Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
-    )
+    refinement = Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
+    return dataclasses.replace(solution, refinement=refinement), audit
 
 
 def _first(

@@ -33,6 +33,7 @@ PARTS = (
     "blend",
     "robots",
     "distances",
+    "clearance",
 )
 """Modules of scripts/timing, each with run(repeats) -> numbers, plot(path, numbers) and report(numbers) -> text."""
 TOGETHER = PARTS[:2]

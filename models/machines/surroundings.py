@@ -31,7 +31,7 @@ from models.robot.kinematics import link_frames
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
 from models.shapes.intervals import bounds
-from models.shapes.pairs import TOLD, checked_pairs
+from models.shapes.pairs import ALWAYS, COVERED, TOLD, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
@@ -165,6 +165,8 @@ class Surroundings:
         limits: Whether the joints keep to the robot's position limits, by which pairs are left that never touch.
         bodies: All that is looked at: of the links, obstacles, hulls of meshes.
         pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
+        covers: Of pairs of hulls, by their places, all pairs of the bodies that cover the two meshes; hulls are as far
+            apart as they are, or as the nearest of these. Shape (m, 2) each. None where some of them always touch.
         left: Pairs of names that are not looked at, and why.
 
     Raises:
@@ -182,10 +184,11 @@ class Surroundings:
     limits: bool = True
     bodies: tuple[Placed, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
+    covers: dict[int, Array] = field(init=False, repr=False)
     left: dict[tuple[str, str], str] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
-    _covers: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
+    _held: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, Moving)) else self.obstacles
@@ -253,7 +256,8 @@ class Surroundings:
             else:
                 bodies.append(Placed(f"obstacle {number}", one, WORLD))
         pairs = [(i, j, places[self._seen_from(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
-        covers: dict[int, tuple[tuple[int, int], ...]] = {}
+        held: dict[int, tuple[tuple[int, int], ...]] = {}
+        covers: dict[int, Array] = {}
         hulls: dict[LinkMesh, int] = {}
         for (one_mesh, other_mesh), stand_ins in close.items():
             first, second = (own[k] for k in stand_ins[0])
@@ -261,13 +265,17 @@ class Surroundings:
                 if mesh not in hulls:
                     hulls[mesh] = len(bodies)
                     bodies.append(Placed(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
-            covers[len(pairs)] = tuple(stand_ins)
+            held[len(pairs)] = tuple(stand_ins)
+            if self.left.get((first.link, second.link)) not in (ALWAYS, COVERED):
+                of = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (one_mesh, other_mesh)]
+                covers[len(pairs)] = np.array([(i, j) for i in of[0] for j in of[1]])
             pairs.append((hulls[one_mesh], hulls[other_mesh], places[self._seen_from(first, second)]))
         pairs += [(i, len(own) + number, WORLD) for i, number in beside]
         object.__setattr__(self, "_carriers", tuple(frames))
         object.__setattr__(self, "bodies", tuple(bodies))
         object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
-        object.__setattr__(self, "_covers", covers)
+        object.__setattr__(self, "covers", covers)
+        object.__setattr__(self, "_held", held)
 
     def _seen_from(self, one: Body, other: Body) -> str:
         """The link that two bodies are seen from: the last rigid part that carries both."""
@@ -307,7 +315,7 @@ class Surroundings:
     ) -> Expression:
         """Signed distances of pairs, m, exact or from below; see `models.shapes.distance`. Shape (n, 1).
 
-        Where hulls of meshes are looked at it is that of their covers.
+        Of two hulls of meshes it is that of their covers: they are no nearer.
 
         Args:
             base, q: Configuration of the machine. time: s.
@@ -335,7 +343,7 @@ class Surroundings:
 
         found = []
         for pair in chosen:
-            each = [between(*both) for both in self._covers.get(pair, (self.pairs[pair, :2].tolist(),))]
+            each = [between(*both) for both in self._held.get(pair, (self.pairs[pair, :2].tolist(),))]
             found.append(each[0] if len(each) == 1 else soft_minimum(each, rounding / 4 + FINEST))
         return ca.vertcat(*found) if found else expression(q)[:0]
 
@@ -355,7 +363,7 @@ class Surroundings:
     def pair_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> PairGradients:
         """What `distance_gradients` is put together from."""
         chosen, rounding = self._asked(pairs, rounding)
-        groups = [self._covers.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in chosen]
+        groups = [self._held.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in chosen]
         softness = rounding / 4 + FINEST
         return pair_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
 
@@ -373,22 +381,18 @@ class Surroundings:
         Raises:
             ModelError: A slide without limits.
         """
-        robot, machine = self.machine.robot, self.machine
-        n, dof, size = len(self.pairs), robot.dof, machine.base_size
+        n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
-        for row, (one, other, seen) in enumerate(self.pairs):
-            for placed in (self.bodies[one], self.bodies[other]):
-                if not 0 <= placed.frame < len(self._carriers):
-                    continue  # an obstacle
-                above = robot.root if seen == WORLD else self._carriers[seen]
-                reach = self._sum_levers(placed, above, joints[row], turns[row])
-                if seen == WORLD and size == 3:
-                    base[row] += (1.0, 1.0, reach)
-                    base_turns[row] += (0.0, 0.0, 1.0)
-                elif seen == WORLD and size:
-                    base[row] += np.r_[np.ones(3), np.full(4, TURN_OF_QUATERNION * reach)]
-                    base_turns[row] += np.r_[np.zeros(3), np.full(4, TURN_OF_QUATERNION)]
+        known: dict[tuple[int, int], Levers] = {}
+        for row, (one, other, seen) in enumerate(self.pairs.tolist()):
+            for pair in [(one, other), *self.covers.get(row, np.zeros((0, 2), dtype=int)).tolist()]:
+                for body in pair:
+                    if (body, seen) not in known:
+                        known[body, seen] = self._levers_of(self.bodies[body], seen)
+                both = [known[body, seen] for body in pair]
+                for most, *found in zip((base, base_turns, joints, turns), *both, strict=True):
+                    most[row] = np.maximum(most[row], sum(found))
         return Levers(base, base_turns, joints, turns)
 
     def fastest(self, begin: float, end: float) -> tuple[Array, Array]:
@@ -436,10 +440,14 @@ class Surroundings:
         """Whether a link ever moves in world."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
-    def _sum_levers(self, placed: Placed, above: str, levers: Array, turns: Array) -> float:
-        """Add the levers (dof,) and turns (dof,) of the joints from the rigid part of a link above down to a body; the
-        farthest that any of its points comes from that part's origin, m."""
-        robot, parts, link = self.machine.robot, self._parts, self._carriers[placed.frame]
+    def _levers_of(self, placed: Placed, seen: int) -> Levers:
+        """Of one body from where it is seen: a link's frame that it hangs on, or -1, the world."""
+        robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
+        joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
+        found = Levers(base, base_turns, joints, turns)
+        if not 0 <= placed.frame < len(self._carriers):
+            return found  # an obstacle
+        link, above = self._carriers[placed.frame], robot.root if seen == WORLD else self._carriers[seen]
         way = parts.path(parts.of_link[above], parts.of_link[link])[1]
         endless = np.full(robot.dof, np.inf)
         low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
@@ -447,13 +455,17 @@ class Surroundings:
         for (joint, *_), arm in zip(way, own, strict=True):
             column, ratio, _ = robot.drives[joint.name]
             slides = joint.kind == "prismatic"
-            levers[column] += abs(ratio) * (1.0 if slides else arm)
+            joints[column] += abs(ratio) * (1.0 if slides else arm)
             turns[column] += 0.0 if slides else abs(ratio)
-        if not np.isfinite(levers).all() or not np.isfinite(reach):
+        if not np.isfinite(joints).all() or not np.isfinite(reach):
             name = next(joint.name for joint, *_ in way if joint.kind == "prismatic")
             message = f"surroundings: joint {name!r} slides without limits; give it some"
             raise ModelError(message, name=name, value=np.inf)
-        return reach
+        if seen == WORLD and size:
+            planar = size == 3
+            base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [TURN_OF_QUATERNION * reach] * 4
+            base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [TURN_OF_QUATERNION] * 4
+        return found
 
 
 def _named(bodies: Sequence[Body]) -> list[str]:

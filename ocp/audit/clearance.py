@@ -5,8 +5,9 @@ no more than the points' acceleration (:mod:`ocp.problem.separation`). Between t
 
     min(gap at the one, gap at the other) - h^2 / 8 acceleration,
 
-and the distance is no less than the gap. The direction is that in which the bodies are nearest in the middle. Where the
-bound does not settle it, the time between is halved. The plan's own polynomials say how fast its states change.
+and the distance is no less than the gap. The direction is that in which the bodies are nearest in the middle. Of a pair
+that others cover the same is said of each of them, and the least of it is as good. Where the bound does not settle it,
+the time between is halved. The plan's own polynomials say how fast its states change.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
-from ocp.problem.hulls import Frames, frames_of, grouped
+from ocp.problem.hulls import Frames, PairsOfBodies, frames_of
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of
@@ -227,7 +228,7 @@ class _Search:
         for level in range(self.top):
             rates, seconds = (_of_two(values) for values in self.fastest[level])
             self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
-        self.kinds = grouped(tuple(apart.hulls.values()), apart.pairs)
+        self.bodies = PairsOfBodies(tuple(apart.hulls.values()), apart.pairs, apart.covers)
         n = len(apart)
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 
@@ -284,21 +285,15 @@ class _Search:
         """At each pair at the node, or middle of an interval, where the balls about its bodies are nearest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
         times = times[:: -(-len(times) // MOST_TIMES)]
-        frames = self.track.frames(times)
-        when = np.zeros(len(self.apart))
-        for kind in self.kinds:
-            rows = np.arange(len(kind.radii))
-            row, at = (part.ravel() for part in np.meshgrid(rows, np.arange(len(times)), indexing="ij"))
-            when[kind.has] = times[kind.balls(frames, at, row).reshape(len(rows), -1).argmin(axis=1)]
-        self._look(when)
+        n, frames = len(self.apart), self.track.frames(times)
+        pair, at = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(len(times)), indexing="ij"))
+        self._look(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
     def _look(self, when: np.ndarray) -> None:
         """At each pair at one time (n,), a fraction of the horizon."""
-        frames = self.track.frames(when)
-        for kind in self.kinds:
-            pair = np.flatnonzero(kind.has)
-            _, gap, points = kind.nearest(frames, pair, kind.row[pair])
-            self._keep(pair, gap, when[pair], points)
+        pair = np.arange(len(self.apart))
+        _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
+        self._keep(pair, gap, when, points)
 
     def _enough(self) -> np.ndarray:
         """Lower bounds of each pair's distance with which it is settled. Shape (n,), m.
@@ -322,20 +317,18 @@ class _Search:
         first, middle, last = np.split(where, 3)
         frames = self.track.frames(times)
         sway, bow = self._moves(pair, block, level, width)
-        bound, enough = np.full(len(pair), -np.inf), self._enough()
-        for kind in self.kinds:
-            chosen = np.flatnonzero(kind.has[pair])
-            bound[chosen] = kind.balls(frames, middle[chosen], kind.row[pair[chosen]]) - sway[chosen]
-            chosen = chosen[bound[chosen] < enough[pair[chosen]]]
-            if not chosen.size:
-                continue
-            row = kind.row[pair[chosen]]
-            along, gap, points = kind.nearest(frames, middle[chosen], row)
-            self._keep(pair[chosen], gap, times[middle[chosen]], points)
-            bound[chosen] = np.maximum(bound[chosen], gap - sway[chosen])
-            near = (bound[chosen] < enough[pair[chosen]]) & np.isfinite(bow[chosen])
-            chosen, row, along = chosen[near], row[near], along[near]
-            chord = np.minimum(*(kind.gaps(along, frames, at[chosen], row) for at in (first, last)))
+        enough = self._enough()[pair]
+        bound = self.bodies.balls(frames, middle, pair) - sway
+        chosen = np.flatnonzero(bound < enough)
+        if not chosen.size:
+            return bound, self._enough()
+        facing, gap, points = self.bodies.nearest(frames, middle[chosen], pair[chosen])
+        self._keep(pair[chosen], gap, times[middle[chosen]], points)
+        bound[chosen] = np.maximum(bound[chosen], gap - sway[chosen])
+        near = (bound[chosen] < enough[chosen]) & np.isfinite(bow[chosen])
+        chosen, facing = chosen[near], facing.of(near)
+        if chosen.size:
+            chord = self.bodies.chords(facing, frames, (first[chosen], last[chosen]))
             bound[chosen] = np.maximum(bound[chosen], chord - bow[chosen])
         return bound, self._enough()
 

@@ -132,6 +132,7 @@ class Clear:
             turns={name: pair[1] for name, pair in moved.items()},
             speed=pace * speed,
             acceleration=pace**2 * acceleration,
+            covers=around.covers,
         )
         if self.margins:
             pairs = sorted(self.margins)
@@ -197,6 +198,7 @@ def clearance_of(
         turns=levers.joint_turns,
         speed=np.zeros(n),
         acceleration=np.zeros(n),
+        covers=around.covers,
     )
     sampler = Sampler([q], [placements])
     frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))

@@ -16,7 +16,7 @@ from models.arrays import Array
 from models.shapes.distance import COLUMNS, VECTORS, column, pair_columns, pair_function
 from ocp.errors import ProblemError, checked_instance
 from ocp.problem.formulation import Sampler
-from ocp.problem.hulls import Frames, Hull, frames_of, grouped
+from ocp.problem.hulls import Covered, Frames, Hull, frames_of, grouped
 
 __all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
 
@@ -93,16 +93,24 @@ def _measured(surroundings: Surroundings, base: Array, joints: Array, times: Arr
     frames = frames_of(pairs.placements(places, joints, np.reshape(times, (-1, 1)))[0])
     apart = pairs.balls(frames)
     sample, pair = np.nonzero(~(apart >= near))
-    for lot in pairs.lots:
-        chosen = lot.has[pair]
-        at, which = sample[chosen], pair[chosen]
-        if at.size:
-            apart[at, which] = lot.measure(frames, at, np.cumsum(lot.has)[which] - 1)
+    place, row = pairs.covered.of(pair)
+    gap, count = np.full(len(row), -np.inf), len(pair)
+
+    def measure(some: np.ndarray) -> None:
+        for lot in pairs.lots:
+            chosen = some[lot.has[row[some]]]
+            if chosen.size:
+                gap[chosen] = lot.measure(frames, sample[place[chosen]], np.cumsum(lot.has)[row[chosen]] - 1)
+
+    measure(np.arange(count, len(row)))
+    covered = gap[pairs.covered.decisive(place, gap, count)]
+    measure(np.flatnonzero(~(covered >= near)))  # hulls are dear, and need not be looked at where covers are apart
+    apart[sample, pair] = gap[pairs.covered.decisive(place, gap, count)]
     return np.where(np.isfinite(apart), apart, -np.inf)
 
 
 class _Lot(NamedTuple):
-    """Pairs that are measured alike: whether a pair is one of them, shape (n,), and how."""
+    """Rows of pairs that are measured alike: whether a row is one of them, shape (n + m,), and how."""
 
     has: Array
     measure: Measure
@@ -112,7 +120,8 @@ class _Pairs:
     """All pairs of surroundings.
 
     Attributes:
-        placements: Function (base, joints, time) -> placements. lots: The pairs by kind.
+        placements: Function (base, joints, time) -> placements. covered: The pairs and what covers them.
+        lots: Its rows by kind.
     """
 
     def __init__(self, surroundings: Surroundings) -> None:
@@ -121,25 +130,23 @@ class _Pairs:
         time = ca.SX.sym("time")
         self.placements = Sampler([base, joints, time], [ca.SX(surroundings.placements(base, joints, time))])
         hulls = tuple(hulls_of(surroundings).values())
+        self.covered = Covered(pairs, surroundings.covers)
         self._one, self._other = pairs[:, 0], pairs[:, 1]
         self._riding = np.array([hull.frame for hull in hulls])
-        self._middles = np.array([hull.core.mean(axis=0) for hull in hulls])
-        reach = [
-            np.linalg.norm(hull.core - middle, axis=1).max() + hull.radius
-            for hull, middle in zip(hulls, self._middles, strict=True)
-        ]
-        self._reach = np.array(reach)
+        self._middles = np.array([hull.middle for hull in hulls])
+        self._reach = np.array([hull.size + hull.radius for hull in hulls])
         self._grounds = [k for k, body in enumerate(bodies) if isinstance(body.shape, HalfSpace)]
         self._normals = {k: hulls[k].normal for k in self._grounds}
-        kinds = [tuple(type(bodies[k].shape) for k in pair[:2]) for pair in pairs]
+        rows = self.covered.rows
+        kinds = [tuple(type(bodies[k].shape) for k in row[:2]) for row in rows]
         simple = np.array([set(both) <= COLUMNS.keys() for both in kinds])
         self.lots = []
         for both in dict.fromkeys(both for both, known in zip(kinds, simple, strict=True) if known):
             has = np.array([one == both for one in kinds])
-            self.lots.append(_Lot(has, _by_formula(surroundings, np.flatnonzero(has), both)))
+            self.lots.append(_Lot(has, _by_formula(surroundings, rows[has], both)))
         others = np.flatnonzero(~simple)
-        for group in grouped(hulls, pairs[others]):
-            has = np.zeros(len(pairs), dtype=bool)
+        for group in grouped(hulls, rows[others]):
+            has = np.zeros(len(rows), dtype=bool)
             has[others[group.has]] = True
             self.lots.append(_Lot(has, lambda *given, group=group: group.nearest(*given)[1]))
 
@@ -154,12 +161,15 @@ class _Pairs:
         return np.asarray(apart - self._reach[self._one] - self._reach[self._other])
 
 
-def _by_formula(surroundings: Surroundings, members: np.ndarray, kinds: tuple[Any, ...]) -> Measure:
+def _by_formula(surroundings: Surroundings, rows: np.ndarray, kinds: tuple[Any, ...]) -> Measure:
     """Distances of pairs of two kinds of shapes that have columns, see `models.shapes.distance`."""
     distance, beside = pair_function(*kinds), pair_columns(kinds[0], kinds[1], 0.0, SIDE)
-    placed = [[surroundings.bodies[k] for k in surroundings.pairs[members, side]] for side in (0, 1)]
-    columns = [np.array([np.array(column(body.shape)).ravel() for body in side]) for side in placed]
-    riding = [np.array([body.frame for body in side]) for side in placed]
+    columns, riding = [], []
+    for side in (0, 1):
+        some, which = np.unique(rows[:, side], return_inverse=True)
+        placed = [surroundings.bodies[k] for k in some]
+        columns.append(np.array([np.array(column(body.shape)).ravel() for body in placed])[which])
+        riding.append(np.array([body.frame for body in placed])[which])
 
     def measured(frames: Frames, at: Array, row: Array) -> Array:
         sides = []

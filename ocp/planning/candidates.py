@@ -25,7 +25,7 @@ from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
 from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, clear_postures, misfits_of, others_told
 from ocp.problem.values import constant
-from ocp.refinement import refine, split
+from ocp.refinement import refined, split
 from ocp.solution import Solution
 
 __all__ = ["TOUCHES", "Maker", "coarse_motions", "fine_motions"]
@@ -219,7 +219,7 @@ def fine_motions(maker: Maker, coarse: list[Candidate], first: bool, every: bool
                     beyond = max(beyond, 2 * abs(solved.cost - one.cost) / max(solved.cost, np.finfo(float).tiny))
                 least = min(least, solved.cost)
                 break
-    if failures and not np.isfinite(least):
+    if failures and not np.isfinite(least) and not barred:
         told = _once_each(told + _other_sides(maker, coarse))
     named = {tuple(one.start) for one in told}
     return told + [replace(one, solution=None) for one in alike if tuple(one.start) not in named]
@@ -427,8 +427,7 @@ class Maker:
                 warnings.simplefilter("ignore", RefinementWarning)
                 same = _mesh_of(mesh, solution)
                 options = _options(motion, same, solution.cost, SOLVER)
-                solution = refine(motion.problem, same, guess=solution, options=options)
-            audit = solution.audit()
+                solution, audit = refined(motion.problem, same, solution, audit, options)
             if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution)) is not solution:
                 solution, audit = finer, finer.audit()
         return solution, audit

@@ -7,8 +7,9 @@ is a lower bound of the distance, so that nobody need trust the search.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,10 @@ import numpy as np
 from ocp.errors import ProblemError
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Frames", "Hull", "HullPairs", "frames_of", "gap_along", "grouped", "nearest_directions"]
+__all__ = [
+    "Covered", "Facing", "Frames", "Hull", "HullPairs", "PairsOfBodies", "frames_of", "gap_along", "grouped",
+    "nearest_directions",
+]  # fmt: skip
 
 STEPS = 64
 CLOSE = 1e-12
@@ -65,6 +69,16 @@ class Hull:
         object.__setattr__(self, "core", core)
         object.__setattr__(self, "normal", normal)
 
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """Of its points. Shape (3,), m."""
+        return np.asarray(self.core.mean(axis=0))
+
+    @cached_property
+    def size(self) -> float:
+        """Radius of the ball about the middle of its points that holds them, m."""
+        return float(np.linalg.norm(self.core - self.middle, axis=1).max())
+
 
 class Frames(NamedTuple):
     """Placements in world at M samples, the world itself the last.
@@ -94,11 +108,11 @@ class HullPairs:
         self._cores = [
             np.array([_filled(pair[side].core, count) for pair in chosen]) for side, count in enumerate(counts)
         ]
-        self._middles = [np.array([pair[side].core.mean(axis=0) for pair in chosen]) for side in (0, 1)]
+        self._middles = [np.array([pair[side].middle for pair in chosen]) for side in (0, 1)]
         self._riding = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
         self._seen = pairs[members, 2]
         self.radii = np.array([one.radius + other.radius for one, other in chosen])
-        self.sizes = np.array([_size(one) + _size(other) for one, other in chosen])
+        self.sizes = np.array([one.size + other.size for one, other in chosen])
         self.flat = np.array([bool(one.normal.size or other.normal.size) for one, other in chosen])
         self.normals = np.array([_normal(*pair) for pair in chosen])
 
@@ -141,6 +155,108 @@ class HullPairs:
         return np.asarray(gap_along(along, *self.points(frames, at, row)) - self.radii[row])
 
 
+class Covered:
+    """Pairs of bodies, and those that cover some of them.
+
+    What covers a pair holds its two bodies between them: both say from below how far it is apart, so that it is as far
+    apart as the pair itself says, or as the nearest of what covers it, whichever is farther. A hull fills what is
+    hollow; covers of its parts do not, and stand out.
+
+    Attributes:
+        rows: The n pairs, below them what covers them, each seen from where its pair is. Shape (n + m, 3).
+    """
+
+    def __init__(self, pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
+        below = [np.column_stack([both, np.full(len(both), pairs[pair, 2])]) for pair, both in covers.items()]
+        self.rows = np.concatenate([pairs, *below]).astype(int)
+        self._counts, self._first = np.zeros(len(pairs), dtype=int), np.zeros(len(pairs), dtype=int)
+        for pair, both in covers.items():
+            self._first[pair] = len(pairs) + self._counts.sum()
+            self._counts[pair] = len(both)
+
+    def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rows of pairs (K,), these first, and to which of the K each belongs: places, rows. Shape (R,) each."""
+        many = self._counts[pair]
+        place = np.repeat(np.arange(len(pair)), many)
+        own = np.arange(len(place)) - (np.cumsum(many) - many)[place]
+        return np.concatenate([np.arange(len(pair)), place]), np.concatenate([pair, self._first[pair][place] + own])
+
+    @staticmethod
+    def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
+        """Which of R rows says how far each of K pairs is apart. Shape (K,).
+
+        Args:
+            place: As of `of`. gap: How far each row is apart. Shape (R,), m. count: K.
+        """
+        found = np.arange(count)
+        order = count + np.lexsort((gap[count:], place[count:]))
+        nearest = order[np.unique(place[order], return_index=True)[1]]
+        farther = nearest[gap[nearest] > gap[place[nearest]]]
+        found[place[farther]] = farther
+        return found
+
+
+class Facing(NamedTuple):
+    """Along what the rows of K pairs of bodies are nearest, see `Covered.of`.
+
+    Attributes:
+        place, row: Shape (R,). along: Unit vectors from the first body to the other, seen from where they are. (R, 3).
+    """
+
+    place: np.ndarray
+    row: np.ndarray
+    along: np.ndarray
+
+    def of(self, some: np.ndarray) -> Facing:
+        """Of some pairs alone. Shape (K,), whether."""
+        kept = some[self.place]
+        return Facing((np.cumsum(some) - 1)[self.place[kept]], self.row[kept], self.along[kept])
+
+
+class PairsOfBodies:
+    """Pairs of bodies, what covers them, and how far they are apart; see `Covered`."""
+
+    def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
+        self._covered = Covered(pairs, covers)
+        self._kinds = grouped(hulls, self._covered.rows)
+
+    def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
+        """How far balls that hold the bodies of pairs are apart at samples. Shape (K,) each, m."""
+        found = np.empty(len(pair))
+        for kind, chosen, row in self._by_kind(pair):
+            found[chosen] = kind.balls(frames, at[chosen], row)
+        return found
+
+    def nearest(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> tuple[Facing, np.ndarray, np.ndarray]:
+        """Along what the bodies of pairs are nearest at samples, shape (K,) each, how far they are apart (K,), m, and
+        the nearest points of what the radii swell (K, 2, 3), m, seen from where they are."""
+        place, rows = self._covered.of(pair)
+        along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
+        for kind, chosen, row in self._by_kind(rows):
+            along[chosen], gap[chosen], points[chosen] = kind.nearest(frames, at[place[chosen]], row)
+        told = self._covered.decisive(place, gap, len(pair))
+        return Facing(place, rows, along), gap[told], points[told]
+
+    def chords(self, facing: Facing, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
+        """How far the bodies of pairs are apart along what others told, the less of both ends of a time. Shape (K,), m.
+
+        What says so is one and the same at both: that a pair is apart at one and what covers it at the other says
+        nothing of the time between.
+        """
+        gap = np.empty(len(facing.row))
+        for kind, chosen, row in self._by_kind(facing.row):
+            along, place = facing.along[chosen], facing.place[chosen]
+            gap[chosen] = np.minimum(*(kind.gaps(along, frames, at[place], row) for at in ends))
+        return np.asarray(gap[self._covered.decisive(facing.place, gap, len(ends[0]))])
+
+    def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
+        """Of each kind which of the rows are of it, and their places among its own."""
+        for kind in self._kinds:
+            chosen = np.flatnonzero(kind.has[rows])
+            if chosen.size:
+                yield kind, chosen, kind.row[rows[chosen]]
+
+
 def grouped(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
     """Pairs of hulls and the frame that they are seen from, (n, 3), -1 for the world, by their numbers of points."""
     kinds: dict[tuple[int, int], list[int]] = {}
@@ -165,11 +281,6 @@ def frames_of(placements: np.ndarray) -> Frames:
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
     return Frames(np.swapaxes(values[:, :, :3], 2, 3), values[:, :, 3])
-
-
-def _size(hull: Hull) -> float:
-    """Radius of the ball about the middle of its points that holds them."""
-    return float(np.linalg.norm(hull.core - hull.core.mean(axis=0), axis=1).max())
 
 
 def _normal(one: Hull, other: Hull) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
 from ocp.problem.hulls import Hull
-from ocp.problem.separation import Separation
+from ocp.problem.separation import Separation, index_rows
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
     check_finite,
@@ -347,6 +347,7 @@ class Problem:
         turns: Mapping[str, Any],
         speed: Any = 0.0,
         acceleration: Any = 0.0,
+        covers: Mapping[int, Any] | None = None,
     ) -> None:
         """Declare bodies that have to stay apart at every time, which the audit proves and no method holds.
 
@@ -361,13 +362,14 @@ class Problem:
             levers, turns: By the name of a state: how far, and by what angle, it moves and turns one body seen from the
                 other at most, by its unit; see :mod:`ocp.problem.separation`. Shape (n, size) each.
             speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,) or a number.
+            covers: By the place of a pair, pairs of bodies that hold its two between them. Shape (m, 2) each.
         """
         self._unused_constraint("separation", name)
         movers = {}
         for each in (*levers, *turns):
             movers[each] = self._find(self.declared.states, each, "separation").size
         parts = {}
-        count = len(table(f"separation {name!r}: pairs", pairs).reshape(-1, 3))
+        count = len(index_rows(f"separation {name!r}", "pairs", pairs, 3))
         for label, given in (("levers", levers), ("turns", turns)):
             what = f"separation {name!r}: {label}"
             columns = [table(what, given.get(each, np.zeros((count, size)))) for each, size in movers.items()]
@@ -377,7 +379,16 @@ class Problem:
         known = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
         frames = self._expression(f"separation {name!r}: placements", placements, [*known, self.time])
         self.declared.apart[name] = Separation(
-            name, frames, dict(hulls), pairs, least, movers, speed=speed, acceleration=acceleration, **parts
+            name,
+            frames,
+            dict(hulls),
+            pairs,
+            least,
+            movers,
+            speed=speed,
+            acceleration=acceleration,
+            covers={} if covers is None else covers,
+            **parts,
         )
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:

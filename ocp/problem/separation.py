@@ -17,17 +17,17 @@ that of Coriolis: an axis that comes later moves points no farther than by its l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ocp.errors import ProblemError, checked_text
-from ocp.problem.hulls import Hull
+from ocp.errors import ProblemError, checked_mapping, checked_text
+from ocp.problem.hulls import Covered, Hull
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Separation"]
+__all__ = ["Separation", "index_rows"]
 
 WORLD = -1
 """In the place of a frame: the world."""
@@ -49,6 +49,8 @@ class Separation:
         levers, turns: As above, of the states in ``movers`` one after the other. Shape (n, k), in m and rad by the unit
             of the state.
         speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,), m/s and m/s^2.
+        covers: By the place of a pair, pairs of bodies, shape (m, 2), that hold its two between them: where the nearest
+            of these is farther apart than the pair is by itself, it is so far apart. Levers and turns hold for all.
 
     Raises:
         ProblemError: Other shapes, what is not finite, or negative, a body or frame that there is none of.
@@ -64,24 +66,36 @@ class Separation:
     turns: np.ndarray
     speed: np.ndarray
     acceleration: np.ndarray
+    covers: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         what = f"separation {checked_text('separation: its name', self.name)!r}"
-        pairs = table(f"{what}: pairs", self.pairs).astype(int).reshape(-1, 3)
+        pairs = index_rows(what, "pairs", self.pairs, 3)
         n, k = len(pairs), sum(self.movers.values())
         frames, rest = divmod(int(self.placements.numel()), 12)
         if rest:
             words = f"{what}: placements have {self.placements.numel()} entries, 12 for each frame expected"
             raise ProblemError(words, name="placements", value=self.placements.numel())
-        if n and (
-            pairs[:, :2].min() < 0 or pairs[:, :2].max() >= len(self.hulls) or (pairs[:, 0] == pairs[:, 1]).any()
-        ):
-            raise ProblemError(f"{what}: a pair is not one of two of the {len(self.hulls)} bodies", name="pairs")
+        covers: dict[int, np.ndarray] = {}
+        for pair, both in checked_mapping(f"{what}: covers", self.covers).items():
+            if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < n:
+                words = f"{what}: covers: there is no pair {pair!r}, only {n}"
+                raise ProblemError(words, name="covers", value=pair, limit=n)
+            covers[int(pair)] = index_rows(what, "covers", both, 2)
+        object.__setattr__(self, "covers", {pair: both for pair, both in covers.items() if len(both)})
+        for label, both in (("pairs", pairs[:, :2]), *(("covers", each) for each in covers.values())):
+            if both.size and (both.min() < 0 or both.max() >= len(self.hulls) or (both[:, 0] == both[:, 1]).any()):
+                words = f"{what}: {label}: a pair is not one of two of the {len(self.hulls)} bodies"
+                raise ProblemError(words, name=label)
         riding = [hull.frame for hull in self.hulls.values()]
         if not all(WORLD <= frame < frames for frame in [*riding, *pairs[:, 2]]):
             raise ProblemError(f"{what}: a frame is none of the {frames} placed", name="frame", limit=frames)
         hulls = tuple(self.hulls.values())
-        if any(hulls[k].normal.size and hulls[k].frame != seen for *bodies, seen in pairs for k in bodies):
+        if any(
+            hulls[k].normal.size and hulls[k].frame != seen
+            for *bodies, seen in Covered(pairs, self.covers).rows
+            for k in bodies
+        ):
             words = f"{what}: a half-space has to be seen from the frame that it rides on, where it stands still"
             raise ProblemError(words, name="pairs")
         object.__setattr__(self, "pairs", pairs)
@@ -116,4 +130,14 @@ class Separation:
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         parts |= {label: getattr(self, label)[keep] for label in ("speed", "acceleration")}
-        return Separation(self.name, self.placements, self.hulls, movers=self.movers, **parts)
+        covers = {place: self.covers[pair] for place, pair in enumerate(keep) if pair in self.covers}
+        return Separation(self.name, self.placements, self.hulls, movers=self.movers, covers=covers, **parts)
+
+
+def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
+    """Rows of so many whole numbers, or ProblemError."""
+    found = table(f"{what}: {label}", values)
+    if found.size % count or (found.ndim == 2 and found.size and found.shape[1] != count) or (found % 1 != 0).any():
+        words = f"{what}: {label} must be rows of {count} indices, not {values!r}"
+        raise ProblemError(words, name=label, value=values)
+    return found.astype(int).reshape(-1, count)

@@ -103,7 +103,10 @@ def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
 
 
 def _by_coal(around: Surroundings, joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Distances of some pairs at joints (M, n). Shape (M, all pairs), inf for those left out."""
+    """Distances of some pairs at joints (M, n). Shape (M, all pairs), inf for those left out.
+
+    Hulls of meshes are as far apart as they are, or as the nearest of their covers, whichever is farther.
+    """
     q = ca.SX.sym("q", joints.shape[1])
     placed = ca.Function("placed", [q], [around.placements((), q)]).map(len(joints))
     frames = np.array(placed(joints.T)).T.reshape(len(joints), -1, 4, 3)
@@ -111,22 +114,27 @@ def _by_coal(around: Surroundings, joints: np.ndarray, pairs: np.ndarray) -> np.
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
     found = np.full((len(joints), len(around.pairs)), np.inf)
+
+    def apart(one: int, other: int, m: int) -> float:
+        sides = []
+        for body in (one, other):
+            geometry, place = bodies[body]
+            frame = around.bodies[body].frame
+            if frame >= 0:
+                turn = frames[m, frame, :3].T
+                place = coal.Transform3s(
+                    turn @ place.getRotation(), turn @ place.getTranslation() + frames[m, frame, 3]
+                )
+            sides += [geometry, place]
+        result.clear()
+        return float(coal.distance(*sides, request, result))
+
     for k in pairs:
-        one, other = around.pairs[k, :2]
         for m in range(len(joints)):
-            sides = []
-            for body in (one, other):
-                geometry, own = bodies[body]
-                frame = around.bodies[body].frame
-                place = own
-                if frame >= 0:
-                    turn = frames[m, frame, :3].T
-                    place = coal.Transform3s(
-                        turn @ own.getRotation(), turn @ own.getTranslation() + frames[m, frame, 3]
-                    )
-                sides += [geometry, place]
-            result.clear()
-            found[m, k] = coal.distance(*sides, request, result)
+            one, other = around.pairs[k, :2].tolist()
+            found[m, k] = apart(one, other, m)
+            if k in around.covers:
+                found[m, k] = max(found[m, k], min(apart(i, j, m) for i, j in around.covers[k].tolist()))
     return found
 
 

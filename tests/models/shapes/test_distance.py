@@ -478,3 +478,16 @@ def test_the_kinds_without_a_column_are_named() -> None:
     for call in calls:
         with pytest.raises(ModelError):
             call()
+
+
+def test_a_mesh_is_seen_past_its_edges_and_corners() -> None:
+    """A cube of corners beside a ball: exact across faces, edges and corners, never nearer than 0.8 of the box's."""
+    cube = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    mesh, box = Mesh(cube), Box((0.2, 0.2, 0.2))
+    for way in ((1, 0, 0), (0, -1, 1), (1, 1, -1)):
+        ball = Sphere(0.05, np.abs(way) * 0.1 * np.sign(way) + 0.3 * np.array(way) / np.linalg.norm(way))
+        assert float(ca.DM(distance(mesh, ball))) == pytest.approx(0.25, abs=1e-9)
+    for way in np.random.default_rng(0).normal(size=(50, 3)):
+        ball = Sphere(1e-3, 0.5 * way / np.linalg.norm(way))
+        told, true = (float(ca.DM(distance(body, ball))) for body in (mesh, box))
+        assert 0.8 * true <= told <= true + 1e-9

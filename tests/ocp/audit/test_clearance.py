@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -33,7 +33,7 @@ def flight(
     problem.dynamics(q, v)
     problem.dynamics(v, u)
     problem.minimize(ca.sumsqr(u) / 2)
-    count = len(np.reshape(pairs, (-1, 3)))
+    count = len(pairs)
     problem.separate(
         "clearance",
         ca.vertcat(EYE, q),
@@ -198,6 +198,127 @@ def test_time_and_length_rescaled_change_no_verdict() -> None:
         assert_allclose(found.worst.time / horizon, 0.5, atol=0.05)
 
 
+# ---- what is hollow ----------------------------------------------------------------------------------------------
+
+BARS = {
+    f"bar {k}": Hull(-1, np.array([[0.2, y, z], [0.8, y, z]]), 0.05)
+    for k, (y, z) in enumerate(((0.3, 0.0), (-0.3, 0.0), (0.0, -0.5)))
+}
+HOLLOW = {"ball": BALL, "frame": Hull(-1, np.vstack([bar.core for bar in BARS.values()]), 0.05), **BARS}
+"""A ball, the hull of three bars, and the bars, between which it flies."""
+OF_BARS = {0: [[0, 2], [0, 3], [0, 4]]}
+
+
+def test_what_flies_through_a_hollow_is_as_far_off_as_what_covers_it() -> None:
+    """The hull fills it; the nearest bar is 0.15 m off all the way, which is proven to a micrometre."""
+    hull = proof(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], 0.1)).worst
+    assert hull is not None
+    assert hull.distance < -0.1
+    for asked, passes in ((0.1, True), (0.15 - 2e-6, True), (0.15 + 2e-6, False)):
+        found = proof(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], asked, covers=OF_BARS))
+        assert found.settled
+        assert found.worst is not None
+        assert (found.worst.missed == 0) == passes
+        assert found.worst.bodies == ("ball", "frame")
+        assert_allclose(found.worst.distance, 0.15, atol=1e-9)
+        assert found.worst.least == pytest.approx(0.15, abs=1.1e-3)
+        assert found.looked < 2000  # the bound of second order holds for what covers, too
+        ball, bar = found.worst.points
+        assert_allclose(bar, [min(max(ball[0], 0.2), 0.8), np.copysign(0.3, bar[1]), 0.0], atol=1e-9)
+
+
+def test_covers_that_stand_out_take_nothing_away() -> None:
+    """Beside bars that are swelled the hull says more; one bar that always touches leaves what the hull says."""
+    thick = {name: replace(bar, radius=0.1) for name, bar in BARS.items()}
+    touching = {**BARS, "bar 2": Hull(0, np.zeros((1, 3)), 0.1)}
+    for bars in (thick, touching):
+        problem = flight([0, 0.6, 0], [1, 0.6, 0], {**HOLLOW, **bars}, [[0, 1, -1]], 0.1, covers=OF_BARS)
+        found = proof(problem)
+        assert found.settled
+        assert found.worst is not None
+        assert_allclose(found.worst.distance, 0.15, atol=1e-9)
+
+
+def test_a_fault_between_bars_and_between_nodes_is_found() -> None:
+    """A post thinner than a step that stands in the hollow is one of what covers."""
+    post = {"bar 1": Hull(-1, np.array([[0.437, 0.1, 0.0]]), 1e-5)}
+    for least, passes in ((-1e-3, True), (1e-3, False)):
+        problem = flight([0, 0, 0], [1, 0, 0], {**HOLLOW, **post}, [[0, 1, -1]], least, covers=OF_BARS)
+        found = proof(problem, 4)
+        assert found.settled
+        assert found.worst is not None
+        assert (found.worst.missed == 0) == passes
+        assert not found.worst.missed or found.worst.time == pytest.approx(0.45, abs=0.05)
+
+
+@given(st.integers(0, 10**6))
+@example(3289)  # the hull says how far they are apart at one end of an interval, what covers it at the other
+@settings(max_examples=10, deadline=None)
+def test_with_covers_it_is_the_larger_of_both_at_every_time(seed: int) -> None:
+    """Beside a fine sampling, however the hulls lie; some pairs with covers and some without, in any order."""
+    rng = np.random.default_rng(seed)
+    hulls = {"flying": Hull(0, rng.normal(size=(2, 3)) * 0.2, 0.05)}
+    pairs, covers = [], {}
+    for i in range(3):
+        middle, first = rng.normal(size=3) * 0.4, len(hulls)
+        parts = [Hull(-1, middle + rng.normal(size=(2, 3)) * 0.3, rng.uniform(0.02, 0.1)) for _ in range(3)]
+        whole = Hull(-1, np.vstack([part.core for part in parts]), 0.03)
+        hulls |= {f"hull {i}": whole} | {f"part {i} {k}": part for k, part in enumerate(parts)}
+        if i != 1:
+            covers[i] = [[0, first + 1 + k] for k in range(3)]
+        pairs.append([0, first, -1])
+    problem = flight([-2, 0.1, 0], [2, 0.1, 0.3], hulls, pairs, 0.0, covers=covers)
+    solution = solve(problem, Collocation(5, 3))
+    found, bodies = solution.audit().clearances["clearance"], tuple(hulls.values())
+    q = solution.at(np.linspace(0, 1, 2001))["q"]
+
+    def apart(other: int) -> np.ndarray:
+        sides = bodies[0].core[None] + q[:, None], np.tile(bodies[other].core, (len(q), 1, 1))
+        return np.asarray(gap_along(nearest_directions(*sides)[0], *sides) - bodies[0].radius - bodies[other].radius)
+
+    for one in found.pairs:
+        i = int(one.bodies[1].split()[1])
+        told = apart(pairs[i][1])
+        if i in covers:
+            told = np.maximum(told, np.min([apart(other) for _, other in covers[i]], axis=0))
+        sampled = told.min()
+        assert one.least <= max(sampled, 0.0) + 1e-9
+        if sampled > 0:
+            assert one.distance >= sampled - 2e-3
+            if found.settled and one is found.worst:
+                assert one.least >= sampled - 0.021 * sampled - 2e-6
+        else:
+            assert one.least <= 0.0
+
+
+def test_covers_stay_with_their_pair() -> None:
+    """Whichever pairs are taken, however often they are saved."""
+    count = 3
+    pairs = [[0, 2, -1], [0, 1, -1], [3, 0, -1]]
+    apart = Separation(
+        "clearance", ca.SX.sym("place", 12), HOLLOW, np.array(pairs), np.zeros(count), {"q": 3},
+        np.ones((count, 3)), np.zeros((count, 3)), np.zeros(count), np.zeros(count),
+        {1: np.array(OF_BARS[0]), 2: np.zeros((0, 2))},
+    )  # fmt: skip
+    assert list(apart.covers) == [1]
+    some = apart.of([2, 1])
+    assert list(some.covers) == [1]
+    assert_allclose(some.covers[1], OF_BARS[0])
+    assert not apart.of([0, 2]).covers
+    assert not apart.of([]).covers
+
+
+def test_covers_are_saved_with_a_plan(tmp_path: Any) -> None:
+    solution = solve(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], 0.1, covers=OF_BARS), Collocation(6, 3))
+    solution.save(tmp_path / "plan.npz")
+    found = Solution.load(tmp_path / "plan.npz").audit().clearances["clearance"].worst
+    assert found is not None
+    assert found.missed == 0
+
+
+# ---- what bends, and how finely it is looked at --------------------------------------------------------------------
+
+
 def swinging(low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.0) -> Clearance:
     """A point on a slide on an arm that turns, past a floor 1 m below where it passes the axis.
 
@@ -357,6 +478,16 @@ BAD: dict[str, dict[str, Any]] = {
     "least-of-another-size": {"least": [0.0, 1.0]},
     "speed-negative": {"speed": -1.0},
     "acceleration-text": {"acceleration": "fast"},
+    "covers-of-no-pair": {"covers": {1: [[0, 1]]}},
+    "covers-of-a-truth": {"covers": {True: [[0, 1]]}},
+    "covers-by-name": {"covers": {"a": [[0, 1]]}},
+    "covers-of-itself": {"covers": {0: [[1, 1]]}},
+    "covers-of-none": {"covers": {0: [[0, -1]]}},
+    "covers-nan": {"covers": {0: [[0, np.nan]]}},
+    "covers-of-three": {"covers": {0: [[0, 1, 1]]}},
+    "pairs-between-bodies": {"pairs": [[0, 0.5, -1]]},
+    "pairs-of-two": {"pairs": [[0, 1]]},
+    "covers-text": {"covers": "all"},
     "half-space-that-moves": {"hulls": {"a": BALL, "b": Hull(0, np.zeros((1, 3)), 0.0, np.array([0, 0, 1.0]))}},
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import coal
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -25,11 +26,13 @@ from models import (
 )
 from models.arrays import Array
 from models.shapes.distance import COLUMNS
+from models.shapes.mesh_files import find_mesh, read_mesh
 from models.spatial import skew
 from ocp import ProblemError
 from ocp.local.touching import checked_surroundings, distances_along, hulls_of, touches
 from tests.models.machines.armoured import armoured_arm
 from tests.models.machines.test_surroundings import OBSTACLES, machines, postures, turned
+from tests.ocp.tasks.space_tasks import panda, ur5
 
 MOVING = Moving(OBSTACLES[1], lambda t: (0.3, 0.2 * t, 0.2), lambda t: turned(t))
 TIMES = np.linspace(0.0, 3.0, 30)
@@ -158,3 +161,60 @@ def test_surroundings_are_those_of_the_machine_with_its_limits() -> None:
         with pytest.raises(ProblemError) as caught:
             checked_surroundings(around, owner, limits)
         assert caught.value.name == "surroundings"
+
+
+def triangles(machine: FixedBase, link: str) -> Any:
+    """The meshes of a link by coal, in its frame."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(0, 0)
+    for shape in machine.robot.link(link).collisions:
+        path = find_mesh(shape.file, shape.folder or None, [])
+        assert path is not None
+        vertices, faces = read_mesh(path)
+        for corners in (vertices * shape.size @ np.array(shape.rotation).T + shape.translation)[faces]:
+            model.addTriangle(*corners)
+    model.endModel()
+    return model
+
+
+def test_meshes_are_no_nearer_than_their_hulls_and_covers_say() -> None:
+    """Beside their triangles by coal: both are bounds from below, the larger is told, and what is held is told."""
+    seen, hollow = np.sum([beside_triangles(machine) for machine in (ur5(), panda())], axis=0)
+    assert seen > 60
+    assert hollow > 5  # where covers are farther apart than hulls
+
+
+def beside_triangles(machine: FixedBase) -> tuple[int, int]:
+    """How many pairs of hulls in random postures are looked at, and how many of them are held as far as is told."""
+    around = Surroundings(machine)
+    assert around.covers
+    rng = np.random.default_rng(3)
+    low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
+    joints = rng.uniform(low, high, (1000, machine.joint_size))
+    pairs = list(around.covers)
+    told = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))[:, pairs]
+    near = np.flatnonzero(((told > 0) & (told < 0.03)).any(axis=1))[:40]
+    joints, told = joints[near], told[near]
+    q = ca.SX.sym("q", machine.joint_size)
+    places = ca.Function("places", [q], [around.placements((), q)])
+    held = ca.Function("held", [q], [around.distances((), q, pairs=pairs)])
+    meshes = {name: triangles(machine, name.split(" hull ")[0]) for pair in pairs for name in around.labels[pair]}
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    seen, hollow = 0, 0
+    for at, apart in zip(joints, told, strict=True):
+        frames = np.array(places(at)).reshape(-1, 4, 3)
+        least = np.array(held(at)).ravel()
+        assert (np.minimum(least, 0.0) <= apart + 1e-9).all()  # what is held apart is apart
+        for k, pair in enumerate(pairs):
+            if not 0 < apart[k] < 0.03:
+                continue
+            sides: list[Any] = []
+            for body in around.pairs[pair, :2]:
+                turn, shift = frames[around.bodies[body].frame, :3].T, frames[around.bodies[body].frame, 3]
+                sides += [meshes[around.bodies[body].name], coal.Transform3s(turn, shift)]
+            result.clear()
+            true = coal.distance(*sides, request, result)
+            assert apart[k] <= true + 1e-7
+            seen += 1
+            hollow += bool(least[k] > apart[k] - 1e-9)
+    return seen, hollow
