@@ -157,7 +157,7 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
         names = [f"{row['robot']}, {row['plan']}" for row in rows]
         left.barh(range(len(rows)), [row["ratio"] for row in rows], 0.6, color=drawing.COLORS["blue"])
         for k, row in enumerate(rows):
-            left.text(row["ratio"], k, f" {row['plan_s']:.2f} s", va="center", fontsize=7)
+            left.text(0.05, k, f"{row['plan_s']:.2f} s", va="center", fontsize=7, color="white")
             if row["plan"] in GOALS:
                 left.plot([GOALS[row["plan"]]] * 2, [k - 0.35, k + 0.35], color="black", lw=1)
         left.set(yticks=range(len(rows)), yticklabels=names, xlabel="times the plain plan", xlim=(0, 5))
