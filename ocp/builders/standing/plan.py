@@ -13,13 +13,14 @@ import numpy as np
 from models.machines.standing import External, Standing
 from ocp.audit.audit import Audit
 from ocp.builders.clearance import Clear, keeping_clear, touching_error
+from ocp.builders.standing.pace import guess_in_time
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.builders.standing.stances import Steps
 from ocp.builders.standing.steps import StepWeights, steps_problem
-from ocp.console import interruptible
+from ocp.console import interruptible, limited, time_left
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping
+from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -154,19 +155,24 @@ def plan_steps(
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
+    time_limit: float | None = None,
     **asked: Unpack[AskedOfSteps],
 ) -> Solution:
     """Solve `steps_problem` and audit the plan; tightened and on finer meshes as `plan_standing` does.
 
-    The first plan that holds is returned; of one that is not decided to be a minimum its audit says so.
+    The first plan that holds is returned; of one that is not decided to be a minimum its audit says so. First a coarse
+    mesh tells whether the steps can be taken in their times at all (`ocp.builders.standing.pace`).
 
     Args:
         steps, start_joints, asked: As for steps_problem.
         method: The first mesh, of each phase; 12 intervals of degree 3 if None.
         options, tolerances: As for plan_standing.
+        time_limit: After so many seconds it gives up, solvers between two iterations. None for no limit.
 
     Raises:
-        SolveError: No attempt leads to a plan that holds; says what became of each.
+        SolveError: The quickest steps that were found take longer than asked: names the phase, and how long it takes.
+            However long they may take there are none: names what would have to give way. Or no attempt leads to a plan
+            that holds; says what became of each.
         ProblemError: As steps_problem.
     """
     if method is not None:
@@ -174,7 +180,9 @@ def plan_steps(
     settings = {**IPOPT, **checked_mapping("options", options)}
     trials: list[Formulation] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
-    return _first_that_holds(lambda _: steps_problem(steps, start_joints, **asked), trials, settings, judge)
+    with limited(checked_time_limit(time_limit)):
+        guess = guess_in_time(steps, start_joints, asked, settings)
+        return _first_that_holds(lambda _: steps_problem(steps, start_joints, **asked), trials, settings, judge, guess)
 
 
 def _first_that_holds(
@@ -182,8 +190,9 @@ def _first_that_holds(
     trials: Sequence[Formulation],
     settings: Mapping[str, Any],
     judge: _Judge,
+    guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """The plan that `plan_standing` returns, of the formulations that are tried.
+    """The plan that `plan_standing` returns, of the formulations that are tried, from a guess where there is one.
 
     Raises:
         SolveError, ProblemError: As it does; at once where a plan is sound but for bodies that touch.
@@ -201,7 +210,8 @@ def _first_that_holds(
             if len(refused) == len(trials):
                 raise refused[0] from None
             continue
-        for attempt in _attempts(problem, level, mesh, settings, judge, diagnosed=level == trials[-1][0]):
+        diagnosed = guess is None and level == trials[-1][0]
+        for attempt in _attempts(problem, level, mesh, settings, judge, guess, diagnosed=diagnosed):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
             if attempt.touching:
@@ -239,22 +249,23 @@ def _attempts(
     mesh: Collocation | MultipleShooting,
     settings: Mapping[str, Any],
     judge: _Judge,
+    guess: Solution | Mapping[str, Any] | None,
     *,
     diagnosed: bool,
 ) -> Iterator[Attempt]:
     """Attempts at one formulation; whoever takes them stops at the first that holds.
 
     Args:
+        guess: Of the first; None: that of the problem.
         diagnosed: Whether a first solve that fails looks for what conflicts, which takes long.
     """
-    guess: Solution | None = None
-    for _ in range(MESHES):
+    for k in range(MESHES):
         name = f"{_tip(level)}{mesh.intervals} intervals"
-        first = diagnosed and guess is None
+        first = diagnosed and k == 0
         attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
         yield attempt
         guess = attempt.solution
-        if guess is None or not guess.success:
+        if attempt.solution is None or not attempt.solution.success or time_left() <= 0:
             return
         if attempt.exceeded:
             drawn_in = partial(tighten, problem, mesh, options=settings, guess=guess)

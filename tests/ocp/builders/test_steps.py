@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable
 from copy import copy
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -25,6 +28,7 @@ from ocp.builders.standing import (
     walk,
 )
 from ocp.builders.standing.loads import motion_of, sampled
+from ocp.builders.standing.pace import guess_in_time
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
 from tests.models.robot.trees import numeric, numeric_poses
@@ -288,6 +292,53 @@ def test_steps_that_cannot_be_are_refused_by_name(step: tuple[Steps, Solution, S
     for call, words in refusals:
         with pytest.raises(ProblemError, match=words):
             call()
+
+
+def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> None:
+    """Given that time, it can be taken."""
+    fast = planar_steps(1, 0.05, 0.06)
+    with pytest.raises(SolveError, match="too fast") as refusal:
+        plan_steps(fast, bent(fast), **GROUND)
+    error = refusal.value
+    assert (error.name, error.limit) == ("2 left", 0.06)
+    assert re.search(r"phase '2 left': 0\.\d+ s, 0\.06 s are asked; at their limits .*(torques|velocities)", str(error))
+    assert error.value > 1.3 * 0.06
+    assert guess_in_time(planar_steps(1, 0.05, 1.05 * error.value), bent(fast), GROUND, {}) is not None
+
+
+@pytest.mark.long
+def test_steps_that_no_time_makes_possible_are_refused_with_what_would_have_to_give_way() -> None:
+    steps = planar_steps(1, 0.5, 0.6)
+    joints = tuple(replace(joint, effort=3.0) for joint in steps.robot.joints)
+    weak = replace(steps, robot=replace(steps.robot, joints=joints))
+    with pytest.raises(SolveError, match="no steps were found, however long they may take") as refusal:
+        plan_steps(weak, bent(weak), options={"max_iter": 100}, **GROUND)
+    error = refusal.value
+    assert error.conflicts
+    assert error.conflicts[0].label == error.name
+    assert error.value > 0
+
+
+@pytest.mark.long
+def test_steps_of_talos_that_are_too_fast_are_refused_soon() -> None:
+    fast = talos_steps(2, 0.05, 0.08)
+    begin = time.process_time()
+    with pytest.raises(SolveError, match="too fast") as refusal:
+        plan_steps(fast, bent(fast), clearance=0.04, **GROUND)
+    assert time.process_time() - begin < 20.0
+    assert refusal.value.name == "4 right"
+
+
+@pytest.mark.long
+def test_steps_near_the_quickest_are_planned_in_the_time_that_they_may_have() -> None:
+    """From the guess of a plan slower than they are, no plan is found within 300 iterations."""
+    steps = planar_steps(2, 0.1, 0.2)
+    coarse = Collocation(12, degree=3, scheme="legendre")
+    problem = steps_problem(steps, bent(steps), **GROUND)
+    guess = guess_in_time(steps, bent(steps), GROUND, {})
+    assert solve(problem, coarse, guess=guess, options={"max_iter": 300}, check=False).success
+    with pytest.raises(SolveError, match="12 intervals"):
+        plan_steps(steps, bent(steps), time_limit=2.0, **GROUND)
 
 
 # ---- two steps -------------------------------------------------------------------------------------------------------
