@@ -17,7 +17,7 @@ from tqdm import tqdm
 from models import ModelError
 from ocp import ProblemError, SolveError
 from scripts.papers.run import write
-from scripts.robots.robots import PANDA, SPACE_ARM, UR5
+from scripts.robots.robots import PANDA, SPACE_ARM, TALOS, UR5
 
 EXAMPLES: Mapping[str, str] = {
     "space_arm": SPACE_ARM.package,
@@ -29,6 +29,7 @@ EXAMPLES: Mapping[str, str] = {
     "pick_and_place": PANDA.package,
     "capture": SPACE_ARM.package,
     "steps": "selfmotion",
+    "talos": TALOS.package,
 }
 """Modules of this folder, each with `plan(coarse)`, which gives what its `draw(example, folder, animation=)` draws and
 has `summary()` and `audit`; and the distributions that the robots come from; that of `steps` is our own."""
@@ -68,7 +69,7 @@ def run(names: Sequence[str], folder: Path, *, coarse: bool = False) -> tuple[di
             rows[name] = example.summary()
             write(folder / f"{name}.audit.txt", f"{example.audit}\n")
             module.draw(example, folder, animation=not coarse)
-            if not example.audit.passed:
+            if not example.audit.feasible or example.audit.optimal is False:
                 failed[name] = f"the plan fails its audit:\n{example.audit}"
             write(folder / "summary.json", _merged(folder / "summary.json", rows))
             bar.update()

@@ -77,6 +77,12 @@ UR5 = RobotFile(
         "tip_rotation": [[1.0, 0.0, 0.0], [0.0, _COSINE, -_SINE], [0.0, _SINE, _COSINE]],
     },
 )
+TALOS = RobotFile(
+    "TALOS",
+    "example-robot-data",
+    "talos_data/robots/talos_reduced_box.urdf",
+    {"tip": "base_link", "inertia": "as_given"},
+)
 
 
 def missing(packages: Iterable[str]) -> list[str]:

@@ -21,7 +21,18 @@ from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.files import read_trajectory
 from scripts import gallery
-from scripts.robots import capture, capture_family, panda, pick_and_place, posture_set, pushing, robots, steps, ur5
+from scripts.robots import (
+    capture,
+    capture_family,
+    panda,
+    pick_and_place,
+    posture_set,
+    pushing,
+    robots,
+    steps,
+    talos,
+    ur5,
+)
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
@@ -199,6 +210,19 @@ def test_the_biped_walks_in_balance_and_faster_without(tmp_path: Path) -> None:
     assert row["com_margin_optimal_m"] < 0 < row["com_margin_static_m"]
     assert row["zmp_margin_optimal_m"] > 0.99 * steps.MARGIN
     with Image.open(tmp_path / "steps.png") as picture:
+        assert min(picture.size) > 500
+
+
+def test_talos_walks_in_balance_and_faster_without(tmp_path: Path) -> None:
+    rows, failed = run(["talos"], tmp_path, coarse=True)
+    row = rows["talos"]
+    assert not failed
+    assert row["audit_feasible"]
+    assert row["duration_s"] < row["duration_static_s"] / 2
+    assert row["com_margin_optimal_m"] < 0 < row["com_margin_static_m"]
+    assert row["zmp_margin_optimal_m"] > 0.99 * talos.KINDS["as a whole"]["margin"]
+    assert row["peak_torque_share"] <= 1 + 1e-6
+    with Image.open(tmp_path / "talos.png") as picture:
         assert min(picture.size) > 500
 
 

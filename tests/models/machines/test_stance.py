@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, rerooted
 from models.robot.dynamics import base_reaction
 from models.robot.motion import link_motions
+from scripts.robots.robots import TALOS
 from scripts.robots.steps import SIDES, planar_biped, planar_feet
-from tests.models.robot.pinocchio_robots import urdf_file
+from scripts.robots.talos import HELD, talos_steps
 from tests.models.robot.trees import Array, numeric, numeric_poses, random_frame, random_robot
-from tests.ocp.builders.bipeds import HELD, TALOS, talos_steps
 
 few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -68,7 +68,7 @@ def test_the_feet_bear_the_rate_of_momentum_that_pinocchio_finds(held: tuple[str
     steps = talos_steps(1, 1.0, 1.0)
     footholds = {name: Foothold.level(rng.normal(), rng.normal(), rng.normal()) for name in held}
     stance = Stance.on(steps.robot, steps.feet, footholds)
-    model = pinocchio.buildModelFromUrdf(str(urdf_file(*TALOS)), pinocchio.JointModelFreeFlyer())
+    model = pinocchio.buildModelFromUrdf(str(TALOS.path), pinocchio.JointModelFreeFlyer())
     data = model.createData()
     for _ in range(3):
         q, qd, qdd = rng.normal(size=(3, stance.joint_size))

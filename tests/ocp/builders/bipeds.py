@@ -1,4 +1,4 @@
-"""One that walks beside the planar biped of the gallery: TALOS, which loads with flat soles and limits of torque."""
+"""The friction that steps of bipeds are tested with, their mirror images, and machines of another size."""
 
 from __future__ import annotations
 
@@ -6,33 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from models import Foot, Foothold, Robot
-from ocp.builders.standing import Steps
-from scripts.robots.steps import SIDES, alternating
-from tests.models.robot.pinocchio_robots import urdf_file
+from models import Foot, Foothold, Robot, Support
+from ocp.builders.standing import StancePhase, Steps
+from scripts.robots.steps import SIDES
 
 FRICTION = 0.6
-TALOS = ("example-robot-data", "talos_data/robots/talos_reduced_box.urdf")
-HELD = {
-    f"arm_{side}_{joint}_joint": angle * sign
-    for side, sign in (("left", 1), ("right", -1))
-    for joint, angle in (("1", 0.25), ("2", 0.17), ("4", -0.6 * sign))
-}
-"""Joints of TALOS's arms that do not hang straight down, rad."""
-
-
-def talos() -> Robot:
-    """TALOS with its legs free: 90 kg, 12 joints."""
-    file = urdf_file(*TALOS)
-    whole = Robot.from_urdf(file, inertia="as_given")
-    held = {name: HELD.get(name, 0.0) for name in whole.joint_names if not name.startswith("leg")}
-    return Robot.from_urdf(file, inertia="as_given", lock=held, tip="base_link")
-
-
-def talos_steps(count: int, shift: float, swing: float, *, first: str = "right", length: float = 0.2) -> Steps:
-    robot = talos()
-    feet = {side: Foot.of(robot, f"leg_{side}_6_link") for side in SIDES}
-    return Steps(robot, feet, alternating(count, shift, swing, first=first, length=length, wide=0.085))
 
 
 def mirrored(steps: Steps) -> Steps:
@@ -48,3 +26,37 @@ def mirrored(steps: Steps) -> Steps:
         for phase in steps.phases
     ]
     return replace(steps, phases=tuple(phases))
+
+
+def resized(steps: Steps, size: float) -> Steps:
+    """A machine of other lengths and equal density, torques as its weight, in the times that its pendulums take."""
+    time = np.sqrt(size)
+    links = tuple(
+        replace(
+            link,
+            mass=size**3 * link.mass,
+            center_of_mass=size * np.asarray(link.center_of_mass),
+            inertia=size**5 * np.asarray(link.inertia),
+            visuals=(),
+        )
+        for link in steps.robot.links
+    )
+    joints = tuple(
+        replace(
+            joint,
+            translation=size * np.asarray(joint.translation),
+            velocity=None if joint.velocity is None else joint.velocity / time,
+            effort=None if joint.effort is None else joint.effort * size**4,
+        )
+        for joint in steps.robot.joints
+    )
+    feet = {}
+    for name, foot in steps.feet.items():
+        assert foot.sole is not None
+        sole = Support(size * np.asarray(foot.sole.vertices))
+        feet[name] = Foot(foot.link, sole, size * np.asarray(foot.translation), foot.rotation)
+    phases = []
+    for phase in steps.phases:
+        places = {name: Foothold(size * np.asarray(at.position), at.rotation) for name, at in phase.footholds.items()}
+        phases.append(StancePhase(places, phase.seconds * time))
+    return Steps(Robot(links, joints, name=steps.robot.name, tip=steps.robot.tip), feet, phases, steps.gravity)

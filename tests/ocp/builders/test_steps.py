@@ -20,6 +20,7 @@ from ocp.builders.standing import (
     StancePhase,
     Steps,
     StepsMotion,
+    StepWeights,
     plan_steps,
     resolve_steps,
     standing_posture,
@@ -31,8 +32,9 @@ from ocp.builders.standing.loads import motion_of, sampled
 from ocp.builders.standing.pace import guess_in_time
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
+from scripts.robots.talos import talos_steps
 from tests.models.robot.trees import numeric, numeric_poses
-from tests.ocp.builders.bipeds import FRICTION, mirrored, talos_steps
+from tests.ocp.builders.bipeds import FRICTION, mirrored, resized
 from tests.ocp.builders.steps_replay import replay
 from tests.ocp.problem.test_phases import failed, moved
 
@@ -137,6 +139,21 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     assert again == pytest.approx(cost, rel=1e-7)
     np.testing.assert_allclose(left.joints[:, [3, 4, 5, 0, 1, 2]], right.joints, rtol=0, atol=1e-6)
     np.testing.assert_allclose(left.loads["left"], right.loads["right"], rtol=0, atol=1e-3)
+
+
+def test_a_machine_of_another_size_takes_the_same_steps_at_the_same_cost() -> None:
+    """Lengths times s, masses s^3, torques s^4, times sqrt(s): all that is asked scales, and so does the motion."""
+    steps, coarse = planar_steps(1, 0.6, 0.7), Collocation(4, degree=3, scheme="legendre")
+    start, plans = bent(steps), []
+    for size in (1.0, 3.0):
+        unit = np.sqrt(size)
+        weights = StepWeights(acceleration=0.01 * unit**3, velocity=0.01 * unit, joint_limits=1 / unit, load=0.0)
+        asked = {**GROUND, "margin": MARGIN * size, "clearance": 0.02 * size, "weights": weights}
+        plans.append(solve(steps_problem(resized(steps, size), start, **asked), coarse))
+    one, large = plans
+    assert large.cost == pytest.approx(one.cost, rel=1e-7)
+    for name in ("1 left + right.joints", "2 left.joints", "3 left + right.joints"):
+        np.testing.assert_allclose(large[name], one[name], rtol=0, atol=1e-5)
 
 
 def docking_arm() -> tuple[Robot, dict[str, Foot]]:

@@ -1,0 +1,219 @@
+"""Gallery: TALOS takes two steps, in balance all the way and dynamically.
+
+90 kg on two legs of six joints each; its arms are held still. The walks of the planar biped (`scripts.robots.steps`) in
+space: the zero moment point goes from sole to sole, sideways too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from models import Foot, FreeFloating, Robot
+from models.arrays import Array
+from ocp import Audit, Collocation, Limits, Solution
+from ocp.app.frames import frames_along
+from ocp.builders.standing import Steps, StepsMotion, plan_steps, steps_motion
+from scripts.drawing import COLORS
+from scripts.robots.drawing import Scene, animate, page
+from scripts.robots.robots import TALOS
+from scripts.robots.steps import SIDES, alternating, bent
+
+__all__ = ["HELD", "draw", "plan", "talos", "talos_steps"]
+
+HELD = {
+    f"arm_{side}_{joint}_joint": angle * sign
+    for side, sign in (("left", 1), ("right", -1))
+    for joint, angle in (("1", 0.25), ("2", 0.17), ("4", -0.6 * sign))
+}
+"""Joints of the arms that do not hang straight down, rad."""
+WIDE = 0.085  # of the feet from the middle, m
+LENGTH = 0.2  # of a step, m
+FRICTION = 0.6
+CLEARANCE = 0.04  # of a sole in the middle of its way, m
+KINDS: dict[str, dict[str, Any]] = {
+    "in balance": {"balance": "static", "margin": 0.03, "times": (2.0, 2.0), "color": "orange"},
+    "as a whole": {"balance": "dynamic", "margin": 0.01, "times": (0.8, 0.8), "color": "blue"},
+}
+"""What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s.
+
+The margin of the first is what ground and servos that give take at the corner of a sole, where it stands long."""
+METHOD = Collocation(12, degree=3, scheme="legendre")
+VIEW = (13.0, -58.0)  # deg
+
+
+@dataclass(frozen=True, eq=False)
+class TalosExample:
+    """Two walks over the same footholds, by their names in KINDS.
+
+    Attributes:
+        plans: Audited. motions: What they take. audits: Of each.
+    """
+
+    plans: dict[str, Solution]
+    motions: dict[str, StepsMotion]
+    audits: dict[str, Audit]
+
+    @property
+    def audit(self) -> Audit:
+        """Of the plan that is not sound, if one is not, else of the dynamic one."""
+        return next((audit for audit in self.audits.values() if not audit.feasible), [*self.audits.values()][-1])
+
+    def summary(self) -> dict[str, Any]:
+        """A row of the summary."""
+        careful, whole = (self.motions[name] for name in KINDS)
+        slow, fast = careful.summary(), whole.summary()
+        share = np.abs(whole.joint_torques).max(axis=0) / whole.steps.robot.effort
+        return {
+            "robot": TALOS.name,
+            "dof": whole.steps.robot.dof,
+            "task_rows": None,
+            "duration_s": fast["duration_s"],
+            "duration_static_s": slow["duration_s"],
+            "cost_local": None,
+            "cost_optimal": float(self.plans["as a whole"].cost),
+            "tip_error": None,
+            "joint_return_rad": None,
+            "audit_passed": all(audit.passed for audit in self.audits.values()),
+            "audit_feasible": all(audit.feasible for audit in self.audits.values()),
+            "zmp_margin_optimal_m": fast["zmp_margin_min_m"],
+            "com_margin_optimal_m": fast["com_margin_min_m"],
+            "com_margin_static_m": slow["com_margin_min_m"],
+            "friction": fast["friction_max"],
+            "peak_torque_share": float(share.max()),
+        }
+
+
+def talos() -> Robot:
+    """TALOS with its legs free: 90 kg, 12 joints.
+
+    Raises:
+        FileNotFoundError: It is not installed; says what to install.
+    """
+    names = TALOS.read().joint_names
+    held = {name: HELD.get(name, 0.0) for name in names if not name.startswith("leg")}
+    return Robot.from_urdf(TALOS.path, lock=held, **TALOS.options)
+
+
+def talos_steps(count: int, shift: float, swing: float, *, first: str = "right", length: float = LENGTH) -> Steps:
+    """Steps of TALOS; see `scripts.robots.steps.alternating`."""
+    robot = talos()
+    feet = {side: Foot.of(robot, f"leg_{side}_6_link") for side in SIDES}
+    return Steps(robot, feet, alternating(count, shift, swing, first=first, length=length, wide=WIDE))
+
+
+def plan(coarse: bool = False) -> TalosExample:
+    """Both walks, audited; from one mesh, `coarse` or not."""
+    plans = {}
+    for name, kind in KINDS.items():
+        steps = talos_steps(2, *kind["times"])
+        plans[name] = plan_steps(
+            steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
+            clearance=CLEARANCE, method=METHOD,
+        )  # fmt: skip
+    return example_of(plans)
+
+
+def example_of(plans: dict[str, Solution]) -> TalosExample:
+    """What plans take."""
+    motions = {name: steps_motion(talos_steps(2, *KINDS[name]["times"]), plan) for name, plan in plans.items()}
+    return TalosExample(plans, motions, {name: plan.audit() for name, plan in plans.items()})
+
+
+def scenes_of(example: TalosExample) -> list[Scene]:
+    """Both walks, the zero moment point marked."""
+    found = []
+    for name, motion in example.motions.items():
+        turn = Rotation.from_matrix(motion.root_rotation).as_quat(scalar_first=True)
+        machine = FreeFloating(motion.steps.robot)
+        frames = frames_along(machine, motion.joints, np.column_stack([motion.root_position, turn]))
+        found.append(
+            Scene(
+                f"{name}: {motion.t[-1]:.1f} s", motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=VIEW,
+                floor=0.0, mark=motion.zero_moment_point,
+            )
+        )  # fmt: skip
+    return found
+
+
+def draw(example: TalosExample, folder: Path, *, animation: bool = True) -> None:
+    """talos.png and talos.gif."""
+    careful, whole = (example.motions[name] for name in KINDS)
+    out = -whole.summary()["com_margin_min_m"]
+    title = (
+        f"With its center of mass up to {1000 * out:.0f} mm outside its feet TALOS walks in {whole.t[-1]:.1f} s "
+        f"instead of {careful.t[-1]:.1f} s"
+    )
+    note = (
+        f"TALOS, {whole.steps.robot.total_mass:.0f} kg, takes two steps; earlier postures pale, disc: zero moment "
+        f"point. Its arms are held still, its legs have twelve joints; steps of {LENGTH:g} and {2 * LENGTH:g} m, soles "
+        f"of 210 by 130 mm. In balance, its center of mass stays {1000 * KINDS['in balance']['margin']:g} mm inside "
+        "the soles that are held; as a whole only the zero moment point does, by "
+        f"{1000 * KINDS['as a whole']['margin']:g} mm. Friction at most {FRICTION:g}, torques and rates within its "
+        f"description, soles {1000 * CLEARANCE:g} mm above the ground in the middle of their way, feet land at rest; "
+        "the durations are given, and both walks are the cheapest found in theirs by the same weights."
+    )
+    scenes = scenes_of(example)
+    with page(folder / "talos.png", scenes, 4, height=6.8, share=1.55, note=note, title=title) as (above, loads, mass):
+        _seen_from_above(above, example)
+        _loads(loads, whole)
+        _momentum(mass, whole)
+    if animation:
+        animate(folder / "talos.gif", scenes, frames=44, seconds=0.12, note=note)
+
+
+def _seen_from_above(ax: Any, example: TalosExample) -> None:
+    """The soles on the ground, the zero moment point of the dynamic walk, and both centers of mass."""
+    whole = example.motions["as a whole"]
+    soles = {
+        (name, tuple(place.position)): (place, foot)
+        for phase in whole.steps.phases
+        for name, place in phase.footholds.items()
+        if (foot := whole.steps.feet[name])
+    }
+    for place, foot in soles.values():
+        corners = np.asarray(place.position) + foot.corners @ np.asarray(place.rotation).T
+        ax.fill(corners[:, 0], corners[:, 1], color=COLORS["grey"], alpha=0.3, lw=0)
+    points = whole.zero_moment_point
+    ax.plot(points[:, 0], points[:, 1], color=COLORS["blue"], lw=1.1, label="zero moment point")
+    for name, dashes in zip(KINDS, (":", "--"), strict=True):
+        way = example.motions[name].center_of_mass
+        ax.plot(way[:, 0], way[:, 1], color=COLORS[KINDS[name]["color"]] if dashes == ":" else "black", ls=dashes,
+                lw=1.1, label=f"center of mass, {name}")  # fmt: skip
+    ax.set(title="support, from above", xlabel="forward, m", ylabel="to the left, m", ylim=(-0.2, 0.5))
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.legend(loc="upper left", fontsize=6.0, handlelength=1.6)
+
+
+def _loads(ax: Any, motion: StepsMotion) -> None:
+    """What each foot bears, over the weight: pressing, and along the ground."""
+    weight = motion.steps.stances[0].weight
+    for side, color in zip(SIDES, ("blue", "orange"), strict=True):
+        force = motion.loads[side][:, 3:] / weight
+        ax.plot(motion.t, force[:, 2], color=COLORS[color], lw=1.2, label=f"{side}, pressing")
+        ax.plot(
+            motion.t, np.hypot(force[:, 0], force[:, 1]), color=COLORS[color], ls=":", lw=1.2, label=f"{side}, along"
+        )
+    ax.set(title="as a whole: forces", xlabel="time, s", ylabel="load of a foot over the weight", ylim=(-0.05, 1.75))
+    ax.legend(loc="upper center", ncols=2, fontsize=6.3, handlelength=1.6)
+
+
+def _momentum(ax: Any, motion: StepsMotion) -> None:
+    """Momentum of the whole, by its mass and the velocity of its center."""
+    mass = motion.steps.robot.total_mass
+    parts: list[Array] = []
+    for k in range(len(motion.steps.phases)):
+        inside = motion.phase == k
+        parts.append(mass * np.gradient(motion.center_of_mass[inside], motion.t[inside], axis=0, edge_order=2))
+    momentum = np.vstack(parts)
+    for i, (name, color, dashes) in enumerate(
+        (("forward", "blue", "-"), ("to the left", "orange", "--"), ("up", "black", ":"))
+    ):
+        line = "black" if color == "black" else COLORS[color]
+        ax.plot(motion.t, momentum[:, i], color=line, ls=dashes, lw=1.2, label=name)
+    ax.set(title="as a whole: momentum", xlabel="time, s", ylabel="momentum, kg m/s")
+    ax.legend(loc="upper left", fontsize=6.3, handlelength=1.6)
