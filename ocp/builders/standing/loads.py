@@ -72,9 +72,13 @@ class StepsMotion:
         points[~self.held(foot)] = np.nan
         return np.asarray(points)
 
+    def _force(self, foot: str) -> Array:
+        """On a foot, in the axes of its sole. Shape (M, 3), N."""
+        return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
+
     def friction(self, foot: str) -> Array:
         """Force along the sole over that which presses it: the coefficient it takes; nan in the air. Shape (M,)."""
-        force = np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:])
+        force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
         return np.asarray(np.where(self.held(foot), needed, np.nan))
@@ -86,7 +90,7 @@ class StepsMotion:
             "duration_s": float(self.t[-1]),
             "zmp_margin_min_m": float(np.nanmin(self.margin)),
             "com_margin_min_m": float(np.nanmin(self.balance)),
-            "pressure_min_n": float(min(self.loads[name][self.held(name), 5].min() for name in soles)),
+            "pressure_min_n": float(min(self._force(name)[self.held(name), 2].min() for name in soles)),
             "friction_max": float(max(np.nanmax(self.friction(name)) for name in soles)),
             "peak_joint_velocity": float(np.abs(self.joint_velocities).max()),
             "peak_joint_torque": float(np.abs(self.joint_torques).max()),

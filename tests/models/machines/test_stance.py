@@ -143,6 +143,58 @@ def test_at_rest_the_center_of_pressure_is_under_the_center_of_mass() -> None:
             assert float(stance.grip(name, loads[name], 0.5)) == pytest.approx((0.5 * stance.weight) ** 2)
 
 
+def test_what_a_sole_bears_does_not_depend_on_where_and_how_it_lies() -> None:
+    """A foothold and its load moved and turned together: same pressure, same rooms at the edges and in friction."""
+    rng = np.random.default_rng(2)
+    steps = talos_steps(1, 1.0, 1.0)
+    moment, force = rng.normal(size=3), rng.normal(size=3) + np.array([0.0, 0.0, 5.0])
+    found = []
+    for turn, place in ((np.eye(3), np.zeros(3)), random_frame(rng)):
+        stance = Stance.on(steps.robot, steps.feet, {"left": Foothold(place, turn)})
+        load = ca.DM(np.concatenate([turn @ moment, turn @ force]))
+        parts = (stance.pressure("left", load), stance.inside("left", load, 0.01), stance.grip("left", load, 0.7))
+        found.append(np.concatenate([numeric(part).ravel() for part in parts]))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+    assert len(found[0]) == 6  # a rectangle has four edges
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.8])
+def test_a_sole_slips_at_friction_times_load_and_turns_at_two_thirds_of_the_radius_of_its_circle(
+    friction: float,
+) -> None:
+    """The circle's middle is that of the sole, which is not its origin; both together take shares as of an ellipse."""
+    sole = rectangle((-0.1, 0.3), (-0.05, 0.15))  # middle at (0.1, 0.05), radius 0.1
+    feet = {name: Foot(f"{name}_foot", sole, (0, 0, -0.08)) for name in SIDES}
+    stance = Stance.on(planar_biped(), feet, {"left": Foothold.level(0.0, 0.0, heading=0.4)})
+    turn = np.asarray(stance.footholds["left"].rotation)
+    pressed, most = 500.0, friction * 500.0
+    middle, heaviest = np.array([0.1, 0.05, 0.0]), 2 / 3 * 0.1 * most
+    for share, along in ((0.0, 0.3), (0.6, -1.2), (1.0, 2.0)):
+        force = np.array([share * most * np.cos(along), share * most * np.sin(along), pressed])
+        twist = np.array([0.0, 0.0, np.sqrt(1 - share**2) * heaviest])
+        for factor, sign in ((1 - 1e-6, 1), (1 + 1e-6, -1)):
+            side = force * [factor, factor, 1]
+            load = np.concatenate([turn @ (factor * twist + np.cross(middle, side)), turn @ side])
+            assert sign * float(stance.grip("left", ca.DM(load), friction)) > 0
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02])
+def test_a_sole_tips_about_the_edge_that_the_center_of_pressure_leaves(margin: float) -> None:
+    """Room at an edge is its distance from the center of pressure, less the margin, times the pressure."""
+    steps = talos_steps(1, 1.0, 1.0)
+    stance = Stance.on(steps.robot, steps.feet, {"right": Foothold.level(0.2, 0.1, heading=0.3)})
+    sole = steps.feet["right"].sole
+    assert sole is not None
+    turn = np.asarray(stance.footholds["right"].rotation)
+    (left, low), (right, high) = (np.asarray(sole.vertices).min(axis=0), np.asarray(sole.vertices).max(axis=0))
+    for x, y in ((0.02, -0.01), (right + 0.01, low), (left, high - 0.03)):
+        force = np.array([30.0, -20.0, 400.0])
+        load = np.concatenate([turn @ np.cross([x, y, 0.0], force), turn @ force])
+        rooms = np.sort(numeric(stance.inside("right", ca.DM(load), margin)).ravel())
+        expected = 400.0 * (np.array([x - left, right - x, y - low, high - y]) - margin)
+        np.testing.assert_allclose(rooms, np.sort(expected), atol=1e-9)
+
+
 def test_the_hull_of_the_soles_holds_exactly_what_they_can_share() -> None:
     """A vertical load anywhere in the hull is shared by points of the soles; outside of it by none."""
     feet = planar_feet()
