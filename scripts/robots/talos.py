@@ -184,8 +184,10 @@ def _seen_from_above(ax: Any, example: TalosExample) -> None:
         way = example.motions[name].center_of_mass
         ax.plot(way[:, 0], way[:, 1], color=COLORS[KINDS[name]["color"]] if dashes == ":" else "black", ls=dashes,
                 lw=1.1, label=f"center of mass, {name}")  # fmt: skip
-    ax.set(title="support, from above", xlabel="forward, m", ylabel="to the left, m", ylim=(-0.2, 0.5))
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(
+        title="support, from above", xlabel="forward, m", ylabel="to the left, m", xlim=(-0.14, 0.54), ylim=(-0.2, 0.56)
+    )
+    ax.set_aspect("equal")
     ax.legend(loc="upper left", fontsize=6.0, handlelength=1.6)
 
 
