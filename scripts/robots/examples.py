@@ -24,6 +24,7 @@ EXAMPLES: Mapping[str, str] = {
     "panda": PANDA.package,
     "ur5": UR5.package,
     "posture_set": UR5.package,
+    "reconfiguration": PANDA.package,
     "mobile_manipulator": "example-robot-data",
     "pushing": "example-robot-data",
     "pick_and_place": PANDA.package,

@@ -17,6 +17,7 @@ from PIL import Image
 
 from models import FixedBase, FreeFloating, with_wheels
 from models.arrays import Array
+from models.paths import rest_to_rest
 from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.files import read_trajectory
@@ -28,6 +29,7 @@ from scripts.robots import (
     pick_and_place,
     posture_set,
     pushing,
+    reconfiguration,
     robots,
     steps,
     talos,
@@ -111,6 +113,32 @@ def test_the_cheapest_of_all_postures_lies_in_another_family_than_the_best_condi
         assert far.min() < 0.05  # it runs through the postures that were found
         homes.append(family[own[far.argmin()]])
     assert len(set(homes)) == 1
+
+
+def test_no_posture_of_the_ring_is_reached_from_its_beginning_and_leads_to_its_end(tmp_path: Path) -> None:
+    example = reconfiguration.plan(coarse=True)
+    made, reached = example.made, example.reached
+    assert all(audit.feasible for audit in example.audits)
+    assert all(piece.audit().passed for piece in made.pieces)
+    assert (len(made.reconfigurations), made.fewest) == (1, 1)
+    assert not (reached.from_the_beginning & reached.to_the_end).any()
+    (change,) = made.reconfigurations
+    for own, apart in ((reached.from_the_beginning, made.pieces[0]), (reached.to_the_end, made.pieces[1])):
+        begin = 0.0 if apart is made.pieces[0] else change.time
+        for k in np.flatnonzero((reached.times >= begin) & (reached.times <= begin + apart.horizon)):
+            charts = reached.charts.centers[own & (reached.charts.layer == k)]
+            far = np.abs(charts - apart.at(reached.times[k] - begin)["joints"]).max(axis=1)
+            assert far.min() < 0.07  # each piece runs through its own postures
+    machine, joints = example.machine, np.concatenate([piece["joints"] for piece in made.pieces])
+    times = np.concatenate([begin + piece.t for begin, piece in zip(made.begins, made.pieces, strict=True)])
+    rotations, places = placed(robots.PANDA, joints, machine.robot.tip_link)
+    angle = np.pi * (2 * rest_to_rest(times / reconfiguration.DURATION) - 1)
+    radius = reconfiguration.RADIUS
+    way = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(len(times), reconfiguration.HEIGHT)])
+    np.testing.assert_allclose(places, way, atol=1e-6)
+    np.testing.assert_allclose(rotations, np.broadcast_to(reconfiguration.DOWN, rotations.shape), atol=1e-6)
+    reconfiguration.draw(example, tmp_path, animation=False)
+    assert (tmp_path / "reconfiguration.png").stat().st_size > 1e4
 
 
 def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Gallery) -> None:

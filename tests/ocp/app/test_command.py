@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 
 from models import cache as kept
-from ocp import Plan, ProblemError, SolveError
+from ocp import Plan, PlanInPieces, ProblemError, SolveError, plan_in_pieces
 from ocp.app import main
 from ocp.app.progress import Progress
 from ocp.files.task_file import read_task
@@ -241,7 +242,16 @@ LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link
 """The shoulder limited: on either side of a line across the elbow has to be on the other one."""
 
 
-def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them(tmp_path: Path, capsys: Any) -> None:
+def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_and_fails_where_one_is_missing(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[PlanInPieces]()
+
+    def kept_too(*given: Any, **options: Any) -> PlanInPieces:
+        made.append(plan_in_pieces(*given, **options))
+        return made[0]
+
+    monkeypatch.setattr("ocp.app.planned.plan_in_pieces", kept_too)
     (tmp_path / "robot.urdf").write_text(LIFTED)
     (tmp_path / "line.toml").write_text(
         "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
@@ -261,6 +271,18 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them(
     for before, after in ((first, way), (way, last)):  # each goes on where the one before ends
         np.testing.assert_allclose(before.at(before.horizon)["joints"], after.at(0.0)["joints"], atol=1e-6)
     assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
+    for file in told["written"]:
+        Path(file).unlink()
+    barred = [replace(one, way=None, why="the way is barred") for one in made[0].reconfigurations]
+    monkeypatch.setattr(
+        "ocp.app.planned.plan_in_pieces", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
+    )
+    status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json")
+    assert status == 1  # the pieces are there, and pass
+    told = json.loads(out)
+    assert (told["passed"], told["duration"], told["reconfigurations"][0]["why"]) == (False, None, "the way is barred")
+    assert {Path(file).name for file in told["written"]} == {"line-1.csv", "line-3.csv"}
+    assert not (tmp_path / "line-2.csv").exists()
 
 
 # ---- what is printed -----------------------------------------------------------------------------------------------
