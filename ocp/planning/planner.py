@@ -60,12 +60,10 @@ SearchKind: TypeAlias = Literal["start", "postures", "global"]
 ROUNDED = 1e-9
 """Share of its cost by which a plan may be cheaper than a bound of all."""
 TRIED = 8
-"""Postures that are taken one after the other, the best conditioned first, before all of them are compared."""
-
+"""Postures that are taken one after the other, the best conditioned first, before all of them are compared; and ways of
+each search through cells, the cheapest first. There are hundreds of these, and each takes seconds."""
 AT_ONCE = 4
 """Ways through cells that are solved before the best of them is audited, where one that passes is enough."""
-IN_BRIEF, THOROUGHLY = 8, 4
-"""Of the ways of each search so many are tried, the cheapest first: there are hundreds, and each takes seconds."""
 
 
 @interruptible
@@ -195,10 +193,12 @@ def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
     if searched is not None:
         if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
             raise end
-        found = searched.followed()
-        told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
-        if any(not one.why for one in told):
-            return maker, _bounded(maker.plan(told), searched.bound)
+        for every in (False, True):
+            found = searched.followed(every)
+            if found[0].cost.size:
+                told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
+            if any(not one.why for one in told):
+                return maker, _bounded(maker.plan(told), searched.bound)
         while searched.looked_closer():
             if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
                 raise end
@@ -241,17 +241,15 @@ def _through_cells(maker: Maker, followed: list[Followed], postures: Array, ever
             if ways is found[0] or cost < least[0]:
                 local = coarse_motions(maker, ways, ways[0].joints[:, 0], True, local)
         return fine_motions(maker, local, first=False, every=True)
-    told = list[Candidate]()
-    for most in (IN_BRIEF, THOROUGHLY):
-        maker.brief = most == IN_BRIEF
-        for begin in range(0, most, AT_ONCE):
-            for some in ([part.of(slice(begin, begin + AT_ONCE)) for part in ways] for ways in found):
-                if some[0].cost.size:
-                    told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
-                if any(not one.why for one in told):
-                    return told
-    why = f"not tried, for the {IN_BRIEF} cheapest of its search fail"
-    return told + [Candidate(one, np.nan, why) for ways in found for one in ways[0].joints[IN_BRIEF:, 0]]
+    told, maker.brief = list[Candidate](), True
+    for begin in range(0, TRIED, AT_ONCE):
+        for some in ([part.of(slice(begin, begin + AT_ONCE)) for part in ways] for ways in found):
+            if some[0].cost.size:
+                told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
+            if any(not one.why for one in told):
+                return told
+    why = f"not tried, for the {TRIED} cheapest of its search fail"
+    return told + [Candidate(one, np.nan, why) for ways in found for one in ways[0].joints[TRIED:, 0]]
 
 
 def _bounded(made: Plan, bound: float) -> Plan:

@@ -48,8 +48,6 @@ MOTIONS = 12
 """Classes of motions that are followed up, the cheapest first."""
 FAR = 3.0
 """Share of the least cost beyond which they are not."""
-WITHIN = (1.5, 1.5, 1.0)
-"""Share of the least cost within which classes are kept to be followed up, by the directions that are free."""
 SAME = 0.1
 """rad or m: motions nearer to each other than this everywhere are one."""
 WHOLE = 1e-9
@@ -151,13 +149,16 @@ class Search:
 
     # ---- motions -------------------------------------------------------------------------------------------------
 
-    def motions(self, most: float) -> list[Array]:
+    def motions(self, most: float, every: bool = False) -> list[Array]:
         """Joints at the instants, (K, n), of the cheapest motion of each class, by rising cost of their steps.
+
+        After `best` of those that may be the cheapest, for what the bound leaves open.
 
         Args:
             most: What one step may cost: that of a motion that is known, or inf.
+            every: Also of classes that are dearer.
         """
-        if self._known is None:
+        if self._known is None or every:
             graph = self.graph(self.layers, np.full(len(self.times) - 1, most))
             self._known = graph, graph.to_come(), None
         graph, to_come, passed = self._known
@@ -236,8 +237,7 @@ class Search:
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
-        free = max(0, *(instant.sets.size for instant in self.instants))
-        share = 1 - GAPS[free]
+        share = 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
         layers, best = self.first(most)
         if not layers:
             return None, np.inf
@@ -249,8 +249,8 @@ class Search:
         rest: list[Values] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
-            # beyond that nothing is looked for: classes at first, then bounds
-            far = (WITHIN[free] if coarse else share) * least
+            # beyond that nothing is looked for: a class at first, whose motion steps miss some of, then bounds
+            far = least / share if coarse else share * least
             to_come = graph.to_come(rest, far)
             if coarse:
                 self._known = graph, to_come, None

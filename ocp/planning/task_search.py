@@ -184,10 +184,13 @@ class TaskSearch:
                 return listed
             raise placed(asked, error, time) from error
 
-    def followed(self) -> list[Followed]:
-        """The cheapest motion of each class through all stretches, as what a plan begins from."""
+    def followed(self, every: bool = False) -> list[Followed]:
+        """The cheapest motion of each class through all stretches, as what a plan begins from.
+
+        Of the classes that may be the cheapest; of `every` one where these do not pass.
+        """
         asked, found = self.asked, list[Followed]()
-        ways = self._search.motions(self._known)
+        ways = self._search.motions(self._known, every)
         if self._best is not None:
             ways.insert(0, self._best)
         paths = [self._turned(path) for path in ways]

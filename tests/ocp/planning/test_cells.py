@@ -164,10 +164,9 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
     monkeypatch.setattr(Maker, "solved", fails)
     with pytest.raises(SolveError, match="fails") as caught:
         plan(machine, task, start=START, clearance=None)
-    assert sum(brief) == sum(min(size, 8) for size in sizes)
-    assert brief[-1] is False
-    rest = sum(max(size - 8, 0) for size in sizes)
+    tried = sum(min(size, 8) for size in sizes)
+    assert brief in ([True] * tried, [False] + [True] * tried)  # the local motion at first
+    rest = sum(sizes) - tried
     assert f"{rest} of {len(brief) + rest} postures: not tried, for the 8 cheapest of its search fail" in str(
         caught.value
     )
-    assert len(brief) - sum(brief) - sum(min(size, 4) for size in sizes) in (0, 1)  # and the local motion at first

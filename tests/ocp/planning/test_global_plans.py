@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Plan, ProblemError, TipTask, Unreachable, plan
+from ocp import Candidate, Plan, ProblemError, TipTask, Unreachable, plan
+from ocp.planning import planner
+from ocp.planning.candidates import Maker, fine_motions
+from ocp.planning.search import Search
 from ocp.planning.task_search import instants_of
 from tests.ocp.planning.test_charts import moved, planar
 from tests.ocp.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -49,6 +53,33 @@ def test_the_bound_follows_weights_and_pace() -> None:
     assert heavy.cost == pytest.approx(5 * one.cost, rel=1e-6)
     assert one.bound is not None
     assert heavy.bound == pytest.approx(5 * one.bound, rel=0.01)
+
+
+def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
+    asked, failed = list[bool](), list[Candidate]()
+
+    def followed(search: Search, most: float, every: bool) -> list[np.ndarray]:
+        asked.append(every)
+        return motions(search, most, every)
+
+    def failing(maker: Maker, coarse: list[Candidate], first: bool) -> list[Candidate]:
+        if asked[-1]:
+            return fine_motions(maker, coarse, first)
+        failed.extend(replace(one, why="fails") for one in coarse)
+        return failed
+
+    motions = Search.motions
+    monkeypatch.setattr(Search, "motions", followed)
+    monkeypatch.setattr(planner, "fine_motions", failing)
+    found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
+    assert asked == [False, True]
+    assert failed
+    assert found.audit().passed
+    assert found.bound is not None
+    assert 0.98 * found.cost <= found.bound <= found.cost
 
 
 def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:

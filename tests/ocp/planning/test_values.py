@@ -104,6 +104,20 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("seed", [5, 10])
+def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheapest(seed: int) -> None:
+    machine, _, places, weights = random_case(seed)
+    search = search_of(machine, places, Squares(weights))
+    path, _ = search.best(np.inf)
+    assert path is not None
+    told, every = ([search.steps(way) for way in search.motions(np.inf, each)] for each in (False, True))
+    assert told == sorted(told)
+    assert every == sorted(every)
+    assert told[0] <= 1.02 * search.steps(path)  # one of a few is drawn from chart to chart, not tight
+    assert every[0] <= told[0] * 1.01
+    assert every[-1] > 1.3 * told[-1]
+
+
 def flat_charts(rng: np.random.Generator, count: int, scale: Array, free: int, half: float) -> Charts:
     """Charts of sets that lie flat, their boxes cut at random."""
     n = len(scale)
