@@ -104,6 +104,16 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("seed", [0, 13])
+def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
+    machine, _, places, weights = random_case(seed)
+    (path, bound), (other, more) = (
+        search_of(machine, places, Length(own)).best(np.inf) for own in (weights, 100 * weights)
+    )
+    np.testing.assert_allclose(other, path, atol=1e-9)
+    assert more == pytest.approx(100 * bound, rel=1e-9)
+
+
 @pytest.mark.parametrize("seed", [5, 10])
 def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheapest(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
