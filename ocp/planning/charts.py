@@ -39,10 +39,10 @@ SINGULAR = 1e-9
 """Singular value of a task's Jacobian relative to the largest below which a row counts as dependent."""
 REACH = 0.9
 """Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by the rest."""
-BENT = 0.15
-"""Share of its radius by which the set may leave a chart at its edge; the radius is halved until it does not. With one
-direction free a third or twice as much changes neither plan nor bound nor time. With two, half as much takes two to
-three times as long, and with twice as much one of two tasks has no bound any more.
+BENT = (0.1, 0.1, 0.15)
+"""Share of its radius by which the set may leave a chart at its edge, by the directions that are free; the radius is
+halved until it does not. With one, half or four times as much changed neither plan nor bound nor time. With two, half
+as much takes two to three times as long, and with twice as much one of two tasks had no bound any more.
 """
 HALVINGS = 7
 """Of the radius, at most: nearer to singular postures the cover ends, and says so."""
@@ -326,7 +326,7 @@ class SelfMotions:
                 break
             on, apart = self._strays(layer[busy], joints[busy], tangents[busy], radii[busy])
             points[busy], strays[busy] = on, apart
-            far = ~(self.space.length(apart) <= BENT * radii[busy, None]).all(axis=1)
+            far = ~(self.space.length(apart) <= BENT[tangents.shape[2]] * radii[busy, None]).all(axis=1)
             if halving < HALVINGS:
                 radii[busy[far]] /= 2
             busy = busy[far]
@@ -402,7 +402,7 @@ class SelfMotions:
             beyond = edges.points + REACH * edges.radii[:, None] * edges.ways
             joints, good = self.corrected(edges.layer, beyond)
             shift = self.space.length(joints - beyond)
-            good &= shift <= 2 * BENT * edges.radii
+            good &= shift <= 2 * BENT[charts.tangents.shape[2]] * edges.radii
             chosen = np.flatnonzero(good)
             chosen = chosen[self._apart(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
             like = charts.tangents[edges.owners[chosen]]
@@ -476,7 +476,7 @@ class SelfMotions:
             flat = np.einsum("kn,knr->kr", apart, charts.tangents[which] * self.space.scale[:, None])
             normal = np.sqrt(np.maximum((apart**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
             radii = charts.radii[which]
-            near = normal <= 2 * BENT * radii + 1e-6
+            near = normal <= 2 * BENT[r] * radii + 1e-6
             found[rows] = near & (np.abs(flat) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
         return found
 
