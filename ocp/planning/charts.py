@@ -91,9 +91,8 @@ class JointSpace:
 
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
         """Tree of postures (M, n), to be asked with what `placed` says; those of other layers are far."""
-        size = np.zeros(1 + joints.shape[1])
-        size[1:][self.periodic] = (TURN * self.scale)[self.periodic]
-        return cKDTree(self.placed(joints, layer), boxsize=size)
+        size = np.append(0.0, np.where(self.periodic, TURN * self.scale, 0.0))
+        return cKDTree(self.placed(joints, layer), boxsize=size if self.periodic.any() else None)  # None is faster
 
     def placed(self, joints: Array, layer: Indices | None = None) -> Array:
         """Points of the tree."""
