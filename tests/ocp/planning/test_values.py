@@ -110,6 +110,8 @@ def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
     (path, bound), (other, more) = (
         search_of(machine, places, Length(own)).best(np.inf) for own in (weights, 100 * weights)
     )
+    assert path is not None
+    assert other is not None
     np.testing.assert_allclose(other, path, atol=1e-9)
     assert more == pytest.approx(100 * bound, rel=1e-9)
 
