@@ -7,8 +7,8 @@ Chaser and target both float. The target has no joints and nothing acts on it, s
 and its tip is the frame that is grasped. The chaser's tip reaches that frame with the same twist, at a time that may be
 free. From there on both are one machine, the target a link on the chaser's tip: base and joints go on as they were, and
 the momentum is that of both (`ocp.builders.grasping`), a constant that is known before anything is planned, unless
-thrusters act. At the end neither joints nor base turn: the momentum is in the wheels then, which have to be able to
-hold it. Rest is relative to the centre of mass of the pair, which goes on at P / m.
+thrusters act. At the end neither joints nor base turn: the momentum is in wheels and gyros then, which have to be able
+to hold it (`ocp.builders.capture_bounds`). Rest is relative to the centre of mass of the pair, which goes on at P / m.
 
 Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) plan both objectives at once, too, without wheels: the
 chaser brings the momentum against that of the target, which is `conserved_momentum` here. Each phase at its own least
@@ -23,33 +23,26 @@ from typing import Any, TypedDict, Unpack
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import FreeFloating, Thruster, center_of_mass, wheels_of
 from models.arrays import Array
 from ocp.audit.clearance import Clearance
+from ocp.builders.capture_bounds import Start, held_by_rotors, require_reach, require_room
 from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem
+from ocp.builders.dynamics import Effort, JointFriction, checked_steady, checked_thrusters, dynamics_problem, rates_at
 from ocp.builders.dynamics_plan import within_limits
-from ocp.builders.grasping import (
-    Cone,
-    Grasp,
-    checked_pair,
-    grasp_wrench,
-    motion_of,
-    pair_momentum,
-    require_reach,
-    require_room,
-)
+from ocp.builders.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.builders.standing.problem import FreeTime
 from ocp.builders.target_clearance import ClearOfTarget
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_each, checked_instance, floats
+from ocp.errors import ProblemError, checked_instance
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.tasks.checks import checked_configuration
+from ocp.tasks.checks import checked_configuration, checked_horizon
 from ocp.tasks.limits import Limits
 
 __all__ = ["AskedOfCapture", "capture_problem", "chained_capture", "plan_capture"]
@@ -68,6 +61,7 @@ class AskedOfCapture(TypedDict, total=False):
     effort: Effort | None
     friction: JointFriction | None
     thrusters: Sequence[Thruster]
+    steady: Sequence[str]
     cone: Cone | None
     grasp: Grasp | None
     clearance: float | ClearOfTarget | None
@@ -92,14 +86,16 @@ def capture_problem(
     counted from the start of each phase.
 
     Args:
-        chaser: With its arm, and wheels among its joints (`models.with_wheels`); its momentum is that at the start.
+        chaser: With its arm, and wheels or gyros among its joints (`models.with_wheels`, `with_gyros`); its momentum is
+            that at the start, of the rotors that spin, too.
         target: A machine of one link without joints, on the same kind of base, with its momentum; its tip is the frame
             that is grasped, which the chaser's tip meets axis by axis.
         start_joints: Of the chaser. Shape (n,), rad or m.
         approach, detumble: How long the phases take, s, or FreeTime(...).
         asked: start_base, target_base: configurations of both bases at the start; home if None. Shape (base_size,).
             start_velocities: Of the chaser's joints; at rest if None. Shape (n,), rad/s.
-            limits, effort, friction, thrusters: As of `dynamics_problem`, of both phases.
+            limits, effort, friction, thrusters, steady: As of `dynamics_problem`, of both phases; rotors of gyros are
+            steady, at the velocities with which they start.
             cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
             grasp: What the hand bears while detumbling.
             clearance: How far the chaser's bodies stay from the target's while approaching, m, but for those of the
@@ -110,19 +106,20 @@ def capture_problem(
 
     Raises:
         ProblemError: Machines that are none, a target with joints, sizes and values as of `dynamics_problem`, a
-            clearance between bodies without shapes; or "momentum": rest is asked for, and the wheels cannot hold the
-            momentum of both: `value` is its size, `limit` what they hold at most, N m s; or "reach": the target is
-            farther off, `value`, than the arm is long, `limit`, m, and nothing pushes the chaser there.
+            clearance between bodies without shapes; or "momentum": rest is asked for, and wheels, gyros and thrusters
+            cannot take the momentum of both: `value` is its size, `limit` what they take at most, N m s; or "reach":
+            the target is farther off, `value`, than the arm is long, `limit`, m, and nothing pushes the chaser there.
     """
-    given = _Capture.of(chaser, target, start_joints, asked)
+    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     begin, after = given.approach(approach), given.detumbling(detumble, None)
     given.guess_approach(begin)
-    guess_braking(after, given.pair, *_end_of(begin))
+    guess_braking(after, given.pair, given.steady, *_end_of(begin))
     problem = Phases("capture", {APPROACH: begin, DETUMBLE: after})
     one, other = problem[APPROACH], problem[DETUMBLE]
     end = {name: one.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
-    begins = {"joints": ca.DM(given.arm) * end["joints"]}
+    rates_kept = np.where(given.steady, given.start.velocities, np.nan)
+    begins = {"joints": ca.DM(given.arm) * end["joints"], "velocities": _told_or(rates_kept, one.at_end("velocities"))}
     if given.thrusters:
         begins["base"] = _of_unit_length(chaser, end["base"])
         base = ca.vertcat(base, one.at_end("momentum"))
@@ -169,7 +166,7 @@ def plan_capture(
 
     mesh = POINTS if method is None else method
     driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    given = _Capture.of(chaser, target, start_joints, asked)
+    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     return within_limits(declare, given.kept, mesh, (), options, tolerances, driven)
 
 
@@ -195,7 +192,7 @@ def chained_capture(
     """
     mesh = POINTS if method is None else method
     limits = asked.get("limits")
-    given = _Capture.of(chaser, target, start_joints, asked)
+    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     given.detumbling(detumble, None)  # refused before the approach is solved
 
     def first(kept: _Kept) -> Problem:
@@ -211,7 +208,7 @@ def chained_capture(
 
     def second(_: _Kept) -> Problem:
         problem = given.detumbling(detumble, end)
-        guess_braking(problem, given.pair_after(end), end["joints"], end["velocities"], end["base"])
+        guess_braking(problem, given.pair_after(end), given.steady, end["joints"], end["velocities"], end["base"])
         return problem
 
     return one, within_limits(second, _Kept(None, None), mesh, (), options, tolerances, {"": (given.pair, limits)})
@@ -245,11 +242,19 @@ class _Capture:
     joints: Array
     base: Array
     target_base: Array
+    times: tuple[float | FreeTime, float | FreeTime]
     thrusters: tuple[Thruster, ...]
     asked: AskedOfCapture
 
     @classmethod
-    def of(cls, chaser: FreeFloating, target: FreeFloating, start_joints: Any, asked: AskedOfCapture) -> _Capture:
+    def of(
+        cls,
+        chaser: FreeFloating,
+        target: FreeFloating,
+        start_joints: Any,
+        times: tuple[Any, Any],
+        asked: AskedOfCapture,
+    ) -> _Capture:
         robot = checked_pair(chaser, target)
         for what, kind in (("cone", Cone), ("grasp", Grasp), ("limits", Limits)):
             if asked.get(what) is not None:
@@ -258,10 +263,13 @@ class _Capture:
         _, there = checked_configuration(target, np.zeros(0), asked.get("target_base"))
         carried = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=carried)
-        thrusters = tuple(checked_each("thrusters", asked.get("thrusters", ()), Thruster))
-        if asked.get("rest", True) and not thrusters:
-            require_room(pair, asked.get("limits"))
-        return cls(chaser, target, pair, joints, base, there, thrusters, asked)
+        thrusters = checked_thrusters(chaser, asked.get("thrusters", ()))
+        found = cls(chaser, target, pair, joints, base, there, times, thrusters, asked)
+        if asked.get("rest", True):
+            bounds = (asked.get("limits") or Limits()).bounds(chaser)
+            held = held_by_rotors(chaser, bounds, found.steady, found.start, asked.get("friction") is None)
+            require_room(chaser, target, carried, found.start, held, thrusters)
+        return found
 
     @property
     def arm(self) -> Array:
@@ -270,10 +278,23 @@ class _Capture:
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
     @property
+    def steady(self) -> NDArray[np.bool_]:
+        """Whether joints keep their speed. Shape (n,)."""
+        return checked_steady(self.chaser.robot, self.asked.get("steady", ()))
+
+    @property
+    def start(self) -> Start:
+        """Where it begins, and until when it may take."""
+        given = self.asked.get("start_velocities")
+        rates = rates_at("start_velocities", "rest" if given is None else given, self.chaser.joint_size)
+        latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in self.times]
+        return Start(self.base, self.joints, rates, self.target_base, *latest)
+
+    @property
     def shared(self) -> dict[str, Any]:
         """Options of both phases."""
         asked: Mapping[str, Any] = self.asked
-        return {name: asked[name] for name in ("limits", "effort", "friction", "thrusters") if name in asked}
+        return {name: asked[name] for name in ("limits", "effort", "friction", "thrusters", "steady") if name in asked}
 
     @property
     def kept(self) -> _Kept:
@@ -291,14 +312,12 @@ class _Capture:
     def approach(self, duration: float | FreeTime) -> Problem:
         """The first phase: the target's motion, and the grasp at the end."""
         chaser, target, asked = self.chaser, self.target, self.asked
-        start = asked.get("start_velocities")
         problem = dynamics_problem(
             chaser, self.joints, duration, start_base=self.base, end="free", clear=asked.get("clear"),
-            start="rest" if start is None else start, **self.shared,
+            start=self.start.velocities, **self.shared,
         )  # fmt: skip
-        if not self.thrusters:
-            times = (duration.lower, duration.upper) if isinstance(duration, FreeTime) else (duration, duration)
-            require_reach(chaser, target, (self.base, self.joints, self.target_base), times)
+        earliest = duration.lower if isinstance(duration, FreeTime) else duration
+        require_reach(chaser, target, self.start, earliest, self.thrusters)
         base, joints, _ = motion_of(problem)
         none = ca.DM(0, 1)
         goal = problem.state(
@@ -388,11 +407,18 @@ class _Capture:
         return replace(self.pair, conserved_momentum=found)
 
     def guess_approach(self, problem: Problem) -> None:
-        start = self.asked.get("start_velocities")
-        rates = np.zeros(self.chaser.joint_size) if start is None else np.nan_to_num(floats(start).ravel())
         cone = self.asked.get("cone")
         out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.target, self.joints, rates, self.base, self.target_base, out)
+        guess_approach(
+            problem,
+            self.chaser,
+            self.target,
+            self.joints,
+            np.nan_to_num(self.start.velocities),
+            self.base,
+            self.target_base,
+            out,
+        )
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
@@ -401,6 +427,12 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
     return joints, rates, base
+
+
+def _told_or(told: Array, found: Any) -> Any:
+    """Numbers that are told, and where they are nan what is found. Told twice they would be conditions of nothing."""
+    known = ~np.isnan(told)
+    return ca.DM(np.where(known, told, 0.0)) + ca.DM((~known).astype(float)) * found
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:

@@ -57,7 +57,10 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["AskedOfDrives", "Effort", "JointFriction", "Motors", "checked_motors", "dynamics_problem", "joint_torques"]
+__all__ = [
+    "AskedOfDrives", "Effort", "JointFriction", "Motors", "checked_motors", "checked_steady", "checked_thrusters",
+    "dynamics_problem", "joint_torques", "rates_at",
+]  # fmt: skip
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 Motors = FixedBase | FreeFloating
@@ -342,9 +345,9 @@ def dynamics_problem(
         checked_instance("dynamics_problem: friction", friction, JointFriction)
     checked_choice("control", control, ("acceleration", "jerk"))
     robot, n = machine.robot, machine.joint_size
-    first_rates, last_rates = (_rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
-    pushers, fired = (_checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
-    bounds, keeps = limits.bounds(machine), _steady(robot, steady)
+    first_rates, last_rates = (rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
+    pushers, fired = (checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
+    bounds, keeps = limits.bounds(machine), checked_steady(robot, steady)
     sizes = _wheel_sizes(robot, bounds, checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon))
     bounds = bounds._replace(
         velocity=np.where(keeps, np.inf, bounds.velocity),
@@ -520,7 +523,7 @@ def _wheel_sizes(robot: Robot, bounds: JointBounds, duration: float) -> Array:
     return found
 
 
-def _steady(robot: Robot, names: Any) -> NDArray[np.bool_]:
+def checked_steady(robot: Robot, names: Any) -> NDArray[np.bool_]:
     """Whether each joint is one of these. Shape (n,)."""
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ProblemError(f"steady: names of joints are expected, not {names!r}", name="steady", value=names)
@@ -530,8 +533,12 @@ def _steady(robot: Robot, names: Any) -> NDArray[np.bool_]:
     return np.array([name in names for name in robot.joint_names], dtype=bool)
 
 
-def _rates_at(what: str, given: Any, n: int) -> Array:
-    """Velocities at an end, nan where free. Shape (n,)."""
+def rates_at(what: str, given: Any, n: int) -> Array:
+    """Velocities at an end, nan where free. Shape (n,).
+
+    Raises:
+        ProblemError: Neither "rest" nor "free", nor n numbers.
+    """
     if isinstance(given, str):
         return np.full(n, 0.0 if checked_choice(what, given, ("rest", "free")) == "rest" else np.nan)
     endless = np.full(n, np.inf)
@@ -540,7 +547,7 @@ def _rates_at(what: str, given: Any, n: int) -> Array:
     return _ends(what, given, -endless, endless)
 
 
-def _checked_thrusters(machine: Motors, thrusters: Any) -> tuple[Thruster, ...]:
+def checked_thrusters(machine: Motors, thrusters: Any) -> tuple[Thruster, ...]:
     found = checked_each("thrusters", thrusters, Thruster)
     if found and not isinstance(machine, FreeFloating):
         words = "thrusters push a machine that floats; this one stands on a fixed base"

@@ -9,28 +9,18 @@ about their common centre of mass,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, ModelError, Robot, attached, center_of_mass, wheels_of
+from models import FreeFloating, ModelError, Robot, attached, center_of_mass
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
 from ocp.problem.problem import Problem
-from ocp.tasks.limits import Limits
 
-__all__ = [
-    "Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum",
-    "require_reach", "require_room",
-]  # fmt: skip
-
-MOST_WHEELS = 12
-"""Of which the greatest momentum is looked for over all corners."""
-ROOM = 1e-9
-"""Share by which a momentum may be greater than what wheels hold: rounding."""
+__all__ = ["Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum"]
 
 
 @dataclass(frozen=True)
@@ -148,80 +138,6 @@ def pair_momentum(
     arm -= center_of_mass(chaser.robot, joints, chaser.world_from_base(base))
     crossed = cross(arm, (one * other[3:6] - two * own[3:6]) / (one + two))
     return ca.vertcat(own[0:3] + other[0:3] + crossed, own[3:6] + other[3:6])[chaser.twist_rows]
-
-
-def require_room(pair: FreeFloating, limits: Limits | None) -> None:
-    """Raise where wheels cannot hold the angular momentum, whatever the attitude of the base at the end.
-
-    Turned, the base brings the momentum along any axis of its own. So what counts is its size, beside the longest of
-    the momenta that the wheels can have, sum of h_k a_k with |h_k| <= I_k w_k: a corner of that set.
-    """
-    angular = np.asarray(pair.conserved_momentum)[[k for k, row in enumerate(pair.twist_rows) if row < 3]]
-    bounds = (Limits() if limits is None else limits).bounds(pair)
-    robot, held = pair.robot, []
-    wheels = wheels_of(robot)
-    for name, inertia in wheels.items():
-        joint, fastest = robot.joint(name), bounds.velocity[robot.joint_names.index(name)]
-        held.append(inertia * fastest * (np.asarray(joint.rotation) @ np.asarray(joint.axis)))
-    if not np.isfinite(held).all():
-        return
-    on_base = all(robot.joint(name).parent == robot.root for name in wheels)
-    if on_base and len(held) <= MOST_WHEELS:
-        corners = np.array(list(product((-1.0, 1.0), repeat=len(held)))) @ np.reshape(held, (-1, 3))
-        most = float(np.linalg.norm(corners, axis=1).max())
-    else:  # never less than that
-        most = float(np.linalg.norm(held, axis=1).sum())
-    size = float(np.linalg.norm(angular))
-    if size > most * (1 + ROOM) + ROOM:
-        words = (
-            f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold {most:.6g} at "
-            f"most: {size - most:.6g} N m s are missing for it to come to rest. Thrusters, other wheels, momentum of "
-            "the chaser against that of the target, or rest=False help"
-        )
-        raise ProblemError(words, name="momentum", value=size, limit=most)
-
-
-def require_reach(
-    chaser: FreeFloating, target: FreeFloating, start: tuple[Any, Any, Any], times: tuple[float, float]
-) -> None:
-    """Raise where the grasp is too far off for the arm at any time: both centres of mass go on as they do.
-
-    The tip is no farther from the chaser's centre of mass than all joints in a line take it.
-
-    Args:
-        start: Base, joints, and configuration of the target. times: Of the grasp, the least and the greatest, s.
-    """
-    robot, body = chaser.robot, target.robot
-    middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
-    arm = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
-    arm += float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
-    base, joints, goal = (ca.DM(np.asarray(each, dtype=float)) for each in start)
-    centers = [
-        center_of_mass(body, ca.DM(0, 1), target.world_from_base(goal)),
-        center_of_mass(robot, joints, chaser.world_from_base(base)),
-    ]
-    way = np.array(centers[0] - centers[1]).ravel()
-    spatial = np.eye(6)[:, chaser.twist_rows]
-    speeds = [spatial @ np.asarray(one.conserved_momentum) / one.robot.total_mass for one in (target, chaser)]
-    drift = (speeds[0] - speeds[1])[3:]
-    nearest = -float(way @ drift) / float(drift @ drift) if drift.any() else 0.0
-    off = float(np.linalg.norm(way + min(max(nearest, times[0]), times[1]) * drift))
-    if off > arm * (1 + ROOM):
-        words = (
-            f"capture: the centres of mass of chaser and target are {off:.4g} m apart or more, and the arm reaches "
-            f"{arm:.4g} m at most: {off - arm:.4g} m are missing. Start nearer, let them drift together, or give "
-            "thrusters"
-        )
-        raise ProblemError(words, name="reach", value=off, limit=arm)
-
-
-def _longest(robot: Robot, link: str, point: Any) -> float:
-    """How far a point of a link is from the root's origin at most, m; inf beyond a slide without limits."""
-    found = float(np.linalg.norm(point))
-    for joint in robot.path_to(link):
-        slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0
-        found += float(np.linalg.norm(joint.translation)) + slides
-    return found
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:

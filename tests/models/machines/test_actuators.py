@@ -93,13 +93,18 @@ def test_a_rotor_is_a_disc_and_its_symmetry_is_judged_by_its_size(inertia: float
         assert wheels_of(replace(robot, links=(*robot.links[:-1], uneven))) == {}
 
 
-def pyramid(**limits: Any) -> Robot:
-    """A body with four gyros on the sides of a pyramid, whose momenta cancel at zero."""
+def pyramid_axes() -> tuple[Array, Array]:
+    """Of the gimbals and rotors of four gyros on the sides of a pyramid, whose momenta cancel at zero."""
     tilt = np.arctan(np.sqrt(2.0))
     angles = np.arange(4) * np.pi / 2
     out = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
     side = np.stack([-np.sin(angles), np.cos(angles), np.zeros(4)], axis=1)
-    gimbals = np.sin(tilt) * out + np.cos(tilt) * np.array([0.0, 0.0, 1.0])
+    return np.sin(tilt) * out + np.cos(tilt) * np.array([0.0, 0.0, 1.0]), side
+
+
+def pyramid(**limits: Any) -> Robot:
+    """A body with four gyros on the sides of a pyramid."""
+    gimbals, side = pyramid_axes()
     body = Link("hub", 80.0, (0, 0, 0), [[20.0, 1.0, 0.5], [1.0, 25.0, -0.8], [0.5, -0.8, 22.0]])
     places = 0.1 * np.arange(12.0).reshape(4, 3)
     robot = with_gyros(Robot((body,), ()), gimbals, side, 5.0, 0.05, mass=0.5, translations=places, **limits)

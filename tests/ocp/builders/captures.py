@@ -9,10 +9,22 @@ import casadi as ca
 import mujoco
 import numpy as np
 
-from models import CollisionShape, FreeFloating, Joint, Link, Robot, Thruster, planar_chain, with_wheels
+from models import (
+    CollisionShape,
+    FreeFloating,
+    Joint,
+    Link,
+    Robot,
+    Thruster,
+    gyros_of,
+    planar_chain,
+    with_gyros,
+    with_wheels,
+)
 from models.spatial import quaternion_about
 from ocp import Cone, Effort, FreeTime, Grasp, Solution
 from ocp.builders.grasping import joined, pair_momentum
+from tests.models.machines.test_actuators import pyramid_axes
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 
@@ -108,6 +120,36 @@ def capture(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> dict[str, Any]:
         "chaser": chaser(), "target": target(spin, inertia), "start_joints": START, "approach": FREE,
         "detumble": FREE, "target_base": [2.5, 0.2, 0.6, 1.0, 0.0, 0.0, 0.0], "cone": CONE, "grasp": GRASP,
         "effort": Effort(torque=1.0, acceleration=[1.0] * 6 + [0.0] * 3, time=0.05),
+    }  # fmt: skip
+
+
+def gyro_chaser(momentum: float = 3.0, rate: float = 0.8) -> FreeFloating:
+    """The same arm on a hub with a pyramid of four gyros instead of wheels, N m s each."""
+    robot = chaser().robot
+    kept = [link for link in robot.links if "wheel" not in link.name]
+    joints = [joint for joint in robot.joints if "wheel" not in joint.name]
+    plain = replace(robot, links=tuple(kept), joints=tuple(joints))
+    gimbals, rotors = pyramid_axes()
+    found = with_gyros(plain, gimbals, rotors, momentum, 0.05, gimbal_inertia=0.02, rate=rate, torque=8.0, mass=0.5)
+    links = [replace(link, mass=0.2) if link.name.endswith("gimbal") else link for link in found.links]
+    return FreeFloating(replace(found, links=tuple(links)))
+
+
+GYRO_START = np.concatenate([START[:6], np.zeros(8)])
+
+
+def spinning(machine: FreeFloating, momentum: float) -> Array:
+    """Velocities with all rotors of gyros at their speed. Shape (n,)."""
+    return np.array([momentum / 0.05 if name.endswith("rotor") else 0.0 for name in machine.robot.joint_names])
+
+
+def gyro_capture(spin: Any) -> dict[str, Any]:
+    """What is asked of it in space."""
+    one = gyro_chaser()
+    effort = Effort(torque=[1.0] * 6 + [1.0, 0.0] * 4, acceleration=[1.0] * 6 + [50.0, 0.0] * 4, time=0.05)
+    return capture(spin) | {
+        "chaser": one, "start_joints": GYRO_START, "start_velocities": spinning(one, 3.0), "effort": effort,
+        "steady": [gyro.rotor for gyro in gyros_of(one.robot)],
     }  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import casadi as ca
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from models import FreeFloating, Joint, Link, Robot, Thruster, center_of_mass, link_frames
+from models import FreeFloating, Joint, Link, Robot, Thruster, center_of_mass, gyros_of, link_frames, with_wheels
 from models.machines.machine import with_tip
 from ocp import (
     Collocation,
     Cone,
+    Limits,
     ProblemError,
     Solution,
     capture_problem,
@@ -23,19 +25,24 @@ from ocp import (
     dynamics_problem,
     plan_capture,
 )
-from ocp.builders.grasping import grasp_wrench, joined, pair_momentum, require_reach
+from ocp.builders.capture_bounds import Start, greatest, held_by_rotors, require_reach
+from ocp.builders.grasping import grasp_wrench, joined, pair_momentum
 from ocp.builders.target_clearance import hand_of
 from tests.models.machines.test_actuators import satellite
 from tests.models.robot.trees import Array
 from tests.ocp.builders.captures import (
     CONE,
     GRASP,
+    GYRO_START,
     PLANAR_START,
     capture,
+    gyro_capture,
+    gyro_chaser,
     planar_capture,
     planar_chaser,
     planar_target,
     replayed_momentum,
+    spinning,
     target,
     thruster_capture,
     turned,
@@ -295,13 +302,144 @@ def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
     assert caught.value.value == pytest.approx(np.linalg.norm([4.5, 0.0, 0.0] - first))
     stretched = 1.8 + 0.4 + (4.0 * 0.4 + 3.0 * 1.15 + 1.0 * 1.65) / hub.total_mass
     assert caught.value.limit == pytest.approx(stretched)
-    start = np.zeros(3), PLANAR_START, asked["target_base"]
-    require_reach(asked["chaser"], planar_target(velocity=(-0.1, 0.0)), start, (5.0, 40.0))
+
+    def reach(velocity: float, latest: float, *thrusters: Thruster) -> None:
+        goal = planar_target(velocity=(velocity, 0.0))
+        start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([4.5, 0.0, 0.0]), latest, 5.0)
+        require_reach(asked["chaser"], goal, start, 5.0, thrusters)
+
+    reach(-0.1, 40.0)
     for velocity, latest in ((-2.0, 40.0), (-0.1, 10.0), (0.1, 40.0)):  # it passes too early, comes too late, or leaves
         with pytest.raises(ProblemError, match="are missing"):
-            require_reach(asked["chaser"], planar_target(velocity=(velocity, 0.0)), start, (5.0, latest))
-    push = {"thrusters": [Thruster("hub", (1, 0, 0), 1.0)], "approach": 10.0, "detumble": 10.0}
-    capture_problem(**(asked | push))
+            reach(velocity, latest)
+    missing, mass = caught.value.value - stretched, hub.total_mass
+    for share, enough in ((1.001, True), (0.999, False)):  # F t^2 / 2 m
+        push = Thruster("hub", (1, 0, 0), share * missing * 2 * mass / 40.0**2)
+        if enough:
+            reach(0.0, 40.0, push)
+        else:
+            with pytest.raises(ProblemError, match="are missing"):
+                reach(0.0, 40.0, push)
+
+
+def with_sizes(size: float, sides: list[Array]) -> Any:
+    """Support of a ball and of segments from -side to side."""
+    return lambda u: size + np.abs(u @ np.array(sides).T).sum(axis=1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_the_greatest_of_a_sum_of_segments_is_its_farthest_corner(count: int) -> None:
+    sides = list(np.random.default_rng(count).normal(size=(count, 3)))
+    corners = np.array(list(product((-1.0, 1.0), repeat=count))) @ np.array(sides)
+    farthest = float(np.linalg.norm(corners, axis=1).max())
+    found = greatest(with_sizes(0.0, sides))
+    assert farthest <= found <= farthest * (1 + 2e-7)
+    assert greatest(with_sizes(0.5, sides)) == pytest.approx(farthest + 0.5)
+
+
+def test_the_greatest_of_a_set_that_is_as_large_all_round_is_never_too_small() -> None:
+    """A disc and a ball end by the number of triangles, with a bound all the same."""
+    disc = greatest(lambda u: np.hypot(u[:, 0], u[:, 1]))
+    assert 1.0 <= disc <= 1 + 1e-6
+    assert 1.0 <= greatest(lambda u: np.ones(len(u))) <= 1 + 1e-3
+
+
+@pytest.mark.parametrize("rate", [np.inf, 0.06])
+def test_gyros_hold_no_more_than_their_gimbals_turn_to(rate: float) -> None:
+    """Of random turns of the gimbals within their reach none holds more, and one that is looked for holds as much."""
+    machine = gyro_chaser(momentum=3.0, rate=rate)
+    start = Start(machine.base_home(), GYRO_START, spinning(machine, 3.0), np.zeros(7), 4.0, 6.0)
+    steady = np.array([name.endswith("rotor") for name in machine.robot.joint_names])
+    most = greatest(held_by_rotors(machine, Limits().bounds(machine), steady, start))
+    q = ca.SX.sym("q", machine.joint_size)
+    still = np.where(steady, start.velocities, 0.0)
+    held = ca.mtimes(machine.momentum_matrices(ca.DM(machine.base_home()), q)[1], ca.DM(still))[:3]
+    size = ca.Function("size", [q], [ca.norm_2(held), ca.gradient(ca.norm_2(held), q)])
+    gimbals, best = np.flatnonzero(steady) - 1, 0.0
+    rng, reach = np.random.default_rng(0), min(rate * 10.0, np.pi)
+    low, high = GYRO_START[gimbals] - reach, GYRO_START[gimbals] + reach
+    for _ in range(20):
+        angles = GYRO_START.copy()
+        angles[gimbals] += rng.uniform(-reach, reach, len(gimbals))
+        for _ in range(100):  # uphill
+            value, slope = (np.array(part).ravel() for part in size(angles))
+            best = max(best, float(value[0]))
+            angles[gimbals] = np.clip(angles[gimbals] + 0.1 * slope[gimbals], low, high)
+    assert best <= most
+    assert best == pytest.approx(most, rel=1e-5)
+
+
+def test_wheels_hold_no_more_than_their_motors_give_them_in_the_time() -> None:
+    """A motor of 0.01 N m has 20 s, from what its rotor has already; what friction adds is not known."""
+    slow = with_wheels(Robot((Link("hub", 60.0, (0, 0, 0), np.eye(3)),), ()), [[0, 0, 1]], 0.02, torque=0.01)
+    machine = FreeFloating(slow, "planar", conserved_momentum=[0.5, 0, 0])
+    rates = np.array([3.0])
+    start = Start(np.zeros(3), np.zeros(1), rates, np.zeros(3), 12.0, 8.0)
+    spin = float(np.array(ca.DM(machine.base_twist(np.zeros(3), np.zeros(1), rates)))[0, 0])
+    held = held_by_rotors(machine, Limits().bounds(machine), np.zeros(1, dtype=bool), start)
+    up = np.array([[0.0, 0.0, 1.0]])
+    assert held(up) == pytest.approx(0.02 * (3.0 + spin) + 0.01 * 20.0)
+    assert held(-up) == pytest.approx(held(up))
+    free = held_by_rotors(machine, Limits().bounds(machine), np.zeros(1, dtype=bool), start, False)
+    assert not np.isfinite(free(up)).any()
+
+
+def test_gyros_that_are_too_weak_or_too_slow_are_refused_with_what_is_missing() -> None:
+    """Four of 2 N m s, 6.5 together, and four that turn by 0.3 rad in the time."""
+    times = {"approach": 6.0, "detumble": 4.0}
+    spin = np.array([0.0, 0.0, 1.5])
+    capture_problem(**(gyro_capture(spin) | times))
+    for machine in (gyro_chaser(momentum=2.0), gyro_chaser(rate=0.03)):
+        asked = gyro_capture(spin) | times | {"chaser": machine}
+        asked["start_velocities"] = spinning(machine, gyros_of(machine.robot)[0].momentum)
+        with pytest.raises(ProblemError, match="N m s are missing") as caught:
+            capture_problem(**asked)
+        assert caught.value.name == "momentum"
+        assert caught.value.value == pytest.approx(6.0 * 1.5)
+
+
+def test_a_guess_of_gyros_holds_the_momentum_of_both() -> None:
+    asked = gyro_capture(np.array([0.1, -0.2, 0.15])) | {"approach": 8.0, "detumble": 9.0}
+    problem = capture_problem(**asked)
+    after = problem.of("detumble")
+    end = {name: np.asarray(after[name].guess(np.array([1.0]))).ravel() for name in ("base", "joints", "velocities")}
+    pair = FreeFloating(joined(asked["chaser"].robot, asked["target"].robot))
+    held = np.array(ca.DM(pair.momentum_matrices(end["base"], end["joints"])[1] @ ca.DM(end["velocities"])))[:3, 0]
+    carried = pair_momentum(
+        asked["chaser"], asked["target"], asked["chaser"].base_home(), asked["target_base"], asked["start_joints"]
+    )
+    assert held == pytest.approx(np.array(ca.DM(carried))[:3, 0], rel=0.02)
+    assert end["velocities"] == pytest.approx(np.where(spinning(asked["chaser"], 3.0) > 0, 60.0, 0.0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("free", [False, True])
+def test_gyros_take_the_momentum_of_a_body_that_tumbles(free: bool) -> None:
+    """Rotors keep their speed, gimbals stand still at the end, and the momentum in MuJoCo stays."""
+    asked = gyro_capture(np.array([0.03, 0.05, -0.04]))
+    if not free:
+        del asked["cone"]
+        asked |= {"approach": 11.0, "detumble": 6.5, "method": Collocation(5, degree=4, scheme="legendre")}
+    plan = plan_capture(**asked)
+    audit = plan.audit()
+    assert audit.passed, audit
+    assert max(gaps(asked, plan)) < 1e-6
+    before, later = replayed_momentum(asked, plan)
+    assert np.abs(before[0]).max() > 0.1
+    assert before == pytest.approx(np.tile(before[0], (len(before), 1)), abs=1e-8)
+    assert later == pytest.approx(np.tile(before[0], (len(later), 1)), abs=1e-8)
+    robot = asked["chaser"].robot
+    rotors = np.array([name.endswith("rotor") for name in robot.joint_names])
+    for phase in ("approach", "detumble"):
+        rates = plan.phase(phase).at_fraction(np.linspace(0, 1, 101))["velocities"]
+        assert rates[:, rotors] == pytest.approx(60.0, abs=1e-9)
+        assert (np.abs(rates) <= np.array(robot.velocity) * (1 + 1e-5)).all()
+    end = plan.phase("detumble").at_fraction(1.0)
+    assert end["velocities"][~rotors] == pytest.approx(0.0, abs=1e-9)
+    pose = np.concatenate([end["base"]])
+    pair = FreeFloating(joined(robot, asked["target"].robot), conserved_momentum=before[0])
+    twist = np.array(ca.DM(pair.base_twist(pose, end["joints"], end["velocities"])))[:3]
+    assert np.abs(twist).max() < 1e-9
 
 
 def test_what_cannot_be_captured_is_refused_by_name() -> None:
