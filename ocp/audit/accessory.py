@@ -20,8 +20,7 @@ import numpy as np
 from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import FLAT, slope
-from ocp.audit.sizes import FLOOR
-from ocp.problem.declarations import Variable
+from ocp.audit.sizes import FLOOR, as_others
 from ocp.problem.formulation import Formulation
 
 __all__ = ["AccessoryProblem", "end_conditions"]
@@ -87,7 +86,7 @@ class AccessoryProblem:
         curves = (weight > NOISE * largest) | (still & (bend > NOISE * bend.max(initial=0.0)))
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, bend, 1.0)), sizes.control)
         state = self.along.state_size.copy()
-        _as_others(state, self.along.form.states, self.along.form.problem.declared.states)
+        as_others(state, self.along.form.states, self.along.form.problem.declared.states, LITTLE)
         self.unit = np.concatenate([state, horizon, *([state] if self.tied else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
@@ -177,9 +176,9 @@ class AccessoryProblem:
         normals *= self.unit
         reach = np.abs(normals).max(axis=2)
 
-        # a control that rests on its limit all along is near it by its own size, for it has no other
+        # a control that rests on its limit all along is near it by its own size, where none of its unit has another
         largest = np.abs(along.u).max(axis=0, initial=0.0)
-        held = np.append(np.maximum(along.sizes.control, largest), along.sizes.path[along.mixed])
+        held = np.append(np.maximum(along.control_size, largest), along.sizes.path[along.mixed])
         rests = np.append(along.sizes.state, along.sizes.path[along.still])
 
         def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
@@ -225,17 +224,6 @@ class AccessoryProblem:
                 steep = np.polynomial.polynomial.polyfit(at[near].ravel(), pull[near, :, i].ravel(), 1)[1]
                 if steep * rise < 0:
                     self.moved[k, i], self.switching[k, i] = True, abs(steep) / abs(rise)
-
-
-def _as_others(size: np.ndarray, places: dict[str, slice], declared: dict[str, Variable]) -> None:
-    """What hardly moves beside others of its unit might have moved as they do: it is given their size."""
-    largest: dict[str, float] = {}
-    for name, place in places.items():
-        unit = declared[name].unit or name
-        largest[unit] = max(largest.get(unit, 0.0), float(size[place].max()))
-    for name, place in places.items():
-        others = largest[declared[name].unit or name]
-        size[place] = np.where(size[place] <= LITTLE * others, others, size[place])
 
 
 def obstacle(form: Formulation) -> str:

@@ -176,7 +176,7 @@ class Backwards:
         nx, nu = along.form.nx, along.form.nu
         rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
         feed, given = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
-        unit, mixed = along.sizes.control, slice(nu, nu + along.mixed.size)
+        unit, mixed = along.control_size, slice(nu, nu + along.mixed.size)
         pushing = holding != 0
         self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
         held = np.flatnonzero(pushing.any(axis=1))
@@ -237,7 +237,7 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.stand.lower.shape[1]
     mine = slice(k * q, (k + 1) * q)
-    size, unit = along.state_size, along.sizes.control
+    size, unit = along.state_size, along.control_size
     limits = [along.stand.at(mine), along.node_stand.at(slice(k, k + 2))]
     slopes = [along.stand_x[mine, :, :nx], along.node_stand_x[k : k + 2, :, :nx]]
     columns, charges, owners, free = [], [], [], []

@@ -29,6 +29,21 @@ SLIP = 1e-6
 """What a variation that lowers the cost may miss its constraints by, relative to its size."""
 
 
+class Tied(NamedTuple):
+    """Singular values of constraints, for rows of length 1, by the controls of a stage.
+
+    Attributes:
+        size: Below which they count as dependent. seen: Below which what is left is a constraint of the stages before;
+            between both it is dropped.
+    """
+
+    size: float
+    seen: float
+
+
+INDEPENDENT = Tied(RANK, RANK)
+
+
 @dataclass(frozen=True)
 class Curvature:
     """The second variation of the cost along a plan.
@@ -96,10 +111,13 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:])
         found = inside
     if found.flat.startswith(NEARLY):
-        # without what is left of conditions that others imply there is more to vary: upwards all the more
-        wider = _sweep(accessory, stages, weak=False, tied=TIED)
-        if wider.least > FLAT and not wider.flat:
-            found = wider
+        # conditions that others imply are seen by controls up to the error of the plan alone: they are for the stages
+        # before; and without what is left of them there is more to vary: upwards all the more
+        for tied in (Tied(SLIP, SLIP), Tied(TIED, RANK)):
+            wider = _sweep(accessory, stages, weak=False, tied=tied)
+            if wider.least > FLAT and not wider.flat:
+                found = wider
+                break
     return Curvature(*found[:4], along.t, *found[4:])
 
 
@@ -115,12 +133,12 @@ class _Swept(NamedTuple):
     pull: np.ndarray | None = None
 
 
-def _sweep(accessory: AccessoryProblem, along: _Linearised, weak: bool, tied: float = RANK) -> _Swept:
+def _sweep(accessory: AccessoryProblem, along: _Linearised, weak: bool, tied: Tied = INDEPENDENT) -> _Swept:
     """The backward sweep over all stages, by solves where every stage curves upwards, else by eigenvectors.
 
     Args:
         weak: Whether what is touched without a push is held too.
-        tied: Size of a singular value below which constraints count as dependent, and the rest of them is dropped.
+        tied: Which constraints count as dependent.
     """
     stages = _freed(accessory, along, weak, tied)
     if not accessory.flat.any():
@@ -133,7 +151,7 @@ def _sweep(accessory: AccessoryProblem, along: _Linearised, weak: bool, tied: fl
 
 
 def _swept(
-    accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tied: float, upwards: bool
+    accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tied: Tied, upwards: bool
 ) -> _Swept | None:
     """The sweep. With ``upwards`` None where some stage does not curve upwards.
 
@@ -141,7 +159,7 @@ def _swept(
     """
     mesh, horizon = accessory.along.mesh, accessory.along.solution.horizon
     n, nz, nu = accessory.along.shape[0], accessory.nz, accessory.nu
-    m, rows, scale = nz + 1, sweep.end_rows, sweep.scale
+    m, rows, scale = nz + 1, _told(sweep.end_rows), sweep.scale
     cost = np.zeros((m, m))
     cost[:nz, :nz] = sweep.end_cost
     least, at, flat = np.inf, None, ""
@@ -152,11 +170,11 @@ def _swept(
         lift, move, bend, above = stages[k]
         joined = bend + move.T @ (cost @ move)
         if len(rows):
-            carried = rows_of_length_one(rows @ move[:nz], tied)
+            carried = rows_of_length_one(rows @ move[:nz], tied.size)
             ((_, (inner,), (unheld,)),) = _eliminated(carried[None], m, tied)
             joined, lift = inner.T @ joined @ inner, lift @ inner
             above = np.vstack([above, unheld])
-        rows = rows_of_length_one(above, tied)[:, :nz] if len(above) else above[:, :nz]
+        rows = rows_of_length_one(above, tied.size)[:, :nz] if len(above) else above[:, :nz]
         curve, mixed, cost = joined[m:, m:], joined[m:, :m], joined[:m, :m]
         answer = mixed
         if len(curve):
@@ -192,8 +210,9 @@ def _swept(
             return None
         if smallest[i] < least:
             least, at = float(smallest[i]), float(mesh[curves[i][0]] * horizon)
-    _, sizes, right = np.linalg.svd(rows_of_length_one(np.vstack([rows, sweep.start_rows]), tied))
-    basis = right[int(np.sum(sizes > tied)) :].T
+    begins = _told(sweep.start_rows)
+    _, sizes, right = np.linalg.svd(rows_of_length_one(np.vstack([rows, begins]), tied.size))
+    basis = right[int(np.sum(sizes > tied.size)) :].T
     starts = basis, np.zeros(0)
     if basis.shape[1]:
         values, vectors = np.linalg.eigh(basis.T @ (cost[:nz, :nz] + sweep.start_cost) @ basis)
@@ -282,7 +301,7 @@ class _Stage(NamedTuple):
     rows: np.ndarray
 
 
-def _freed(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: float) -> list[_Stage]:
+def _freed(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: Tied) -> list[_Stage]:
     """What its own constraints leave free of each stage: those with the same constraints all at once."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
@@ -310,20 +329,20 @@ def _freed(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tied: fl
     return [found[k] for k in range(n)]
 
 
-def _eliminated(rows: np.ndarray, nz: int, tied: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _eliminated(rows: np.ndarray, nz: int, tied: Tied) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """What rows (K, r, nz + m) of nz states and m controls leave free at K stages.
 
     Returns:
         Of the stages that are alike, L of them: which they are, (L,); states and controls from the states and from what
         is free of the controls, (L, nz + m, nz + f); and the rows (L, r', nz) of the states that no control sees. What
-        controls see by less than counts is dropped.
+        controls see by less than counts is dropped, or counts as not seen.
     """
     both = rows.shape[2]
     lengths = np.linalg.norm(rows, axis=2, keepdims=True)
-    keep = lengths > tied * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
+    keep = lengths > tied.size * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
     rows = np.where(keep, rows / np.where(keep, lengths, 1.0), 0.0)
     left, sizes, right = np.linalg.svd(rows[:, :, nz:])
-    ranks, seen = (sizes > tied).sum(axis=1), (sizes > RANK).sum(axis=1)
+    ranks, seen = (sizes > tied.size).sum(axis=1), (sizes > tied.seen).sum(axis=1)
     alike: dict[tuple[int, int], list[int]] = {}
     for k, kind in enumerate(zip(ranks.tolist(), seen.tolist(), strict=True)):
         alike.setdefault(kind, []).append(k)
@@ -356,6 +375,11 @@ def rows_of_length_one(rows: np.ndarray, rank: float) -> np.ndarray:
     sizes = np.linalg.norm(rows, axis=1)
     keep = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
     return np.asarray(rows[keep] / sizes[keep, None])
+
+
+def _told(rows: np.ndarray) -> np.ndarray:
+    """Conditions at an end as rows of length 1: what they see of states that hardly move is small, and counts."""
+    return rows_of_length_one(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), RANK)
 
 
 class _Variation(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import FLOOR, Sizes
+from ocp.audit.sizes import FLOOR, Sizes, as_others, nearest_bound
 from ocp.problem.formulation import Bounds, Formulation, Sampler
 from ocp.solution import Solution, stack
 
@@ -28,6 +28,8 @@ MOST_DERIVATIVES = 3
 """Of a limit of the states, looked at for a control."""
 NEAR = 1e-2
 """A limit nearer than this share of the size of what it limits may push; what it pushes over the gap is charged."""
+STILL = 10 * FLOOR
+"""Share of the largest of its unit by which a control that moves less stands still."""
 
 
 class Limits:
@@ -83,6 +85,7 @@ class Linearisation:
         cost_y, rate_y: Derivatives of T L and T f in y = (x, T, u). Shapes (M, ny), (M, nx, ny).
         row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
         sizes: Of all named things along the plan. state_size: Of the states, by which costates are judged. Shape (nx,).
+        control_size: Of the controls, by which they are near their limits. Shape (nu,).
         end_row, end_y: The end and start rows, in this order, and their derivatives in (x, x0, T), (m,), (m, 2 nx + 1).
         final_y, final_yy: First and second derivatives of the terminal cost in these, (2 nx + 1,) and
             (2 nx + 1, 2 nx + 1).
@@ -115,6 +118,7 @@ class Linearisation:
         self._differentiate()
         self._at_ends()
         self.state_size = self._state_sizes()
+        self.control_size = self._control_sizes()
         self._limits()
         self._arcs()
 
@@ -197,6 +201,21 @@ class Linearisation:
             found[still] = np.minimum(1.0 / fastest, found[still] / FLOOR)
         return found
 
+    def _control_sizes(self) -> np.ndarray:
+        """Sizes of the controls, by which they are near their limits. Shape (nu,).
+
+        One that is never used rests on a limit but for the solver's tolerance, and shows no size but that: it is as
+        large as others of its unit; where none of these is used, as its nearest bound, one SI unit at most.
+        """
+        form, own = self.form, self.sizes.control
+        low, high = (side[form.bounds.places["control"]] for side in self.bounds)
+        others = own.copy()
+        as_others(others, form.controls, form.problem.declared.controls, STILL)
+        bound = np.minimum(1.0, nearest_bound((low, high)))
+        whole = np.where(others <= STILL * bound, bound, others)
+        off = np.minimum(np.abs(self.u - low), np.abs(self.u - high)).max(axis=0, initial=0.0)
+        return np.asarray(np.where(off <= STILL * whole, whole, own))
+
     def _limits(self) -> None:
         form, sizes, (n, q) = self.form, self.sizes, self.shape
         nx, nu = form.nx, form.nu
@@ -208,7 +227,7 @@ class Linearisation:
         low, high = self.bounds[0][index] + drawn[0], self.bounds[1][index] - drawn[1]
         equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
         equal |= self.bounds[0][index] == self.bounds[1][index]
-        size = np.concatenate([sizes.state, sizes.control, sizes.path])
+        size = np.concatenate([sizes.state, self.control_size, sizes.path])
         hold = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
         stand = np.concatenate([np.arange(nx), nx + nu + self.still])
         value = np.hstack([self.x, self.u, self.row])

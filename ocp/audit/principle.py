@@ -90,7 +90,7 @@ def holders(
         multipliers: Per unit of s. Shape (M, nu + r + a).
         across: At which points some push over a gap. Shape (M,), bool.
     """
-    unit, hold, mixed = along.sizes.control, along.hold, along.mixed.size
+    unit, hold, mixed = along.control_size, along.hold, along.mixed.size
     gradient, directions = slope(along, costate) * unit, along.hold_u * unit
     inverse = inverse_of(along, hold.near)
     found = balance(gradient, directions, hold.lower, hold.upper, inverse)
@@ -134,7 +134,7 @@ def inverse_of(along: Linearisation, held: np.ndarray) -> np.ndarray:
     """
     key = np.packbits(held).tobytes()
     if key not in along.inverses:
-        along.inverses[key] = inverses(along.hold_u * along.sizes.control, held)
+        along.inverses[key] = inverses(along.hold_u * along.control_size, held)
     return along.inverses[key]
 
 
@@ -172,7 +172,7 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
-    unit, of = along.sizes.control, form.nx + 1
+    unit, of = along.control_size, form.nx + 1
     left = (slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)) * unit
     parts = np.abs(along.cost_y[:, of:]) + np.einsum("kiu,ki->ku", np.abs(along.rate_y[:, :, of:]), np.abs(costate))
     size = float((parts * unit).max(initial=0.0)) or 1.0
@@ -245,7 +245,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     nu, n = along.form.nu, along.shape[0]
     if not nu:
         return np.zeros(n)
-    unit = along.sizes.control
+    unit = along.control_size
     won = along.hold.charge(multipliers).sum(axis=1)
     gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
     gradient, curved_u, curved = gradient * unit, curved, curved * (unit * unit[:, None])
@@ -280,7 +280,7 @@ def turning(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np
 
     The loss there is that of max(slope, 0) and max(-slope, 0) times the ways to both limits. Args as of `lost`.
     """
-    (n, q), unit = along.shape, along.sizes.control
+    (n, q), unit = along.shape, along.control_size
     pull, bends = slope(along, costate) * unit, curved * (unit * unit[:, None])
     largest = max(float(np.abs(bends).max(initial=0.0)), float(np.abs(pull).max(initial=0.0)))
     flat = np.abs(bends).max(axis=(0, 2), initial=0.0) <= FLAT * largest

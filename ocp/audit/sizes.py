@@ -8,6 +8,7 @@ value. The size of a constraint is that of what it is made of.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +16,22 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import lagrange
+from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 
-__all__ = ["FLOOR", "FineGrid", "Sizes", "changes", "fine_grid", "integral", "plan_at", "sizes", "sizes_along"]
+__all__ = [
+    "FLOOR",
+    "FineGrid",
+    "Sizes",
+    "as_others",
+    "changes",
+    "fine_grid",
+    "integral",
+    "plan_at",
+    "sizes",
+    "sizes_along",
+]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which a plan is looked at
 FLOOR = 1e-6  # of the largest value: what is smaller cannot be told from the solver's own tolerance
@@ -147,6 +160,23 @@ def spaced(grid: FineGrid) -> np.ndarray:
     return np.linspace(0, last, min(PLACES, last + 1)).astype(int)
 
 
+def as_others(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
+    """Give what hardly moves beside others of its unit their size: it might have moved as they do.
+
+    Args:
+        size: Of all states or controls, changed in place. Shape (n,).
+        places, declared: Of these, by their names.
+        below: Share of the largest of its unit.
+    """
+    largest: dict[str, float] = {}
+    for name, place in places.items():
+        unit = declared[name].unit or name
+        largest[unit] = max(largest.get(unit, 0.0), float(size[place].max()))
+    for name, place in places.items():
+        others = largest[declared[name].unit or name]
+        size[place] = np.where(size[place] <= below * others, others, size[place])
+
+
 def _of(bounds: Bounds, index: np.ndarray) -> Bounds:
     return bounds[0][index], bounds[1][index]
 
@@ -163,10 +193,10 @@ def _sizes_of(
     known = np.zeros(spread.shape, dtype=bool)
     for end in ends:
         known |= np.abs(np.nan_to_num(end)) > STILL
-    return _floored(np.maximum(spread, FLOOR * largest), known, np.minimum(1.0, _least(declared)))
+    return _floored(np.maximum(spread, FLOOR * largest), known, np.minimum(1.0, nearest_bound(declared)))
 
 
-def _least(declared: Bounds) -> np.ndarray:
+def nearest_bound(declared: Bounds) -> np.ndarray:
     """Absolute value of the nearer of two bounds that are neither zero nor infinite. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
@@ -212,7 +242,7 @@ def _rows_of(
         own, largest = _spread(values)
     made_of = np.where(moved | (largest <= STILL), made_of, 0.0)  # what is there though nothing moves has a size
     size = np.maximum(np.maximum(own, made_of), FLOOR * largest)
-    least = np.minimum(1.0, _least(_of(bounds, rows.bounds)))
+    least = np.minimum(1.0, nearest_bound(_of(bounds, rows.bounds)))
     still, told = np.where(moved, 0.0, STILL), ~moved & (largest > STILL)
     for name in rows.names:
         mine = rows.of(name)

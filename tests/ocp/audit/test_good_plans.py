@@ -20,7 +20,7 @@ from ocp import (
     solve,
     tighten,
 )
-from tests.ocp.audit.drawn import drawn, holds
+from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, of
 from tests.ocp.audit.test_unsound_motions import START, arm, circle
 from tests.ocp.builders.standing_tasks import table_plan
 from tests.ocp.problems import double_integrator
@@ -38,6 +38,32 @@ METHODS: dict[str, Any] = {
 }
 every_method = pytest.mark.parametrize("method", METHODS)
 direct_methods = pytest.mark.parametrize("method", [name for name in METHODS if name != "indirect"])
+
+
+# ---- never used ------------------------------------------------------------------------------------------------------
+
+
+def pushed(price: float, most: float = 0.2) -> Problem:
+    """From rest to rest by a drive, which a push from outside relieves at a price."""
+    problem = Problem("pushed")
+    q, v = problem.state("q", initial=0.0, terminal=1.0), problem.state("v", initial=0.0, terminal=0.0)
+    a, f = problem.control("a"), problem.control("f", lower=0.0, upper=most)
+    problem.dynamics(q, v)
+    problem.dynamics(v, a)
+    problem.horizon(1.0)
+    problem.minimize((a - 0.3 * f) ** 2 + price * f)
+    return problem
+
+
+@pytest.mark.parametrize("most", [0.2, 1e-3, np.inf])
+def test_a_push_that_is_too_dear_to_be_used_rests_on_its_limit(most: float) -> None:
+    """It is off but for the solver's tolerance, and shows no size but that; where it would pay it is missed."""
+    plan = solve(pushed(10.0, most), Collocation(8, degree=4, scheme="legendre"))
+    assert np.abs(plan["f"]).max() < 1e-6
+    assert plan.cost == pytest.approx(12.0)
+    holds(plan.audit())
+    if most == 0.2:
+        is_no_minimum(of(plan, pushed(-1.0)).audit())
 
 
 # ---- without cost ----------------------------------------------------------------------------------------------------

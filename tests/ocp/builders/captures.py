@@ -79,7 +79,7 @@ def with_bodies(asked: dict[str, Any], antenna: Any, size: float = 0.04) -> dict
 def thruster_capture() -> dict[str, Any]:
     """In the plane, with a wheel that holds two thirds of what the target has, and thrusters of a couple each way."""
     couples = [Thruster("hub", (0, side, 0), 0.2, (arm, 0, 0)) for arm in (0.3, -0.3) for side in (1, -1)]
-    effort = Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], thrust=1.0, time=0.05)
+    effort = Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], fuel=1.0, time=0.05)
     return planar_capture() | {"chaser": planar_chaser(0.3), "thrusters": couples, "effort": effort}
 
 

@@ -25,7 +25,7 @@ from ocp import (
     dynamics_problem,
     plan_capture,
 )
-from ocp.builders.capture_bounds import Start, greatest, held_by_rotors, require_reach
+from ocp.builders.capture_bounds import Start, greatest, held_by_rotors, require_reach, require_room
 from ocp.builders.grasping import grasp_wrench, joined, pair_momentum
 from ocp.builders.target_clearance import hand_of
 from tests.models.machines.test_actuators import satellite
@@ -279,6 +279,50 @@ def test_thrusters_take_the_momentum_that_wheels_cannot_hold() -> None:
         thrust = plan.phase(phase).at_fraction(np.linspace(0, 1, 401))["thrust"]
         assert thrust.min() >= -1e-5
         assert thrust.max() <= 0.2 + 1e-5
+
+
+def test_thrusters_that_are_not_needed_stay_off() -> None:
+    """A wheel holds it all: the plan is that without thrusters, and is decided to be the best."""
+    asked = thruster_capture() | {"chaser": planar_chaser()} | SHORT
+    plan = plan_capture(**asked)
+    assert plan.audit().passed
+    for phase in ("approach", "detumble"):
+        assert np.abs(plan.phase(phase)["thrust"]).max() < 1e-6
+    less = {name: value for name, value in asked.items() if name != "thrusters"}
+    assert plan.cost == pytest.approx(plan_capture(**less).cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("phase", ["approach", "detumble"])
+def test_thrusters_change_the_momentum_by_less_than_is_said_beforehand(phase: str) -> None:
+    """Where nothing but the hub has mass the bound is a couple's moment times the time."""
+    asked = thruster_capture()
+    hub = asked["chaser"]
+    light = replace(hub, robot=replace(hub.robot, links=tuple(
+        link if link.name == "hub" else replace(link, mass=1e-9, inertia=1e-9 * np.eye(3)) for link in hub.robot.links
+    )))  # fmt: skip
+    small = planar_target(inertia=3.0)
+    small = replace(small, robot=replace(small.robot, links=(replace(small.robot.links[0], mass=1e-9),)))
+    times = {"approach": 7.0, "detumble": 0.0} if phase == "approach" else {"approach": 0.0, "detumble": 7.0}
+    start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([1.9, 0.3, 0.0]), **times)
+    couple = 2 * 0.2 * 0.3 * 7.0  # what turns the one way alone
+    momentum = np.array([couple, 0.0, 0.0])
+
+    def none(directions: Array) -> Array:
+        return np.zeros(len(directions))
+
+    require_room(light, small, momentum, start, none, asked["thrusters"])
+    with pytest.raises(ProblemError, match="thrusters take away") as caught:
+        require_room(light, small, 1.001 * momentum, start, none, asked["thrusters"])
+    assert caught.value.limit == pytest.approx(couple, rel=1e-6)
+
+
+def test_thrusters_that_are_too_weak_are_refused_with_what_is_missing() -> None:
+    asked = thruster_capture() | {"approach": 5.0, "detumble": 5.0}
+    weak = [replace(each, force=1e-3) for each in asked["thrusters"]]
+    with pytest.raises(ProblemError, match="thrusters take away") as caught:
+        capture_problem(**(asked | {"thrusters": weak}))
+    assert caught.value.name == "momentum"
+    assert 0.3 < caught.value.limit < caught.value.value
 
 
 def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
