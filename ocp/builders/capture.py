@@ -31,7 +31,15 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.capture_bounds import Start, held_by_rotors, require_reach, require_room
 from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import Effort, JointFriction, checked_steady, checked_thrusters, dynamics_problem, rates_at
+from ocp.builders.dynamics import (
+    Effort,
+    JointFriction,
+    checked_steady,
+    checked_thrusters,
+    dynamics_problem,
+    rates_at,
+    told_or,
+)
 from ocp.builders.dynamics_plan import within_limits
 from ocp.builders.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.builders.standing.problem import FreeTime
@@ -119,7 +127,7 @@ def capture_problem(
     end = {name: one.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
     rates_kept = np.where(given.steady, given.start.velocities, np.nan)
-    begins = {"joints": ca.DM(given.arm) * end["joints"], "velocities": _told_or(rates_kept, one.at_end("velocities"))}
+    begins = {"joints": ca.DM(given.arm) * end["joints"], "velocities": told_or(rates_kept, one.at_end("velocities"))}
     if given.thrusters:
         begins["base"] = _of_unit_length(chaser, end["base"])
         base = ca.vertcat(base, one.at_end("momentum"))
@@ -427,12 +435,6 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
     return joints, rates, base
-
-
-def _told_or(told: Array, found: Any) -> Any:
-    """Numbers that are told, and where they are nan what is found. Told twice they would be conditions of nothing."""
-    known = ~np.isnan(told)
-    return ca.DM(np.where(known, told, 0.0)) + ca.DM((~known).astype(float)) * found
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:

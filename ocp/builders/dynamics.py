@@ -59,7 +59,7 @@ from ocp.tasks.tip_task import TipTask
 
 __all__ = [
     "AskedOfDrives", "Effort", "JointFriction", "Motors", "checked_motors", "checked_steady", "checked_thrusters",
-    "dynamics_problem", "joint_torques", "rates_at",
+    "dynamics_problem", "joint_torques", "rates_at", "told_or",
 ]  # fmt: skip
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
@@ -545,6 +545,12 @@ def rates_at(what: str, given: Any, n: int) -> Array:
     if given is None:
         raise ProblemError(f"{what} must be 'rest', 'free' or velocities, not None", name=what, value=given)
     return _ends(what, given, -endless, endless)
+
+
+def told_or(told: Array, found: Any) -> Any:
+    """Numbers that are told, and where they are nan what is found. Told twice they would be conditions of nothing."""
+    known = ~np.isnan(told)
+    return ca.DM(np.where(known, told, 0.0)) + ca.DM((~known).astype(float)) * found
 
 
 def checked_thrusters(machine: Motors, thrusters: Any) -> tuple[Thruster, ...]:

@@ -22,8 +22,17 @@ from typing import Any, Literal, Unpack
 import numpy as np
 
 from models import FreeFloating, Thruster
+from models.arrays import Array
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import AskedOfDrives, Motors, checked_motors, dynamics_problem
+from ocp.builders.dynamics import (
+    AskedOfDrives,
+    Motors,
+    checked_motors,
+    checked_steady,
+    dynamics_problem,
+    rates_at,
+    told_or,
+)
 from ocp.builders.standing.problem import FreeTime
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, checked_text
@@ -99,12 +108,15 @@ def dynamics_phases(
         name: value for name, value in asked.items() if name not in ("start", "start_base", *ends)
     }
     begin: Any = start_joints
+    steady = np.full(movers[0].joint_size, np.nan)
+    if len(given) > 1:
+        steady = _steady_rates(movers[0], asked.get("steady", ()), asked.get("start", "rest"))
     for k, (name, leg) in enumerate(zip(names, given, strict=True)):
         known = begin is not None and not np.isnan(np.asarray(begin, dtype=float)).any()
         if k and not known and not (isinstance(leg.tasks, Sequence) and not leg.tasks):
             words = f"{name}: its tasks begin where the leg before ends; tell all joints there"
             raise ProblemError(words, name=name, value=begin)
-        own: dict[str, Any] = {"start": asked.get("start", "rest") if k == 0 else given[k - 1].end}
+        own: dict[str, Any] = {"start": asked.get("start", "rest") if k == 0 else _begin(given[k - 1], steady)}
         own["start_base"] = asked.get("start_base") if k == 0 else np.full(movers[k].base_size, np.nan)
         if k == len(given) - 1:
             own |= ends
@@ -116,7 +128,7 @@ def dynamics_phases(
         begin = leg.joints
     phases = Phases("legs", problems)
     for k in range(1, len(given)):
-        _join(phases, names[k - 1], names[k], given[k - 1])
+        _join(phases, names[k - 1], names[k], given[k - 1], steady)
     if total is not None:
         duration = checked_horizon(total)
         if not any(isinstance(leg.horizon, FreeTime) for leg in given):
@@ -167,13 +179,32 @@ def _machines(machine: Motors, legs: Sequence[Leg], names: Sequence[str]) -> lis
     return found[1:]
 
 
-def _join(phases: Phases, before: str, after: str, leg: Leg) -> None:
+def _steady_rates(machine: Motors, names: Any, start: Any) -> Array:
+    """Velocities of joints that keep theirs, nan of all others. Shape (n,)."""
+    keeps = checked_steady(machine.robot, names)
+    rates = np.where(keeps, rates_at("start", start, machine.joint_size), np.nan)
+    if np.isnan(rates[keeps]).any():
+        words = "steady: joints that keep their speed through several legs have to be told it; say start=velocities"
+        raise ProblemError(words, name="steady", value=names)
+    return rates
+
+
+def _begin(before: Leg, steady: Array) -> Any:
+    """How a leg starts after another: at rest, but for what is steady, or free, to be joined."""
+    if before.end != "rest" or np.isnan(steady).all():
+        return before.end
+    return np.nan_to_num(steady)
+
+
+def _join(phases: Phases, before: str, after: str, leg: Leg, steady: Array) -> None:
     """What of one leg goes on in the next: all that is not told at both ends already."""
-    told: list[str] = []
+    told: dict[str, Any] = {}
     if leg.joints is not None and not np.isnan(np.asarray(leg.joints, dtype=float)).any():
-        told.append("joints")
+        told["joints"] = None
     if leg.end == "rest":
-        told += ["velocities", "accelerations"]
+        told |= {"velocities": None, "accelerations": None}
+    elif not np.isnan(steady).all():
+        told["velocities"] = told_or(steady, phases[before].at_end("velocities"))
     states = [name for name in phases.of(after) if f"{after}.{name}" in phases.declared.states and name != DURATION]
-    if set(states) - set(told):
-        phases.join(before, after, {name: None for name in told if name in states})
+    if any(told.get(name, "joined") is not None for name in states):
+        phases.join(before, after, {name: value for name, value in told.items() if name in states})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import mujoco
@@ -28,6 +28,7 @@ from ocp import (
     plan_dynamics,
     solve,
 )
+from ocp.problem.values import constant
 from tests.models.machines.test_actuators import SPINNING, moving, pyramid, satellite, state, wheeled
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
@@ -205,6 +206,31 @@ def test_a_pyramid_of_gyros_turns_a_body_within_the_rates_of_its_gimbals() -> No
         mujoco.mj_forward(model, data)
         mujoco.mj_subtreeVel(model, data)
         assert np.abs(data.subtree_angmom[1]).max() < 1e-8
+
+
+@pytest.mark.parametrize("end", ["rest", "free"])
+def test_rotors_of_gyros_keep_their_speed_through_all_legs(end: Literal["rest", "free"]) -> None:
+    """Two legs, with a stop between them or none: nothing is asked for that stops a rotor, nor twice."""
+    robot = pyramid(rate=0.8, torque=8.0)
+    asked: dict[str, Any] = {"start": SPINNING, "steady": [gyro.rotor for gyro in gyros_of(robot)]}
+    legs = [Leg(None, 3.0, end=end), Leg(None, 3.0)]
+    problem = dynamics_phases(FreeFloating(robot), np.zeros(8), legs, **asked)
+    begins = problem.of("leg 2")["velocities"].initial
+    rotors = slice(1, None, 2)
+    if end == "rest":
+        assert constant(begins) == pytest.approx(SPINNING)
+        assert "leg 1 to leg 2: velocities" not in problem.declared.end
+    else:
+        assert begins is None or np.isnan(constant(begins)).all()
+        joined = problem.declared.end["leg 1 to leg 2: velocities"].expression
+        before, after = (problem[f"leg {k}"] for k in (1, 2))
+        gaps = ca.Function("gaps", [after.at_start("velocities"), before.at_end("velocities")], [joined])
+        told = np.array(gaps(SPINNING, np.zeros(8))).ravel()
+        assert told[rotors] == pytest.approx(np.zeros(4))
+        assert np.array(gaps(np.zeros(8), np.ones(8))).ravel()[::2] == pytest.approx(-1.0)
+    with pytest.raises(ProblemError, match="keep their speed") as caught:
+        dynamics_phases(FreeFloating(robot), np.zeros(8), legs, **(asked | {"start": "free"}))
+    assert caught.value.name == "steady"
 
 
 # ---- laws ----------------------------------------------------------------------------------------------------------
