@@ -17,6 +17,8 @@ from models.machines.machine import with_tip
 from ocp import (
     Collocation,
     Cone,
+    Effort,
+    Grasp,
     Limits,
     ProblemError,
     Solution,
@@ -281,6 +283,58 @@ def test_thrusters_take_the_momentum_that_wheels_cannot_hold() -> None:
         assert thrust.max() <= 0.2 + 1e-5
 
 
+@cache
+def short() -> Solution:
+    return plan_capture(**(planar_capture() | SHORT))
+
+
+def longer(robot: Robot, share: float) -> Robot:
+    """The same with all lengths some times as long, and inertias and torques as they follow."""
+    links = [
+        replace(
+            link, center_of_mass=share * np.asarray(link.center_of_mass), inertia=share**2 * np.asarray(link.inertia)
+        )
+        for link in robot.links
+    ]
+    joints = [
+        replace(joint, translation=share * np.asarray(joint.translation), effort=share**2 * joint.effort)
+        for joint in robot.joints
+    ]
+    tip = share * np.asarray(robot.tip_translation)
+    return replace(robot, links=tuple(links), joints=tuple(joints), tip_translation=tip)
+
+
+@pytest.mark.parametrize("share", [0.1, 10.0])
+def test_a_capture_in_another_unit_of_length_is_the_same(share: float) -> None:
+    asked = planar_capture() | SHORT
+    one, other = asked["chaser"], asked["target"]
+    momentum = np.asarray(other.conserved_momentum) * np.array([share**2, share, share])
+    asked |= {
+        "chaser": replace(one, robot=longer(one.robot, share)),
+        "target": replace(other, robot=longer(other.robot, share), conserved_momentum=momentum),
+        "target_base": share * np.array([1.9, 0.3, 0.0]),
+        "cone": replace(CONE, length=share * CONE.length, depth=share * CONE.depth),
+        "grasp": Grasp(force=share * GRASP.force, moment=share**2 * GRASP.moment),
+        "effort": Effort(torque=share**-4, acceleration=[1.0] * 3 + [0.0], time=0.05),
+    }
+    plan = plan_capture(**asked)
+    assert plan.cost == pytest.approx(short().cost, rel=1e-9)
+    assert plan.audit().passed
+
+
+def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
+    asked = planar_capture() | SHORT
+    *arm, wheel = asked["chaser"].robot.joints
+    asked |= {
+        "chaser": replace(asked["chaser"], robot=replace(asked["chaser"].robot, joints=(wheel, *arm))),
+        "start_joints": np.roll(PLANAR_START, 1),
+        "effort": Effort(torque=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
+    }
+    plan = plan_capture(**asked)
+    assert plan.cost == pytest.approx(short().cost, rel=1e-9)
+    assert plan.phase("detumble")["velocities"][-1, 0] == pytest.approx(0.45 / 0.02, rel=1e-9)
+
+
 def test_thrusters_that_are_not_needed_stay_off() -> None:
     """A wheel holds it all: the plan is that without thrusters, and is decided to be the best."""
     asked = thruster_capture() | {"chaser": planar_chaser()} | SHORT
@@ -288,32 +342,57 @@ def test_thrusters_that_are_not_needed_stay_off() -> None:
     assert plan.audit().passed
     for phase in ("approach", "detumble"):
         assert np.abs(plan.phase(phase)["thrust"]).max() < 1e-6
-    less = {name: value for name, value in asked.items() if name != "thrusters"}
-    assert plan.cost == pytest.approx(plan_capture(**less).cost, rel=1e-6)
+    assert plan.cost == pytest.approx(short().cost, rel=1e-6)
 
 
-@pytest.mark.parametrize("phase", ["approach", "detumble"])
-def test_thrusters_change_the_momentum_by_less_than_is_said_beforehand(phase: str) -> None:
-    """Where nothing but the hub has mass the bound is a couple's moment times the time."""
+def taken_away(phase: str, thrusters: list[Thruster], mass: float, way: float, *, arm: bool = False) -> float:
+    """What thrusters take away at most in 7 s of a phase, by a chaser whose arm has mass, or of which the hub alone."""
     asked = thruster_capture()
-    hub = asked["chaser"]
-    light = replace(hub, robot=replace(hub.robot, links=tuple(
+    hub, goal = asked["chaser"], planar_target()
+    links = [
         link if link.name == "hub" else replace(link, mass=1e-9, inertia=1e-9 * np.eye(3)) for link in hub.robot.links
-    )))  # fmt: skip
-    small = planar_target(inertia=3.0)
-    small = replace(small, robot=replace(small.robot, links=(replace(small.robot.links[0], mass=1e-9),)))
+    ]
+    light = hub if arm else replace(hub, robot=replace(hub.robot, links=tuple(links)))
+    goal = replace(goal, robot=replace(goal.robot, links=(replace(goal.robot.links[0], mass=mass),)))
     times = {"approach": 7.0, "detumble": 0.0} if phase == "approach" else {"approach": 0.0, "detumble": 7.0}
-    start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([1.9, 0.3, 0.0]), **times)
-    couple = 2 * 0.2 * 0.3 * 7.0  # what turns the one way alone
-    momentum = np.array([couple, 0.0, 0.0])
+    start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([way, 0.0, 0.0]), **times)
 
     def none(directions: Array) -> Array:
         return np.zeros(len(directions))
 
-    require_room(light, small, momentum, start, none, asked["thrusters"])
     with pytest.raises(ProblemError, match="thrusters take away") as caught:
-        require_room(light, small, 1.001 * momentum, start, none, asked["thrusters"])
-    assert caught.value.limit == pytest.approx(couple, rel=1e-6)
+        require_room(light, goal, np.array([1e3, 0.0, 0.0]), start, none, thrusters)
+    assert isinstance(caught.value.limit, float)
+    require_room(light, goal, np.array([caught.value.limit, 0.0, 0.0]), start, none, thrusters)
+    return caught.value.limit
+
+
+@pytest.mark.parametrize("phase", ["approach", "detumble"])
+def test_thrusters_beside_the_middle_take_their_moment_times_the_time(phase: str) -> None:
+    """Of two couples one alone, for they turn opposite ways; the target has no mass."""
+    couple = 2 * 0.2 * 0.3 * 7.0
+    assert taken_away(phase, thruster_capture()["thrusters"], 1e-9, 1.9) == pytest.approx(couple, rel=1e-6)
+
+
+@pytest.mark.parametrize(("phase", "way"), [("approach", 1.0), ("approach", 3.0), ("detumble", 3.0)])
+def test_a_push_through_the_middle_has_the_lever_of_the_target(phase: str, way: float) -> None:
+    """30 kg of 90 at the end of an arm of 1.8 m and 0.4, or as far as they are at first, and are pushed apart."""
+    force, time = 0.5, 7.0
+    lever = max(way, 2.2) + force / 60.0 * time**2 / 12 if phase == "approach" else 2.2
+    found = taken_away(phase, [Thruster("hub", (0, 1, 0), force)], 30.0, way)
+    assert found == pytest.approx(force * time * lever / 3, rel=1e-6)
+
+
+def test_a_push_through_the_hub_has_the_lever_of_an_arm_that_is_stretched_out() -> None:
+    stretched = (4.0 * 0.4 + 3.0 * 1.15 + 1.0 * 1.65) / planar_chaser().robot.total_mass
+    found = taken_away("detumble", [Thruster("hub", (0, 1, 0), 0.5)], 1e-9, 1.9, arm=True)
+    assert found == pytest.approx(0.5 * 7.0 * stretched, rel=1e-6)
+
+
+def test_a_thruster_on_the_arm_is_as_far_off_as_the_arm_takes_it() -> None:
+    """Link 3 begins 1.5 m from the hub, and the thruster sits 0.2 m along it, whatever way it points."""
+    thruster = Thruster("link3", (1, 0, 0), 0.5, (0.2, 0, 0))
+    assert taken_away("detumble", [thruster], 1e-9, 1.9) == pytest.approx(0.5 * 1.7 * 7.0, rel=1e-6)
 
 
 def test_thrusters_that_are_too_weak_are_refused_with_what_is_missing() -> None:
