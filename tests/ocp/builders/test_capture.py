@@ -345,14 +345,9 @@ def test_thrusters_that_are_not_needed_stay_off() -> None:
     assert plan.cost == pytest.approx(short().cost, rel=1e-6)
 
 
-def taken_away(phase: str, thrusters: list[Thruster], mass: float, way: float, *, arm: bool = False) -> float:
-    """What thrusters take away at most in 7 s of a phase, by a chaser whose arm has mass, or of which the hub alone."""
-    asked = thruster_capture()
-    hub, goal = asked["chaser"], planar_target()
-    links = [
-        link if link.name == "hub" else replace(link, mass=1e-9, inertia=1e-9 * np.eye(3)) for link in hub.robot.links
-    ]
-    light = hub if arm else replace(hub, robot=replace(hub.robot, links=tuple(links)))
+def taken_away(phase: str, thrusters: list[Thruster], mass: float, way: float, chaser: FreeFloating) -> float:
+    """What thrusters take away at most in 7 s of a phase, from a target of some mass and some way off."""
+    goal = planar_target()
     goal = replace(goal, robot=replace(goal.robot, links=(replace(goal.robot.links[0], mass=mass),)))
     times = {"approach": 7.0, "detumble": 0.0} if phase == "approach" else {"approach": 0.0, "detumble": 7.0}
     start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([way, 0.0, 0.0]), **times)
@@ -361,17 +356,27 @@ def taken_away(phase: str, thrusters: list[Thruster], mass: float, way: float, *
         return np.zeros(len(directions))
 
     with pytest.raises(ProblemError, match="thrusters take away") as caught:
-        require_room(light, goal, np.array([1e3, 0.0, 0.0]), start, none, thrusters)
+        require_room(chaser, goal, np.array([1e3, 0.0, 0.0]), start, none, thrusters)
     assert isinstance(caught.value.limit, float)
-    require_room(light, goal, np.array([caught.value.limit, 0.0, 0.0]), start, none, thrusters)
+    require_room(chaser, goal, np.array([caught.value.limit, 0.0, 0.0]), start, none, thrusters)
     return caught.value.limit
+
+
+def with_light_arm() -> FreeFloating:
+    """A chaser of whose bodies the hub alone has mass, 60 kg."""
+    hub = planar_chaser()
+    links = [
+        link if link.name == "hub" else replace(link, mass=1e-9, inertia=1e-9 * np.eye(3)) for link in hub.robot.links
+    ]
+    return replace(hub, robot=replace(hub.robot, links=tuple(links)))
 
 
 @pytest.mark.parametrize("phase", ["approach", "detumble"])
 def test_thrusters_beside_the_middle_take_their_moment_times_the_time(phase: str) -> None:
     """Of two couples one alone, for they turn opposite ways; the target has no mass."""
     couple = 2 * 0.2 * 0.3 * 7.0
-    assert taken_away(phase, thruster_capture()["thrusters"], 1e-9, 1.9) == pytest.approx(couple, rel=1e-6)
+    found = taken_away(phase, thruster_capture()["thrusters"], 1e-9, 1.9, with_light_arm())
+    assert found == pytest.approx(couple, rel=1e-6)
 
 
 @pytest.mark.parametrize(("phase", "way"), [("approach", 1.0), ("approach", 3.0), ("detumble", 3.0)])
@@ -379,20 +384,26 @@ def test_a_push_through_the_middle_has_the_lever_of_the_target(phase: str, way: 
     """30 kg of 90 at the end of an arm of 1.8 m and 0.4, or as far as they are at first, and are pushed apart."""
     force, time = 0.5, 7.0
     lever = max(way, 2.2) + force / 60.0 * time**2 / 12 if phase == "approach" else 2.2
-    found = taken_away(phase, [Thruster("hub", (0, 1, 0), force)], 30.0, way)
+    found = taken_away(phase, [Thruster("hub", (0, 1, 0), force)], 30.0, way, with_light_arm())
     assert found == pytest.approx(force * time * lever / 3, rel=1e-6)
 
 
-def test_a_push_through_the_hub_has_the_lever_of_an_arm_that_is_stretched_out() -> None:
-    stretched = (4.0 * 0.4 + 3.0 * 1.15 + 1.0 * 1.65) / planar_chaser().robot.total_mass
-    found = taken_away("detumble", [Thruster("hub", (0, 1, 0), 0.5)], 1e-9, 1.9, arm=True)
-    assert found == pytest.approx(0.5 * 7.0 * stretched, rel=1e-6)
+@pytest.mark.parametrize("back", [0.0, 0.1])
+@pytest.mark.parametrize("phase", ["approach", "detumble"])
+def test_a_push_through_the_hub_has_the_lever_of_an_arm_that_is_stretched_out(phase: str, back: float) -> None:
+    """Away from where the hub has its mass, behind the arm."""
+    chaser = planar_chaser()
+    hub = replace(chaser.robot.links[0], center_of_mass=(-back, 0, 0))
+    chaser = replace(chaser, robot=replace(chaser.robot, links=(hub, *chaser.robot.links[1:])))
+    arm = 4.0 * (0.4 + back) + 3.0 * (1.15 + back) + 1.0 * (1.65 + back) + 0.2 * back  # and the wheel
+    found = taken_away(phase, [Thruster("hub", (0, 1, 0), 0.5, (-back, 0, 0))], 1e-9, 1.9, chaser)
+    assert found == pytest.approx(0.5 * 7.0 * arm / chaser.robot.total_mass, rel=1e-6)
 
 
 def test_a_thruster_on_the_arm_is_as_far_off_as_the_arm_takes_it() -> None:
     """Link 3 begins 1.5 m from the hub, and the thruster sits 0.2 m along it, whatever way it points."""
     thruster = Thruster("link3", (1, 0, 0), 0.5, (0.2, 0, 0))
-    assert taken_away("detumble", [thruster], 1e-9, 1.9) == pytest.approx(0.5 * 1.7 * 7.0, rel=1e-6)
+    assert taken_away("detumble", [thruster], 1e-9, 1.9, with_light_arm()) == pytest.approx(0.5 * 1.7 * 7.0, rel=1e-6)
 
 
 def test_thrusters_that_are_too_weak_are_refused_with_what_is_missing() -> None:
