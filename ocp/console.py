@@ -229,19 +229,37 @@ class Progress(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arguments: list[Any]) -> list[int]:
+        x, worst = np.asarray(arguments[0].full()).reshape(-1), 0.0
+        if self.is_shown:
+            g = np.asarray(arguments[2].full()).reshape(-1)
+            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+        return [int(not self.may_go_on(x, float(arguments[1]), worst))]
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is a line."""
+        return self.bar is not None and not self.bar.disable
+
+    def may_go_on(self, iterate: np.ndarray, cost: float, worst: float) -> bool:
+        """Whether the solver may go on from an iterate (n,), which is kept; its cost and infeasibility are shown."""
         try:
-            if self.bar is not None and not self.bar.disable:
-                g = np.asarray(arguments[2].full()).reshape(-1)
-                worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-                cost = float(arguments[1])
+            if self.is_shown:
                 self.bar.set_postfix_str(f"cost {cost:.6g}, infeasibility {worst:.1e}", refresh=False)
                 self.bar.update()
             self.stopped = reason_to_stop()
             self.meanwhile()
         except KeyboardInterrupt:  # CasADi would make another error of it
             self.stopped = INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [int(bool(self.stopped))]
+        self.iterations, self.iterate = self.iterations + 1, iterate
+        return not self.stopped
+
+    def must_end(self) -> bool:
+        """Whether the solver must end inside an iteration."""
+        try:
+            self.stopped = self.stopped or reason_to_stop()
+        except KeyboardInterrupt:
+            self.stopped = INTERRUPTED
+        return bool(self.stopped)
 
     def close(self) -> None:
         if self.bar is not None:
@@ -251,7 +269,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
 class Watch(ca.Callback):  # type: ignore[misc]
     """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
 
-    For a solver that has no iteration callback. ``meanwhile`` is called at each iterate.
+    For fatrop's plugin, which has no iteration callback. ``meanwhile`` is called at each iterate.
     """
 
     def __init__(self, n: int, title: str) -> None:

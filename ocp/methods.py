@@ -41,7 +41,7 @@ class Method(Protocol):
         self,
         problem: Problem,
         *,
-        solver: str = "ipopt",
+        solver: str = "auto",
         options: ByName = None,
         compiled: bool | str = "auto",
         scaling: bool = True,
@@ -55,7 +55,7 @@ def prepare(
     problem: Problem,
     method: Method,
     *,
-    solver: str = "ipopt",
+    solver: str = "auto",
     options: ByName = None,
     compiled: bool | str = "auto",
     scaling: bool = True,
@@ -64,12 +64,13 @@ def prepare(
 
     Args:
         problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt``, ``native`` (fatrop from stage to stage through its C interface: built and solved in a time
-            that grows with the intervals alone; needs a C compiler once a machine), ``fatrop`` (the same by CasADi's
-            plugin, slow to build; takes no coupling of controls at the end) or ``sleqp`` (an active-set method, to
-            confirm a plan, started there). Where ``native`` cannot be had, fails or misses its tolerance, it is ipopt
-            that solves; ``Solution.solver`` says which did. For the indirect method, of the direct solution that seeds
-            it.
+        solver: ``ipopt``, ``native`` (an interior-point method of our own from stage to stage: built and solved in a
+            time that grows with the intervals alone; needs a C compiler once a machine), ``fatrop`` (another such
+            method, by CasADi's plugin, slow to build; takes no coupling of controls at the end) or ``sleqp`` (an
+            active-set method, to confirm a plan, started there). Where ``native`` cannot be had, fails or misses its
+            tolerance, it is ipopt that solves; ``Solution.solver`` says which did. ``auto`` is ``native``, but ipopt
+            while that is being compiled, or where options are given. For the indirect method, of the direct solution
+            that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Whether the functions of the problem and their derivatives go through the machine's C compiler (that
             of the environment's CC, else cc), which makes solves several times faster and changes no number. What was
@@ -101,7 +102,7 @@ def solve(
     method: Method,
     *,
     parameters: ByName = None,
-    solver: str = "ipopt",
+    solver: str = "auto",
     options: ByName = None,
     guess: Guess = None,
     check: bool = True,

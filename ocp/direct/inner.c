@@ -1,8 +1,8 @@
-/* Between a partially separable program and fatrop's C interface: blocks in, matrices of stages out.
+/* A partially separable program as its stages: blocks in, matrices of stages out.
 
    The same text for every problem; sizes and places come in the tables that ocp/direct/native.py makes. What the solver
    sees is scaled: variables over `a`, rows and cost over their own. Here: the program and what no solver sees of it;
-   stages.c follows, in one text with this.
+   riccati.c, stages.c and interior.c follow, in one text with this.
 
    The solver never sees the inner variables z of a stage, which the inner rows D(w, z) = 0 there define by the others,
    w = (u, x): the values at the points of an interval and its end. Newton's method finds z at each w. With E = dz/dw
@@ -12,15 +12,12 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include "blasfeo.h"
-#include "fatrop/ocp/OCPCInterface.h"
 
 #define VAST 1e20
 #define WILD (1 / DBL_EPSILON) /* derivatives beside which 1 is rounding */
-#define GROWTH (DBL_MAX_10_EXP / 4) /* powers of ten along the horizon: squares' squares overflow, fatrop loops for ever */
 #define SETTLED 1e-13 /* of the inner rows */
 #define ROUNDING 1e-9 /* below which inner rows that fall no more stand at their rounding */
-#define GAIN 0.1 /* of what is left, by each step with the factors of an earlier point: slower, and new ones are quicker */
+#define GAIN 0.1 /* of what is left, by a step with the factors of an earlier point: slower, and new ones are quicker */
 #define STEPS DBL_MANT_DIG /* of Newton's method, and halvings of each, whose last changes nothing */
 #define EXPORT __attribute__((visibility("default")))
 
@@ -32,16 +29,16 @@ typedef struct {
 } entries;
 
 typedef struct {
-  int stages, variables, rows, values, slopes, linear, duals;
+  int stages, variables, rows, values, slopes, linear, equal, slacks; /* rows of the solver: equalities, inequalities */
   int plain, most;               /* no block reads an inner variable; variables of the largest stage */
   const int *nx, *nu, *nz, *ng, *ni; /* of each stage */
   const int *primal_first, *slack_first, *inner_first, *factors_first, *sensitivity_first; /* where its part begins */
-  const int *place;              /* of each variable in fatrop's vector; -1: an inner one */
+  const int *place;              /* of each variable in the solver's vector; -1: an inner one */
   const int *local;              /* of each variable in its stage: controls, states, inner ones */
   const int *inner_variable, *inner_row; /* stage by stage */
   const double *a;
   const int *kind, *position;    /* of each row: 0 dynamics, 1 equality, 2 inequality, 3 inner; which in its stage */
-  const int *target;             /* of each row in fatrop's vector of constraints; -1: not there */
+  const int *target;             /* of each row in the solver's vector of rows; -1: not there */
   const double *factor, *shift;  /* of each row: sign over scale; what an equality is asked to be */
   entries constant, inner, jacobian, hessian; /* of linear rows; of inner rows, of others; of half the curvature */
   const double *half;            /* of each entry of the curvature: 1, on the diagonal 1/2 */
@@ -51,13 +48,14 @@ typedef struct {
   double cost_scale;
   double *x, *g, *lam;           /* scratch: variables and rows as they are, multipliers of these */
   double sigma;
-  const double *lower, *upper, *guess; /* in fatrop's order */
+  const double *lower, *upper, *guess; /* of inequalities; in the solver's order */
+  const int *own;                /* of each inequality the variable that it bounds, in the solver's order; -1: none */
   int (*evaluate)(int);          /* fills the numbers of a kind, at x, lam and sigma */
-  int (*watch)(void);            /* not zero where the solve must end */
+  int (*watch)(int);             /* not zero where the solve must end; told whether there is a new iterate */
+  double cost, missed;           /* of it */
   double *seen, *before, *slope, *step, *size, *factors, *sensitivity, *scratch;
   int *pivots;
-  struct FatropOcpCSolver *solver;
-  int stopped, lost;             /* the solve must end; it cannot go on */
+  int stopped;                   /* the solve must end */
   int known, found, ready, sloped, factored; /* of the point seen: its values, z; E, slopes; an E of some point */
 } program;
 
@@ -67,20 +65,12 @@ static double tame(double v) { return isnan(v) ? VAST : v > VAST ? VAST : v < -V
 
 static int own(const program *s, int k) { return s->nu[k] + s->nx[k]; }
 
-static void end(program *s) {
-  if (!s->stopped) fatrop_ocp_c_set_option_int(s->solver, "max_iter", 0);
-  s->stopped = 1;
-}
-
-static void give_up(program *s) {
-  s->lost = 1;
-  end(s);
-}
-
-static int must_end(program *s) {
-  if (!s->stopped && s->watch()) end(s);
+static int ends(program *s, int anew) {
+  if (!s->stopped && s->watch(anew)) s->stopped = 1;
   return s->stopped;
 }
+
+static int must_end(program *s) { return ends(s, 0); }
 
 /* ---- dense factors of D_z, row by row ---- */
 
@@ -262,7 +252,7 @@ static int newton(program *s) {
   return 0;
 }
 
-/* The variables of the program at fatrop's, and the values of the blocks there; not twice at the same place. */
+/* The variables of the program at the solver's, and the values of the blocks there; not twice at the same place. */
 static int move(program *s, const double *primal) {
   int i;
   if (s->known && !memcmp(s->seen, primal, sizeof(double) * (size_t)s->primal_first[s->stages])) return s->found;

@@ -1,19 +1,18 @@
-"""A stage-ordered program solved by fatrop through its own C interface, without CasADi in between.
+"""A stage-ordered program solved by an interior-point method of our own, in C that is compiled once a machine.
 
-Fatrop (Vanroye, Sathya, De Schutter, Decre, 2023) is an interior-point method whose linear algebra goes from stage to
-stage. CasADi's plugin for it takes a time that grows with the square of the intervals to build; here tables say where
-every number of a block stands in the matrices of the stages, and C, compiled once a machine, puts them there. Its
-interface wants equalities apart from inequalities, and bounds of variables among these. What the dynamics inside an
-interval define, fatrop does not see: `inner.c` finds it by Newton's method, with its slopes and curvature (condensing:
-Bock, Plitt, 1984; of collocation: Quirynen, Gros, Diehl, 2015).
+What IPOPT does (`interior.c`), with linear algebra that goes from stage to stage (`riccati.c`), in a time and a memory
+that grow with the intervals alone. Tables say where every number of a block stands in the matrices of the stages
+(`stages.c`). What the dynamics inside an interval define, the method does not see: `inner.c` finds it by Newton's
+method, with its slopes and curvature (condensing: Bock, Plitt, 1984; of collocation: Quirynen, Gros, Diehl, 2015).
+Where IPOPT would begin its restoration, this ends, and IPOPT itself goes on.
 
-The blocks are evaluated by CasADi, all applications at once, through a call back to Python, five times an iteration.
+The blocks are evaluated by CasADi, all applications at once, through a call back to Python, some five times an
+iteration.
 """
 
 from __future__ import annotations
 
 import ctypes
-import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -24,29 +23,33 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import Watch
+from ocp.console import Progress
 from ocp.direct.assembly import Derivatives, gather, inputs, mapped, nonzeros, repeat
+from ocp.direct.compiled import Background
 from ocp.direct.fragment import Fragment
 from ocp.direct.stages import Entries, Tables
 from ocp.errors import ProblemError
-from ocp.libraries import CompilerError, Library, built
+from ocp.libraries import CompilerError, Library, built, kept
 from ocp.problem.formulation import Formulation
 
-__all__ = ["NativeSolver", "why_not"]
+__all__ = ["NativeSolver", "checked_options", "is_at_hand", "why_not"]
 
 KINDS = ("value", "gradient", "jacobian", "hessian")
 VALUE, GRADIENT, JACOBIAN, HESSIAN = range(4)
 DYNAMICS, EQUALITY, INEQUALITY, INNER = range(4)
 MOST_KEPT = 4
 """Solvers kept of one program: which rows are equalities may change with the parameters, and makes another solver."""
-WORDS = {
-    0: "Solve_Succeeded",
-    1: "Maximum_Iterations_Exceeded",
-    2: "Solved_To_Acceptable_Level",
-    3: "Infeasible_Problem_Detected",
-}
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("inner.c", "stages.c"))
-_CREATION = threading.Lock()  # fatrop sets a stream of the whole process when a solver is made
+WORDS = (
+    "Solve_Succeeded",
+    "Maximum_Iterations_Exceeded",
+    "Solved_To_Acceptable_Level",
+    "Restoration_Failed",
+    "Error_In_Step_Computation",
+)
+"""How a solve ended, in ipopt's words."""
+OPTIONS: dict[str, type] = {"tol": float, "max_iter": int, "acceptable_tol": float, "acceptable_iter": int}
+"""What can be told it, which means the same to ipopt."""
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("inner.c", "riccati.c", "stages.c", "interior.c"))
 
 
 # ---- the library -------------------------------------------------------------------------------------------------
@@ -61,27 +64,37 @@ def why_not() -> str:
     return ""
 
 
+def is_at_hand() -> bool:
+    """Whether the driver is compiled; where it is not, that is done in the background."""
+    loaded = library.cache_info().currsize > 0
+    return loaded or kept(driver()) is not None or isinstance(in_background().found[0], Path)
+
+
+@cache
+def in_background() -> Background:
+    """What compiles the driver."""
+    return Background([driver()])
+
+
+@cache
+def driver() -> Library:
+    """The driver, for this machine's processor."""
+    text = "\n".join(source.read_text(encoding="utf-8") for source in SOURCES)
+    return Library((text,), lambda: text, vectors=True, flags=("-O3",))
+
+
 @cache
 def library() -> Any:
     """The driver, compiled for this machine.
 
     Raises:
-        CompilerError: There is no compiler, or it fails. OSError: There is no library of fatrop beside casadi.
+        CompilerError: There is no compiler, or it fails. OSError: It cannot be loaded.
     """
-    home = Path(ca.__file__).parent
-    for name in ("libfatrop.so", "libblasfeo.so", "include/fatrop/ocp/OCPCInterface.h"):
-        if not (home / name).exists():
-            raise OSError(f"casadi brings no {name}")
-    text = "\n".join(source.read_text(encoding="utf-8") for source in SOURCES)
-    link = (f"-L{home}", "-lfatrop", "-l:libblasfeo.so", f"-Wl,-rpath,{home}", "-lm")
-    made = ctypes.CDLL(str(built(Library((text,), lambda: text, (str(home / "include"),), link, flags=("-O3",)))))
+    made = ctypes.CDLL(str(built(driver())))
     address, number = ctypes.c_void_p, ctypes.c_int
     for name, result, given in (
         ("stages_create", address, [address]),
-        ("stages_places", None, [address, address, number]),
-        ("stages_option", None, [address, ctypes.c_char_p, number, ctypes.c_double]),
-        ("stages_option_type", number, [ctypes.c_char_p]),
-        ("stages_solve", number, [address] * 5),
+        ("stages_solve", None, [address, ctypes.c_double, number, ctypes.c_double, number, *[address] * 3]),
         ("stages_values", None, [address] * 4),
         ("stages_curve_upwards", number, [address] * 3),
         ("stages_destroy", None, [address]),
@@ -96,14 +109,17 @@ class _Entries(ctypes.Structure):
 
 
 EVALUATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
-WATCH = ctypes.CFUNCTYPE(ctypes.c_int)
+WATCH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
 
 
 class _Program(ctypes.Structure):
     _fields_ = [
         *(
             (name, ctypes.c_int)
-            for name in ("stages", "variables", "rows", "values", "slopes", "linear", "duals", "plain", "most")
+            for name in (
+                *("stages", "variables", "rows", "values", "slopes", "linear", "equal", "slacks"),
+                *("plain", "most"),
+            )
         ),
         *(
             (name, ctypes.c_void_p)
@@ -121,15 +137,16 @@ class _Program(ctypes.Structure):
         ("cost_scale", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in ("x", "g", "lam")),
         ("sigma", ctypes.c_double),
-        *((name, ctypes.c_void_p) for name in ("lower", "upper", "guess")),
+        *((name, ctypes.c_void_p) for name in ("lower", "upper", "guess", "own")),
         ("evaluate", EVALUATE),
         ("watch", WATCH),
+        ("cost", ctypes.c_double),
+        ("missed", ctypes.c_double),
         *(
             (name, ctypes.c_void_p)
             for name in ("seen", "before", "slope", "step", "size", "factors", "sensitivity", "scratch", "pivots")
         ),
-        ("solver", ctypes.c_void_p),
-        *((name, ctypes.c_int) for name in ("stopped", "lost", "known", "found", "ready", "sloped", "factored")),
+        *((name, ctypes.c_int) for name in ("stopped", "known", "found", "ready", "sloped", "factored")),
     ]
 
 
@@ -158,7 +175,7 @@ class _Kept:
 
 
 class _Handle(_Kept):
-    """A solver of fatrop for what is an equality, what an inequality and what neither.
+    """A solver for what is an equality, what an inequality and what neither.
 
     The bounds of variables are rows behind those of the program.
 
@@ -184,43 +201,49 @@ class _Handle(_Kept):
             before = np.concatenate([[0], np.cumsum(counts[which])])
             position[order] = np.arange(len(order)) - before[stage[order]]
         ng, ni = counts[EQUALITY], counts[INEQUALITY]
-        # fatrop would end the whole process
         if np.any(ng > tables.nx + tables.nu):
             crowded = int(np.argmax(ng - tables.nx - tables.nu))
             raise RuntimeError(f"stage {crowded} has {ng[crowded]} equalities, more than it has variables; use ipopt")
-        slack = np.concatenate([[0], np.cumsum(ni)])
-        self.duals = int(tables.nx[1:].sum() + ng.sum() + ni.sum())
+        # dynamics, equalities, inequalities, each from stage to stage
+        firsts = [np.concatenate([[0], np.cumsum(count)]) for count in (tables.nx[1:], ng, ni)]
+        dynamics, slack = int(firsts[0][-1]), firsts[2]
+        equal = dynamics + int(firsts[1][-1])
+        begins = np.zeros((stages, 3), dtype=int)
+        begins[: stages - 1, DYNAMICS] = firsts[0][:-1]
+        begins[:, EQUALITY], begins[:, INEQUALITY] = dynamics + firsts[1][:-1], equal + slack[:-1]
+        self.duals = equal + int(slack[-1])
 
         self.base = base = _Program()
         ctypes.pointer(base)[0] = solver.base  # a copy
         base.ng, base.ni, base.slack_first = (self.keep(part) for part in (ng, ni, slack))
+        base.equal, base.slacks = equal, int(slack[-1])
         self.limits = np.zeros((2, slack[-1]))
         base.lower, base.upper = (part.ctypes.data for part in self.limits)
-        library = solver.library
-        with _CREATION:
-            self.address = library.stages_create(ctypes.byref(base))
-        weakref.finalize(self, library.stages_destroy, self.address)
-        places = np.zeros(3 * stages, dtype=np.int32)
-        library.stages_places(self.address, places.ctypes.data, stages)
-        for name, (type_, number) in solver.options.items():
-            library.stages_option(self.address, name.encode(), type_, number)
         seen = (kind >= 0) & (kind != INNER)
-        base.target = self.keep(np.where(seen, places[3 * stage + np.where(seen, kind, 0)] + position, -1))
+        base.target = self.keep(np.where(seen, begins[stage, np.where(seen, kind, 0)] + position, -1))
         base.kind, base.position = self.keep(kind), self.keep(position)
         self.is_slack, self.is_equality = kind == INEQUALITY, kind == EQUALITY
         self.slack = (slack[stage] + position)[self.is_slack]
+        own = np.full(slack[-1], -1)
+        mine = self.is_slack[m:]
+        own[(slack[stage] + position)[m:][mine]] = tables.place[self.bounded][mine]
+        base.own = self.keep(own)
         self.is_dynamics = tables.dynamics >= 0
 
         at, column, value = tables.fragment.linear
         bound = Entries(m + np.arange(more), self.bounded, np.full(more, solver.one))
         constant = Entries(at, column, solver.one - len(value) + np.arange(len(at))).followed_by(bound)
         base.constant = self.entries(constant, stage[constant.row], stages)
-        base.linear, base.rows, base.duals = len(constant.row), m + more, self.duals
+        base.linear, base.rows = len(constant.row), m + more
         entries = tables.jacobian.followed_by(bound)
         entries = entries.select(seen[entries.row] & (tables.stage[entries.column] == stage[entries.row]))
         base.jacobian = self.entries(entries, stage[entries.row], stages)
         self.factor, self.shift = np.zeros(m + more), np.zeros(m + more)
         base.factor, base.shift = self.factor.ctypes.data, self.shift.ctypes.data
+        self.address = solver.library.stages_create(ctypes.byref(base))
+        if not self.address:
+            raise MemoryError("no memory for the stages of a solver")
+        weakref.finalize(self, solver.library.stages_destroy, self.address)
 
     def bind(self, tables: Tables, a: np.ndarray, b: np.ndarray, sides: tuple[np.ndarray, ...]) -> None:
         """Set scales of variables and rows, and bounds (lbx, ubx, lbg, ubg)."""
@@ -233,14 +256,14 @@ class _Handle(_Kept):
 
 
 class NativeSolver(_Kept):
-    """Fatrop for one program, called as a casadi solver is.
+    """The native solver of one program, called as a casadi solver is.
 
     Args:
-        form, fragment: What is solved, in stages. functions: Of its blocks. options: Of fatrop.
-        watch: Asked at every iterate whether the solve must end.
+        form, fragment: What is solved, in stages. functions: Of its blocks. options: See OPTIONS.
+        progress: Told of every iterate, and asked whether the solve must end.
 
     Raises:
-        ProblemError: An option that fatrop does not take.
+        ProblemError: An option that it does not take.
     """
 
     def __init__(
@@ -249,13 +272,13 @@ class NativeSolver(_Kept):
         fragment: Fragment,
         functions: Sequence[Derivatives],
         options: Mapping[str, Any],
-        watch: Watch,
+        progress: Progress,
     ) -> None:
         super().__init__()
         self.library = library()
-        self.options = checked_options(self.library, options)
+        self.options = checked_options(options)
         self.tables = tables = Tables(form, fragment, functions)
-        self._parameters, self._watch = form.np, watch
+        self._parameters, self._progress = form.np, progress
         self._stats: dict[str, Any] = {}
         self._handles: OrderedDict[bytes, _Handle] = OrderedDict()
         self._error: BaseException | None = None
@@ -327,7 +350,7 @@ class NativeSolver(_Kept):
             lam=self._lam.ctypes.data,
             g=self._g.ctypes.data,
             pivots=self.keep(np.zeros(last["inner_first"])),
-            watch=WATCH(lambda: me._ask()),
+            watch=WATCH(lambda anew: me._ask(anew)),
             evaluate=EVALUATE(lambda kind: me._evaluate(kind)),
             **{name: self.keep(part) for name, part in sums.items()},
             **{name: self.keep(np.zeros(size), float) for name, size in sizes.items()},
@@ -378,10 +401,12 @@ class NativeSolver(_Kept):
             numbers[:] = np.nan
         return 1
 
-    def _ask(self) -> int:
-        """Whether the solve must end."""
+    def _ask(self, anew: int) -> int:
+        """Whether the solve must end; at a new iterate, or inside an iteration."""
+        at = self._running
         try:
-            return int(self._error is not None or not self._watch.may_go_on(self._x))
+            ends = not self._progress.may_go_on(self._x, at.cost, at.missed) if anew else self._progress.must_end()
+            return int(ends or self._error is not None)
         except BaseException as error:
             self._error = error
             return 1
@@ -420,19 +445,16 @@ class NativeSolver(_Kept):
         seen = tables.place >= 0
         guess[tables.place[seen]] = x0[seen]
         primal, dual, told = np.zeros(len(guess)), np.zeros(handle.duals), np.zeros(2, dtype=np.int32)
+        ends = [self.options[name] for name in OPTIONS]
         program, cost = handle.base, ctypes.c_double()
         program.guess, program.cost_scale = guess.ctypes.data, c
         self._running = program
-        self.library.stages_solve(
-            handle.address, ctypes.byref(program), primal.ctypes.data, dual.ctypes.data, told.ctypes.data
-        )
+        self.library.stages_solve(handle.address, *ends, primal.ctypes.data, dual.ctypes.data, told.ctypes.data)
         self.library.stages_values(ctypes.byref(program), primal.ctypes.data, dual.ctypes.data, ctypes.byref(cost))
-        if program.stopped:
-            self._handles.clear()  # it was stopped by an option that would stop it again
         if self._error is not None and not isinstance(self._error, RuntimeError):
             raise self._error
         flag, iterations = (int(value) for value in told)
-        word = WORDS.get(flag, "Error_In_Step_Computation")
+        word = WORDS[flag]
         upwards = flag == 0 and self.library.stages_curve_upwards(
             ctypes.byref(program), primal.ctypes.data, dual.ctypes.data
         )
@@ -445,14 +467,14 @@ class NativeSolver(_Kept):
         return {"x": self._x / a, "f": np.array(cost.value), "g": self._g[:m] / b, "lam_g": self._lam[:m] * b}
 
 
-def checked_options(library: Any, options: Mapping[str, Any]) -> dict[str, tuple[int, float]]:
-    """Options of fatrop by name, with the type that it asks for: 0 a number, 1 a whole number, 2 a switch."""
+def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by name, of the type of each."""
     found = {}
     for name, value in options.items():
-        type_ = library.stages_option_type(name.encode()) if isinstance(name, str) else -1
-        number = isinstance(value, int | float | np.number) and bool(np.isfinite(value))
-        if type_ not in (0, 1, 2) or not (number or isinstance(value, bool)) or (type_ == 1 and int(value) != value):
+        type_ = OPTIONS.get(name)
+        is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if type_ is None or not (is_number and 0 <= value < np.inf and value == type_(value)):
             words = f"native does not take this option: {name!r}: {value!r}"
             raise ProblemError(words, name="options", value=dict(options))
-        found[name] = (int(type_), float(value))
+        found[name] = type_(value)
     return found

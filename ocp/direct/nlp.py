@@ -14,7 +14,7 @@ import numpy as np
 from ocp.console import LOG, Progress, Watch, listening, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
-from ocp.errors import ProblemError, SolveError, checked_choice
+from ocp.errors import ProblemError, SolveError
 
 __all__ = [
     "ADVICE",
@@ -45,10 +45,11 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-NATIVE = {"tol": 1e-10, "print_level": 0, "max_iter": 120, "linsol_lu_fact_tol": 1e-3}
+NATIVE = {"tol": 1e-10, "acceptable_tol": 1e-8, "acceptable_iter": 10, "max_iter": 120}
 SLEQP = {"print_level": 0, "max_iter": 1000}
 DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "native": NATIVE, "fatrop": FATROP, "sleqp": SLEQP}
-SOLVERS = tuple(DEFAULTS)
+SOLVERS = ("auto", *DEFAULTS)
+"""What may be asked for."""
 
 ADVICE = {
     "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
@@ -98,10 +99,9 @@ def build_solver(
     """The casadi solver of a program, and what ends it where it must end.
 
     Raises:
-        ProblemError: An unknown solver, or an option that it does not take.
+        ProblemError: An option that it does not take.
         SolveError: The solver's library cannot be loaded, for want of file handles, say.
     """
-    checked_choice("solver", solver, SOLVERS)
     n, m, n_p = (program.nlp[key].numel() for key in ("x", "g", "p"))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     own = {**DEFAULTS[solver], **options}
@@ -207,8 +207,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     try:
         # SLEQP tells of each subproblem that it gives up
         with listening(), quiet() if kind == "sleqp" else nullcontext():
-            relaxing = kind in ("fatrop", "native")
-            result = solver(**(tightened(arguments) if relaxing else arguments))
+            result = solver(**(tightened(arguments) if kind == "fatrop" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
         if progress.stopped or kind == "sleqp":  # SLEQP's interface raises wherever it fails

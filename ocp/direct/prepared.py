@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Watch, interruptible, limited
+from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Progress, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
@@ -26,7 +26,7 @@ from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, later, names_told
 from ocp.direct.kkt import held_by
 from ocp.direct.known import Known
-from ocp.direct.native import NativeSolver, why_not
+from ocp.direct.native import NativeSolver, checked_options, is_at_hand, why_not
 from ocp.direct.nlp import (
     DEFAULTS,
     SOLVERS,
@@ -60,7 +60,6 @@ from ocp.storage import checked_path
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
 
 SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
-COMMON = ("tol", "max_iter", "print_level")  # options that all solvers but sleqp take
 MOST_ELSEWHERE = 200  # iterations from each other start
 
 
@@ -96,7 +95,7 @@ class DirectMethod(ABC):
         self,
         problem: Problem,
         *,
-        solver: str = "ipopt",
+        solver: str = "auto",
         options: ByName = None,
         compiled: bool | str = "auto",
         scaling: bool = True,
@@ -184,7 +183,7 @@ class Prepared:
 
     Attributes:
         formulation, fragment, program: What was built.
-        solver_name: The solver, ``ipopt`` where ``native`` was asked for and cannot be had.
+        solver_name: The solver, ``ipopt`` where ``native`` cannot be had.
         seconds: Wall time of the build.
     """
 
@@ -201,18 +200,27 @@ class Prepared:
         self.problem, self.method = problem, method
         self.formulation = Formulation.of(problem)
         checked_choice("solver", solver, SOLVERS)
-        self.solver_name, self.fragment = transcribed(self.formulation, method, solver)
         own = checked_mapping("options", options)
-        if self.solver_name != solver:
-            own = {name: value for name, value in own.items() if name in COMMON}
         self._own_options, self._scaling = own, scaling
-        # sleqp asks for products with the Hessian, which compiled functions do not have
-        self._blocks = Blocks(self.fragment, compiled if solver != "sleqp" else False)
-        self._build()
+        self.solver_name = chosen(solver, own, self.formulation)
+        try:
+            self._make(compiled)
+        except ProblemError as error:  # of stages, else it comes again
+            if self.solver_name != "native":
+                raise
+            self.solver_name = no_native(self.formulation, str(error))
+            self._make(compiled)
         self._most = largest_number_of_iterations(self.solver_name, own)
         self._made_of = problem, method, solver, options, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
+
+    def _make(self, compiled: bool | str) -> None:
+        """The fragment, and the rest of it."""
+        self.fragment = self.method.transcribe(self.formulation, staged=self.solver_name in ("native", "fatrop"))
+        # sleqp asks for products with the Hessian, which compiled functions do not have
+        self._blocks = Blocks(self.fragment, compiled if self.solver_name != "sleqp" else False)
+        self._build()
 
     def _build(self) -> None:
         """The program and its solver, of the functions of the blocks that are at hand."""
@@ -237,15 +245,16 @@ class Prepared:
     @cached_property
     def _ipopt(self) -> tuple[Any, Any]:
         """The second solver, for the same start."""
-        return self._built_solver(self.second, {k: v for k, v in self._own_options.items() if k in COMMON})
+        return self._built_solver(self.second, self._own_options)
 
     def _built_solver(self, solver: str, options: dict[str, Any]) -> tuple[Any, Any]:
         """A solver, and what ends it where it must end."""
         fragment, title = self.fragment, self.problem.name
         if solver != "native":
             return build_solver(self.scaled, solver, options, fragment.stages, title)
-        watch, own = Watch(fragment.size, title), {**DEFAULTS["native"], **options}
-        return NativeSolver(self.formulation, fragment, self._blocks.functions, own, watch), watch
+        form, own = self.formulation, {**DEFAULTS["native"], **options}
+        progress = Progress(fragment.size, fragment.n_rows, form.np, title, show=True)
+        return NativeSolver(form, fragment, self._blocks.functions, own, progress), progress
 
     def __reduce__(self) -> Any:
         """Pickled and copied as what it was prepared of, to be prepared again."""
@@ -396,8 +405,7 @@ class Prepared:
     @cached_property
     def _plain(self) -> Prepared:
         """The same for ipopt, without stages, of which it would have more variables and take more iterations."""
-        options = {name: value for name, value in self._own_options.items() if name in COMMON}
-        return Prepared(self.problem, self.method, "ipopt", options, self._made_of[4], self._scaling)
+        return Prepared(self.problem, self.method, "ipopt", self._own_options, self._made_of[4], self._scaling)
 
     def _moved(self, point: np.ndarray, p: np.ndarray) -> Solution:
         """A start of this program as a guess for any."""
@@ -647,18 +655,25 @@ class Attempt:
         return f"from the {self.start}: {word} after {self.outcome.iterations} iterations"
 
 
-def transcribed(form: Formulation, method: DirectMethod, solver: str) -> tuple[str, Fragment]:
-    """The program of a problem for a solver, and the solver: ``ipopt`` where ``native`` cannot be had, told once."""
-    if solver != "native":
-        return solver, method.transcribe(form, staged=solver == "fatrop")
-    why = why_not()
-    if not why:
-        try:
-            return solver, method.transcribe(form, staged=True)
-        except ProblemError as error:
-            why = str(error)
+def chosen(solver: str, options: Mapping[str, Any], form: Formulation) -> str:
+    """The solver that begins: for ``auto`` native where its driver is at hand and no options of ipopt are given.
+
+    Raises:
+        ProblemError: An option that native does not take.
+    """
+    if solver == "auto":
+        return "native" if not options and is_at_hand() else "ipopt"
+    if solver == "native":
+        checked_options(options)
+        why = why_not()
+        return no_native(form, why) if why else solver
+    return solver
+
+
+def no_native(form: Formulation, why: str) -> str:
+    """The solver in its place, which is told."""
     LOG.info("problem %r is solved by ipopt, not by native: %s", form.name, why)
-    return "ipopt", method.transcribe(form)
+    return "ipopt"
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

@@ -1,110 +1,65 @@
-/* What fatrop asks of a program, and its face to Python. */
+/* What the solver asks of a program at a point, and whether the cost curves upwards where it ends. */
 
-static int objective(double scale, const double *primal, const double *u0, const double *u1, double *out,
-                     const struct FatropOcpCDims *d, void *data) {
-  program *s = data;
-  double sum = 0;
+static int objective(program *s, const double *primal, double *cost) {
+  double sum = 0.0;
   int i;
-  *out = VAST;
-  if (!move(s, primal)) return 1;
+  if (!move(s, primal)) return 0;
   for (i = 0; i < s->values; ++i)
     if (s->value_row[i] < 0) sum += s->numbers[VALUE][i];
-  *out = tame(scale * sum / s->cost_scale);
+  *cost = sum / s->cost_scale;
+  return fabs(*cost) < VAST;
+}
+
+/* The rows; of inequalities as they are, of the others what they miss. */
+static int rows_of(program *s, const double *primal, double *out) {
+  int i;
+  if (!move(s, primal)) return 0;
+  for (i = 0; i < s->rows; ++i) {
+    if (s->target[i] < 0) continue;
+    out[s->target[i]] = s->factor[i] * s->g[i] - s->shift[i];
+    if (!(fabs(out[s->target[i]]) < VAST)) return 0;
+  }
   return 1;
 }
 
-static int slope(double scale, const double *primal, const double *u0, const double *u1, double *out,
-                 const struct FatropOcpCDims *d, void *data) {
-  program *s = data;
+/* The slope of the cost along what inner variables do. */
+static int slope(program *s, const double *primal, double *out) {
   int i, j, k, q;
   memset(out, 0, sizeof(double) * (size_t)s->primal_first[s->stages]);
-  if (!slopes_at(s, primal)) {
-    give_up(s);
-    return 1;
-  }
+  if (!slopes_at(s, primal)) return 0;
   slope_of_cost(s);
   for (i = 0; i < s->variables; ++i)
-    if (s->place[i] >= 0) out[s->place[i]] = scale * s->slope[i];
+    if (s->place[i] >= 0) out[s->place[i]] = s->slope[i];
   for (k = 0; k < s->stages; ++k) {
     const int w = own(s, k);
     const double *along = s->sensitivity + s->sensitivity_first[k];
     double *mine = out + s->primal_first[k];
-    for (j = 0, i = s->inner_first[k]; i < s->inner_first[k + 1]; ++i, ++j) {
-      const double v = scale * s->slope[s->inner_variable[i]];
-      if (v != 0.0)
-        for (q = 0; q < w; ++q) mine[q] += v * along[j * w + q];
-    }
+    for (j = 0, i = s->inner_first[k]; i < s->inner_first[k + 1]; ++i, ++j)
+      if (s->slope[s->inner_variable[i]] != 0.0) add(mine, s->slope[s->inner_variable[i]], along + j * w, w);
+    for (q = 0; q < w; ++q)
+      if (wild(mine[q])) return 0;
   }
   return 1;
 }
 
-static int violation(const double *primal, const double *u0, const double *u1, double *out,
-                     const struct FatropOcpCDims *d, void *data) {
-  program *s = data;
-  const int found = move(s, primal);
-  int i;
-  for (i = 0; i < s->rows; ++i)
-    if (s->target[i] >= 0) out[s->target[i]] = found ? tame(s->factor[i] * s->g[i] - s->shift[i]) : VAST;
-  return 1;
-}
-
-static void clear(struct blasfeo_dmat *of, int rows, int columns) { blasfeo_dgese(rows, columns, 0.0, of, 0, 0); }
-
-/* Powers of ten by which what the first stage does grows along the horizon, without the controls. */
-static double growth(const program *s, struct blasfeo_dmat *dynamics) {
-  double *x = s->scratch, *next = x + s->most, powers = 0.0;
-  int i, j, k;
-  for (i = 0; i < s->nx[0]; ++i) x[i] = 1.0 + 0.1 * (i % 7);
-  for (k = 0; k + 1 < s->stages; ++k) {
-    double size = 0.0;
-    for (j = 0; j < s->nx[k + 1]; ++j) {
-      next[j] = 0.0;
-      for (i = 0; i < s->nx[k]; ++i) next[j] += BLASFEO_DMATEL(dynamics + k, s->nu[k] + i, j) * x[i];
-      size = fmax(size, fabs(next[j]));
-    }
-    if (size == 0.0) return powers;
-    powers += log10(size);
-    for (j = 0; j < s->nx[k + 1]; ++j) x[j] = next[j] / size;
-  }
-  return powers;
-}
-
-static int slopes_of_rows(const double *primal, const double *u0, const double *u1, struct blasfeo_dmat *dynamics,
-                          struct blasfeo_dmat *equal, struct blasfeo_dmat *unequal, const struct FatropOcpCDims *d,
-                          void *data) {
-  program *s = data;
+/* The slopes of the rows of all stages. */
+static int slopes_of_rows(program *s, const double *primal, stage *stages) {
   const entries *e = &s->jacobian;
-  int i, k, q;
-  must_end(s);
-  if (!slopes_at(s, primal)) give_up(s);
+  int i, k;
+  if (!slopes_at(s, primal)) return 0;
   for (k = 0; k < s->stages; ++k) {
-    const int w = own(s, k);
-    struct blasfeo_dmat *of[3] = {dynamics + k, equal + k, unequal + k};
-    if (k + 1 < s->stages) clear(dynamics + k, w, s->nx[k + 1]);
-    clear(equal + k, w, s->ng[k]);
-    clear(unequal + k, w, s->ni[k]);
-    for (i = e->first[k]; i < e->first[k + 1] && !s->lost; ++i) {
+    stage *a = stages + k;
+    const int w = a->w, all = a->next + a->g + a->i, before[3] = {0, a->next, a->next + a->g};
+    memset(a->slopes, 0, sizeof(double) * (size_t)(all * w));
+    for (i = e->first[k]; i < e->first[k + 1]; ++i) {
       const double v = s->numbers[JACOBIAN][e->source[i]] * s->factor[e->row[i]] * s->a[e->column[i]];
-      struct blasfeo_dmat *m = of[s->kind[e->row[i]]];
-      const int at = s->position[e->row[i]], c = s->local[e->column[i]];
-      if (wild(v)) give_up(s);
-      if (c < w) {
-        BLASFEO_DMATEL(m, c, at) += v;
-      } else {
-        const double *along = s->sensitivity + s->sensitivity_first[k] + (c - w) * w;
-        for (q = 0; q < w; ++q) {
-          if (wild(v * along[q])) give_up(s);
-          BLASFEO_DMATEL(m, q, at) += v * along[q];
-        }
-      }
+      const int c = s->local[e->column[i]];
+      double *row = a->slopes + (before[s->kind[e->row[i]]] + s->position[e->row[i]]) * w;
+      if (c < w) row[c] += v;
+      else add(row, v, s->sensitivity + s->sensitivity_first[k] + (c - w) * w, w);
     }
-  }
-  if (!s->lost && growth(s, dynamics) > GROWTH) give_up(s);
-  for (k = 0; k < s->stages && s->lost; ++k) { /* what lets its step end */
-    if (k + 1 < s->stages) clear(dynamics + k, own(s, k), s->nx[k + 1]);
-    clear(equal + k, own(s, k), s->ng[k]);
-    clear(unequal + k, own(s, k), s->ni[k]);
-    for (i = 0; i < s->ng[k]; ++i) BLASFEO_DMATEL(equal + k, i, i) = 1.0;
+    for (i = 0; i < all * w; ++i)
+      if (wild(a->slopes[i])) return 0;
   }
   return 1;
 }
@@ -137,30 +92,21 @@ static const double *half_curvature(const program *s, int k) {
   return half;
 }
 
-static int curvature(double scale, const double *primal, const double *dual, const double *u0, const double *u1,
-                     struct blasfeo_dmat *out, const struct FatropOcpCDims *d, void *data) {
-  program *s = data;
+/* The curvature of the Lagrangian, of the cost times `scale`, in all stages. */
+static int curvature(program *s, double scale, const double *primal, const double *dual, stage *stages) {
   int k, q, r;
-  if (!s->lost && !slopes_at(s, primal)) give_up(s);
-  if (!s->lost) {
-    s->sigma = scale / s->cost_scale;
-    multipliers(s, scale, dual);
-    s->evaluate(HESSIAN);
-  }
+  if (!slopes_at(s, primal)) return 0;
+  s->sigma = scale / s->cost_scale;
+  multipliers(s, scale, dual);
+  s->evaluate(HESSIAN);
   for (k = 0; k < s->stages; ++k) {
     const int w = own(s, k);
-    const double *half = s->lost ? 0 : half_curvature(s, k);
-    clear(out + k, w, w);
-    for (r = 0; r < w && !s->lost; ++r)
+    const double *half = half_curvature(s, k);
+    for (r = 0; r < w; ++r)
       for (q = 0; q < w; ++q) {
-        const double v = half[r * w + q] + half[q * w + r];
-        if (wild(v)) give_up(s);
-        BLASFEO_DMATEL(out + k, r, q) = v;
+        const double v = stages[k].curvature[r * w + q] = half[r * w + q] + half[q * w + r];
+        if (wild(v)) return 0;
       }
-  }
-  for (k = 0; k < s->stages && s->lost; ++k) {
-    clear(out + k, own(s, k), own(s, k));
-    for (r = 0; r < own(s, k); ++r) BLASFEO_DMATEL(out + k, r, r) = 1.0;
   }
   return 1;
 }
@@ -268,113 +214,9 @@ EXPORT int stages_curve_upwards(program *s, const double *primal, const double *
   if (!(largest < VAST)) return 0;
   if (largest == 0.0) largest = 1.0;
   scratch = malloc(sizeof(double) * (size_t)(s->most * (3 * s->most + most_rows)));
-  found = scratch && (convex(s, dual, 1e3, largest, most_rows, scratch) || convex(s, dual, 1e6, largest, most_rows, scratch));
+  found = scratch && (convex(s, dual, 1e3, largest, most_rows, scratch) ||
+                      convex(s, dual, 1e6, largest, most_rows, scratch));
   free(scratch);
   return found;
 }
 
-/* ---- its face ---- */
-
-static int count_x(int k, void *data) { return ((program *)data)->nx[k]; }
-static int count_u(int k, void *data) { return ((program *)data)->nu[k]; }
-static int count_g(int k, void *data) { return ((program *)data)->ng[k]; }
-static int count_i(int k, void *data) { return ((program *)data)->ni[k]; }
-static int horizon(void *data) { return ((program *)data)->stages; }
-static int none_of(int k, void *data) { return 0; }
-static int none(void *data) { return 0; }
-static int nothing_of(double *p, int k, void *data) { return 0; }
-static int nothing(double *p, void *data) { return 0; }
-
-static int limits(double *lower, double *upper, int k, void *data) {
-  program *s = data;
-  memcpy(lower, s->lower + s->slack_first[k], sizeof(double) * (size_t)s->ni[k]);
-  memcpy(upper, s->upper + s->slack_first[k], sizeof(double) * (size_t)s->ni[k]);
-  return 0;
-}
-static int first_u(double *u, int k, void *data) {
-  program *s = data;
-  memcpy(u, s->guess + s->primal_first[k], sizeof(double) * (size_t)s->nu[k]);
-  return 0;
-}
-static int first_x(double *x, int k, void *data) {
-  program *s = data;
-  memcpy(x, s->guess + s->primal_first[k] + s->nu[k], sizeof(double) * (size_t)s->nx[k]);
-  return 0;
-}
-
-static void silent(const char *words, int size) {}
-static void flush(void) {}
-
-/* What is kept of one solver: its face must outlive it. */
-typedef struct {
-  struct FatropOcpCInterface face;
-  struct FatropOcpCSolver *solver;
-} kept;
-
-EXPORT void *stages_create(program *s) {
-  kept *k = calloc(1, sizeof *k);
-  struct FatropOcpCInterface *f = &k->face;
-  f->get_nx = count_x, f->get_nu = count_u, f->get_ng = count_g, f->get_ng_ineq = count_i;
-  f->get_n_stage_params = none_of, f->get_n_global_params = none;
-  f->get_default_stage_params = nothing_of, f->get_default_global_params = nothing;
-  f->get_horizon_length = horizon;
-  f->get_bounds = limits, f->get_initial_xk = first_x, f->get_initial_uk = first_u;
-  f->full_eval_lag_hess = curvature, f->full_eval_constr_jac = slopes_of_rows;
-  f->full_eval_contr_viol = violation, f->full_eval_obj_grad = slope, f->full_eval_obj = objective;
-  f->user_data = s;
-  k->solver = fatrop_ocp_c_create(f, silent, flush);
-  return k;
-}
-
-/* Where the rows of each stage stand in fatrop's vector of constraints: dynamics, equalities, inequalities. */
-EXPORT void stages_places(void *handle, int *places, int stages) {
-  const struct FatropOcpCDims *d = fatrop_ocp_c_get_dims(((kept *)handle)->solver);
-  int k;
-  for (k = 0; k < stages; ++k) {
-    places[3 * k] = k + 1 < stages ? d->dyn_eq_offs[k] : -1;
-    places[3 * k + 1] = d->g_offs[k];
-    places[3 * k + 2] = d->g_ineq_offs[k];
-  }
-}
-
-EXPORT void stages_option(void *handle, const char *name, int type, double value) {
-  struct FatropOcpCSolver *solver = ((kept *)handle)->solver;
-  if (type == 0) fatrop_ocp_c_set_option_double(solver, name, value);
-  if (type == 1) fatrop_ocp_c_set_option_int(solver, name, (int)value);
-  if (type == 2) fatrop_ocp_c_set_option_bool(solver, name, value != 0);
-}
-
-/* Solve; `told`: flag, or -1 where it cannot go on; iterations. */
-EXPORT int stages_solve(void *handle, program *s, double *primal, double *dual, int *told) {
-  kept *k = handle;
-  int i, word = -1;
-  s->solver = k->solver;
-  s->known = s->factored = s->stopped = s->lost = 0;
-  for (i = 0; i < s->inner_first[s->stages]; ++i)
-    s->before[s->primal_first[s->stages] + i] = s->x[s->inner_variable[i]] / s->a[s->inner_variable[i]];
-  memcpy(primal, s->guess, sizeof(double) * (size_t)s->primal_first[s->stages]);
-  memset(dual, 0, sizeof(double) * (size_t)s->duals);
-  told[1] = 0;
-  if (move(s, primal)) {
-    word = fatrop_ocp_c_solve(k->solver);
-    memcpy(primal, fatrop_ocp_c_get_primal(k->solver)->pa, sizeof(double) * (size_t)s->primal_first[s->stages]);
-    memcpy(dual, fatrop_ocp_c_get_dual(k->solver)->pa, sizeof(double) * (size_t)s->duals);
-    told[1] = fatrop_ocp_c_get_stats(k->solver)->iterations_count;
-  }
-  told[0] = word < 0 || s->lost ? -1 : fatrop_ocp_c_get_stats(k->solver)->return_flag;
-  return 0;
-}
-
-/* Cost (scaled); rows and their multipliers (as they are, in `g` and `lam`) at some variables. */
-EXPORT void stages_values(program *s, const double *primal, const double *dual, double *cost) {
-  objective(1.0, primal, 0, 0, cost, 0, s);
-  memset(s->lam, 0, sizeof(double) * (size_t)s->rows);
-  if (slopes_at(s, primal)) multipliers(s, 1.0, dual);
-}
-
-EXPORT int stages_option_type(const char *name) { return fatrop_ocp_c_option_type(name); }
-
-EXPORT void stages_destroy(void *handle) {
-  fatrop_ocp_c_destroy(((kept *)handle)->solver);
-  free(handle);
-}

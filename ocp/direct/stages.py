@@ -37,11 +37,11 @@ class Entries(NamedTuple):
 
 
 class Tables:
-    """A stage-ordered program as stages: variables in fatrop's order, and where the numbers of its blocks belong.
+    """A stage-ordered program as stages: variables in the solver's order, and where the numbers of its blocks belong.
 
     Attributes:
         nx, nu, nz: States, controls and inner variables of each stage. Shape (N + 1,).
-        place: Where each variable of the program stands in fatrop's vector; -1: an inner one.
+        place: Where each variable of the program stands in the solver's vector; -1: an inner one.
         stage, local: Stage of each, and its place there: controls, states, inner ones.
         inner, inner_rows: The inner variables, and the rows that define them, stage by stage.
         row_stage: Stage of each row. dynamics: Entry of the next state that a row defines, -1 for other rows.

@@ -79,7 +79,7 @@ class Indirect:
         self,
         problem: Problem,
         *,
-        solver: str = "ipopt",
+        solver: str = "auto",
         options: ByName = None,
         compiled: bool | str = "auto",
         scaling: bool = True,

@@ -1,4 +1,4 @@
-"""Fatrop through its own C interface: the optimum of ipopt with its multipliers, by tables that state the program."""
+"""The interior-point method over the stages: the optimum of ipopt with its multipliers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from ocp.direct.kkt import conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
 from ocp.direct.scaling import unscaled
+from ocp.direct.stages import Tables
 from tests.ocp.direct.test_nlp import INTERRUPTED, obstacle, run, soft_lander, too_far
+from tests.ocp.problem.flights import two_burns
 from tests.ocp.problems import METHODS, SWING, Method, energy, relative, swing, van_der_pol
 
 FINE: dict[str, Method] = {
@@ -228,8 +230,29 @@ def test_ipopt_takes_over_by_name_without_a_compiler(
         native.library.cache_clear()
 
 
-def test_ipopt_takes_over_by_name_where_the_tolerance_is_missed() -> None:
-    """The ceiling of Bryson-Denham: its contact on the nodes leaves no freedom, and its bound does not push there."""
+def test_ipopt_takes_over_by_name_where_the_guess_defines_no_states() -> None:
+    """A step of Euler backwards from .3, x = .3 + x^2 + u, has no x where u is zero, as in the guess."""
+    problem = Problem("beyond")
+    x, u = problem.state("x", initial=0.3), problem.control("u")
+    problem.dynamics(x, x**2 + u)
+    problem.horizon(1.0)
+    problem.minimize(running=(x - 0.2) ** 2 + u**2)
+    method = Collocation(1, 1)
+    prepared = built(problem, method)
+    plan, alone = prepared.solve(), solve(problem, method, solver="ipopt")
+    assert plan.solver == "ipopt"
+    # by the program that ipopt has alone, not by that of the stages
+    assert plan.iterations == alone.iterations
+    np.testing.assert_array_equal(plan.variables, alone.variables)
+    # where the controls of a guess are those of a plan there are states
+    again = built(problem, method).solve(guess={"x": plan["x"], "u": plan["u"], "t": plan.t})
+    assert again.solver == "native"
+    assert again.cost == pytest.approx(plan.cost, rel=1e-9)
+    assert prepared.solve(guess=plan).cost == pytest.approx(plan.cost, rel=1e-9)
+
+
+def test_the_ceiling_that_leaves_no_freedom_is_reached() -> None:
+    """Bryson-Denham's, in contact on the nodes: its bound does not push there."""
     problem = Problem("Bryson-Denham")
     x, v = problem.state("x", initial=0.0, terminal=0.0, upper=1 / 9), problem.state("v", initial=1.0, terminal=-1.0)
     u = problem.control("u")
@@ -238,14 +261,51 @@ def test_ipopt_takes_over_by_name_where_the_tolerance_is_missed() -> None:
     problem.horizon(1.0)
     problem.minimize(running=u**2 / 2)
     prepared = built(problem, Collocation(12))
-    plan, alone = prepared.solve(), solve(problem, Collocation(12))
-    assert plan.solver == "ipopt"
+    plan = prepared.solve()
+    assert plan.solver == "native"
     assert plan.cost == pytest.approx(4.0, abs=2e-3)
-    # by the program that ipopt has alone, not by that of the stages
-    assert plan.iterations == alone.iterations
-    np.testing.assert_array_equal(plan.variables, alone.variables)
     assert prepared.solve(guess=plan).cost == pytest.approx(plan.cost, rel=1e-9)
     assert prepared.solve(guess=plan, shift=2).success
+
+
+def test_a_transfer_by_two_burns_is_solved_from_a_coarser_plan() -> None:
+    """Phases of free length, and curvature that must be shifted on the way: fatrop did that for ever."""
+    coarse = solve(two_burns(), Collocation(20, 5), solver="ipopt")
+    a, b = (solve(two_burns(), Collocation(40, 4), guess=coarse, solver=s) for s in ("ipopt", "native"))
+    assert b.solver == "native"
+    assert b.cost == pytest.approx(a.cost, rel=1e-9)
+
+
+def test_auto_is_native_where_it_is_at_hand_and_ipopt_where_options_are_given() -> None:
+    assert not native.why_not()  # else there is no compiler here
+    problem, method = van_der_pol(), Collocation(5)
+    assert solve(problem, method).solver == "native"
+    assert solve(problem, method, options={"max_iter": 50}).solver == "ipopt"
+
+
+def test_auto_is_ipopt_while_the_driver_is_compiled(tmp_path: Any) -> None:
+    code = f"""
+    import os, time
+    os.environ["XDG_CACHE_HOME"] = {str(tmp_path)!r}
+    from ocp import Collocation, solve
+    from ocp.direct.native import is_at_hand
+    from tests.ocp.problems import van_der_pol
+    print(solve(van_der_pol(), Collocation(5)).solver)
+    while not is_at_hand():
+        time.sleep(0.1)
+    print(solve(van_der_pol(), Collocation(5)).solver)
+    """
+    assert run(code).stdout.split() == ["ipopt", "native"]
+
+
+def test_curvature_over_stages_is_left_to_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
+    def apart(self: Tables) -> None:
+        raise ProblemError("a stage-ordered program cannot couple stages that are apart; use ipopt")
+
+    monkeypatch.setattr(Tables, "_check", apart)
+    prepared = built(van_der_pol(), Collocation(5))
+    assert prepared.solver_name == "ipopt"
+    assert prepared.solve().solver == "ipopt"
 
 
 def test_more_equalities_in_a_stage_than_variables_are_refused_and_do_not_end_the_process() -> None:
@@ -275,7 +335,7 @@ def test_infeasible_problems_are_refused_as_by_ipopt(method: str) -> None:
 
 
 def test_what_is_no_number_is_told_and_what_grows_beyond_all_numbers_is_left_to_ipopt() -> None:
-    """In a process of its own, because fatrop loops for ever on both."""
+    """In a process of its own, for what could loop for ever."""
     code = """
     import casadi as ca
     from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
