@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
 from ocp.direct import native
+from ocp.direct.guess import initial_point, later
 from ocp.direct.kkt import conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
@@ -249,6 +251,26 @@ def test_ipopt_takes_over_by_name_where_the_guess_defines_no_states() -> None:
     assert again.solver == "native"
     assert again.cost == pytest.approx(plan.cost, rel=1e-9)
     assert prepared.solve(guess=plan).cost == pytest.approx(plan.cost, rel=1e-9)
+
+
+def test_a_plan_that_has_moved_on_is_handed_over_as_it_is() -> None:
+    """Where native does not get on, ipopt begins at what the plan has so many intervals later, as native did."""
+    problem, method, ahead = van_der_pol(), Collocation(10, 3), 2
+    prepared, other = built(problem, method), prepare(problem, method, solver="ipopt")
+    assert isinstance(other, Prepared)
+    plan = prepared.solve()
+    moved = prepared._moved(plan.variables[later(prepared.fragment, ahead)[0]], np.zeros(0))
+    # the control at the start is that of the interval behind it, at other nodes that of the one before
+    for name, first in (("x", 0), ("u", 1)):
+        np.testing.assert_allclose(moved[name][first : -3 * ahead], plan[name][3 * ahead + first :], atol=1e-12)
+    form, fragment = other.formulation, other.fragment
+    start = initial_point(form, fragment, moved, form.bound_values(np.zeros(0)))
+    np.testing.assert_allclose(other._moved(start, np.zeros(0))["x"], moved["x"], atol=1e-12)
+
+    prepared._solver.options["max_iter"] = 0
+    found = prepared.solve(guess=replace(plan, regularised=True), shift=ahead)  # which no steps of Newton's begin from
+    assert found.solver == "ipopt"
+    np.testing.assert_array_equal(found.variables, other.solve(guess=moved).variables)
 
 
 def test_the_ceiling_that_leaves_no_freedom_is_reached() -> None:
