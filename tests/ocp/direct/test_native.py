@@ -13,7 +13,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
+from models import FixedBase
+from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, inverse_kinematics, prepare, solve
+from ocp.builders.redundancy import minimum_velocity_problem
 from ocp.direct import native
 from ocp.direct.guess import initial_point, later
 from ocp.direct.kkt import conditions
@@ -21,6 +23,8 @@ from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
 from ocp.direct.scaling import unscaled
 from ocp.direct.stages import Tables
+from scripts.robots.panda import HOME, LAP, circling
+from scripts.robots.robots import PANDA
 from tests.ocp.direct.test_nlp import INTERRUPTED, obstacle, run, soft_lander, too_far
 from tests.ocp.problem.flights import two_burns
 from tests.ocp.problems import METHODS, SWING, Method, energy, relative, swing, van_der_pol
@@ -298,6 +302,18 @@ def test_a_transfer_by_two_burns_is_solved_from_a_coarser_plan() -> None:
     assert b.cost == pytest.approx(a.cost, rel=1e-9)
 
 
+def test_a_closed_lap_whose_end_its_task_nearly_implies_is_solved() -> None:
+    """Of seven joints that come back six follow from the tip's way, but for what the intervals miss."""
+    machine = FixedBase(PANDA.read())
+    start = inverse_kinematics(machine, circling(), near=HOME, starts=0)[0].joints
+    problem = minimum_velocity_problem(
+        machine, task=circling(), start_joints=start, horizon=LAP, cyclic=True, free_start=True
+    )
+    a, b = (solve(problem, Collocation(10), solver=s) for s in ("ipopt", "native"))
+    assert b.solver == "native"
+    assert b.cost == pytest.approx(a.cost, rel=1e-9)
+
+
 def test_auto_is_native_where_it_is_at_hand_and_ipopt_where_options_are_given() -> None:
     assert not native.why_not()  # else there is no compiler here
     problem, method = van_der_pol(), Collocation(5)
@@ -361,7 +377,9 @@ def test_what_is_no_number_is_told_and_what_grows_beyond_all_numbers_is_left_to_
     code = """
     import casadi as ca
     from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
-    from tests.ocp.direct.test_nlp import rooted
+    from scripts.robots.panda import HOME, LAP, circling
+from scripts.robots.robots import PANDA
+from tests.ocp.direct.test_nlp import rooted
     try:
         solve(rooted(), Collocation(3), solver="native")
     except SolveError as error:
