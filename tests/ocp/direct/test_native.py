@@ -321,6 +321,7 @@ def test_auto_is_native_where_it_is_at_hand_and_ipopt_where_options_are_given() 
     assert solve(problem, method, options={"max_iter": 50}).solver == "ipopt"
 
 
+@pytest.mark.long
 def test_auto_is_ipopt_while_the_driver_is_compiled(tmp_path: Any) -> None:
     code = f"""
     import os, time
@@ -377,9 +378,7 @@ def test_what_is_no_number_is_told_and_what_grows_beyond_all_numbers_is_left_to_
     code = """
     import casadi as ca
     from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
-    from scripts.robots.panda import HOME, LAP, circling
-from scripts.robots.robots import PANDA
-from tests.ocp.direct.test_nlp import rooted
+    from tests.ocp.direct.test_nlp import rooted
     try:
         solve(rooted(), Collocation(3), solver="native")
     except SolveError as error:
