@@ -32,7 +32,7 @@ COARSE = Collocation(4, degree=2, scheme="legendre")
 ROUGHLY = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 """Of IPOPT: what is wanted are durations to a percent."""
 BRIEFLY = 60
-"""Iterations for steps in the times that are asked, where longer ones are found; where there were some, 31 to 51 did."""
+"""Iterations for steps in the times that are asked, where longer ones are found; those that exist took 31 to 51."""
 NEAR = 0.05
 """Share of a duration by which so coarse a mesh may be wrong: from 3 to 12 intervals it differs by up to .016."""
 PRICE = 1e4
