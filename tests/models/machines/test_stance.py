@@ -229,8 +229,9 @@ def test_what_nothing_stands_on_is_refused_by_name() -> None:
         both.loads(np.zeros(6), np.zeros(6), np.zeros(6), {})
     aside = {name: Foot(f"{name}_foot", rectangle((-0.1, 0.1), (0.1, 0.2)), (0, 0, -0.08)) for name in SIDES}
     stance = Stance.on(robot, aside, {"left": Foothold.level(0, 0)})
-    with pytest.raises(ModelError, match="beyond an edge of the sole"):
-        stance.inside("left", ca.DM([0, 0, 0, 0, 0, 1]))
+    with pytest.raises(ModelError, match="beyond an edge of the sole") as refusal:
+        stance.inside("left", ca.DM([0, 0, 0, 0, 0, 1]), 0.03)
+    assert refusal.value.value == pytest.approx(0.13)  # the edge is 0.1 m aside
     askew = Stance.on(robot, feet, {name: Foothold.level(0, 0, heading=0.5) for name in SIDES})
     with pytest.raises(ModelError, match="not along axes of the world"):
         _ = askew.held_rows
