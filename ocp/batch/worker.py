@@ -23,6 +23,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ocp.batch.content import Parcel, packed, text_of, unpacked
+from ocp.direct.native import is_ready
 from ocp.errors import ProblemError
 
 __all__ = [
@@ -68,6 +69,7 @@ def attempt(function: Function, task: str, near: bool, guess: Parcel | None) -> 
         Broken: There is no room on the disk.
     """
     with _ONE:
+        is_ready()  # or the first results would be another solver's, whose last digits differ
         began = time.perf_counter()
         try:
             given = (json.loads(task), None if guess is None else unpacked(guess)) if near else (json.loads(task),)

@@ -32,7 +32,7 @@ from ocp.errors import ProblemError
 from ocp.libraries import CompilerError, Library, built, kept
 from ocp.problem.formulation import Formulation
 
-__all__ = ["NativeSolver", "checked_options", "is_at_hand", "why_not"]
+__all__ = ["NativeSolver", "checked_options", "is_at_hand", "is_ready", "why_not"]
 
 KINDS = ("value", "gradient", "jacobian", "hessian")
 VALUE, GRADIENT, JACOBIAN, HESSIAN = range(4)
@@ -66,8 +66,18 @@ def why_not() -> str:
 
 def is_at_hand() -> bool:
     """Whether the driver is compiled; where it is not, that is done in the background."""
-    loaded = library.cache_info().currsize > 0
-    return loaded or kept(driver()) is not None or isinstance(in_background().found[0], Path)
+    if library.cache_info().currsize > 0:
+        return True
+    try:
+        return kept(driver()) is not None or isinstance(in_background().found[0], Path)
+    except OSError:  # no more files can be opened
+        return False
+
+
+@cache
+def is_ready() -> bool:
+    """Whether there is a native solver, after it is compiled: who needs the same numbers of many processes waits."""
+    return not why_not()
 
 
 @cache

@@ -177,6 +177,7 @@ def plan_steps(
     """
     if method is not None:
         checked_instance("method", method, Collocation)
+    checked_instance("plan_steps: steps", steps, Steps)
     settings = {**IPOPT, **checked_mapping("options", options)}
     trials: list[Formulation] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
