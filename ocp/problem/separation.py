@@ -137,7 +137,8 @@ class Separation:
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
     """Rows of so many whole numbers, or ProblemError."""
     found = table(f"{what}: {label}", values)
-    if found.size % count or (found.ndim == 2 and found.size and found.shape[1] != count) or (found % 1 != 0).any():
+    shaped = found.size % count == 0 and (found.ndim != 2 or not found.size or found.shape[1] == count)
+    if not shaped or not np.isfinite(found).all() or (found % 1 != 0).any():
         words = f"{what}: {label} must be rows of {count} indices, not {values!r}"
         raise ProblemError(words, name=label, value=values)
     return found.astype(int).reshape(-1, count)

@@ -485,6 +485,7 @@ BAD: dict[str, dict[str, Any]] = {
     "covers-of-none": {"covers": {0: [[0, -1]]}},
     "covers-nan": {"covers": {0: [[0, np.nan]]}},
     "covers-of-three": {"covers": {0: [[0, 1, 1]]}},
+    "pairs-endless": {"pairs": [[0, np.inf, -1]]},
     "pairs-between-bodies": {"pairs": [[0, 0.5, -1]]},
     "pairs-of-two": {"pairs": [[0, 1]]},
     "covers-text": {"covers": "all"},

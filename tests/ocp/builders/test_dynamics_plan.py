@@ -8,6 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import toppra
+from toppra.algorithm import TOPPRA
+from toppra.constraint import JointTorqueConstraint
 
 from models import (
     CollisionShape,
@@ -110,6 +113,22 @@ def test_a_path_that_is_free_is_faster_than_any_that_is_given(fastest: Solution)
 
 
 @pytest.mark.long
+def test_a_path_that_is_free_is_faster_than_toppra_along_the_straight_one(fastest: Solution) -> None:
+    """Within the same torques; what toppra takes there is what our own passes say, to a percent."""
+
+    def torques(at: Array, rates: Array, second: Array) -> Array:
+        sample = {"joints": at[None], "velocities": rates[None], "accelerations": second[None]}
+        return np.asarray(torques_along(MACHINE, sample)[0])
+
+    toppra.setup_logging("ERROR")
+    path = toppra.SplineInterpolator(np.array([0.0, 0.5, 1.0]), np.array([START, (START + END) / 2, END]))
+    limit = JointTorqueConstraint(torques, np.stack([-MOST, MOST], axis=1), np.zeros(2))
+    made = TOPPRA([limit], path, gridpoints=np.linspace(0, 1, 201)).compute_trajectory(0, 0)
+    s = np.linspace(0, 1, 2001)
+    assert made.duration == pytest.approx(least_time_along(s, START + s[:, None] * (END - START)), rel=1e-2)
+    assert fastest.horizon < 0.97 * made.duration
+
+
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
     asked: dict[str, Any] = {"end_joints": END, "limits": Limits(torque=MOST)}
     mixed = plan_dynamics(MACHINE, START, SOON, effort=Effort(torque=1e-3, time=1.0), **asked)
