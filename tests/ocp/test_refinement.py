@@ -24,6 +24,7 @@ from ocp import (
     SolveError,
     minimum_velocity_problem,
     refine,
+    refinement,
     solve,
 )
 from ocp.refinement import MOST_PIECES, split
@@ -77,6 +78,20 @@ def test_the_tolerance_is_reached(method: str) -> None:
     assert solution.refinement.intervals[-1] == len(solution.control_interpolant.breaks) - 1
     assert list(solution.refinement.intervals) == sorted(set(solution.refinement.intervals))
     assert len(solution.refinement.intervals) <= 5
+
+
+@pytest.mark.parametrize("method", START)
+def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -> None:
+    """As from its first solve; and the audit that comes with it is that of the plan."""
+    first = solve(van_der_pol(), START[method])
+    found, audit = refinement.refined(first.problem, START[method], first, first.audit())
+    whole = refined(method)
+    assert found.refinement is not None
+    assert whole.refinement is not None
+    assert found.refinement.intervals == whole.refinement.intervals
+    assert found.refinement.reached
+    assert found.cost == pytest.approx(whole.cost, rel=1e-9)
+    assert str(audit) == str(found.audit())
 
 
 @pytest.mark.parametrize("method", START)
