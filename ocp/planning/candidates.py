@@ -23,7 +23,15 @@ from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import Touch
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Plan, failed, parts_of
-from ocp.planning.postures import LEAST_INTERVALS, OUT_OF_REACH, Asked, clear_postures, misfits_of, others_told
+from ocp.planning.postures import (
+    LEAST_INTERVALS,
+    OUT_OF_REACH,
+    Asked,
+    clear_postures,
+    misfits_of,
+    others_told,
+    touches_at_the_start,
+)
 from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
@@ -123,13 +131,13 @@ def coarse_motions(
     least = np.inf
     for number in np.lexsort((costs, ~follows)).tolist():
         joints = postures[number]
+        maker.followed[tuple(joints)] = [part.of(slice(number, number + 1)) for part in followed]
         if not follows[number] and np.isfinite(least):
             found.append(Candidate(joints, np.nan, "the tasks cannot be followed from there"))
             continue
         if costs[number] > FAR * least:
             found.append(Candidate(joints, float(costs[number]), "far dearer by its local motion"))
             continue
-        maker.followed[tuple(joints)] = [part.of(slice(number, number + 1)) for part in followed]
         solution = prepared.solve(guess=motion.guess(followed, number), check=False)
         if solution.success:
             least = min(least, solution.cost)
@@ -254,7 +262,32 @@ def _other_sides(maker: Maker, coarse: list[Candidate]) -> list[Candidate]:
         bent, held = maker.bent(one, clear, list(pairs.values()), guess)
         told.append(bent if bent.why else maker.solved(one.start, bent.solution, clear=held))
         if not told[-1].why:
-            break
+            return told
+    return told + _held_starts(maker, [one.start for one in coarse])
+
+
+def _held_starts(maker: Maker, starts: Sequence[Array]) -> list[Candidate]:
+    """What becomes of postures that begin clear and are held there, the cheapest local motion first; ends with one that
+    passes.
+
+    A start that may slide is pushed about by all that is held apart later on the way; held, what it leads to is nearer.
+    From what passes the start slides again.
+    """
+    asked, told = maker.asked, list[Candidate]()
+    if asked.start is not None or asked.clear is None:
+        return told
+    touching = touches_at_the_start(asked, np.array(starts))
+    clear = [one for one, touch in zip(starts, touching, strict=True) if touch is None]
+    ways = [(one, maker.followed[tuple(one)]) for one in clear]
+    ways = [(one, way) for one, way in ways if max(misfits_of(way)) <= OUT_OF_REACH]
+    ways.sort(key=lambda way: sum(part.cost[0] for part in way[1]))
+    for start, way in ways[:FAILURES]:
+        held = Maker(replace(asked, start=start), start, start)
+        told.append(held.solved(start, held.motion.guess(way, 0)))
+        if not told[-1].why:
+            near = asked.clear.holding([touch.pair for touch in maker.local_touches(start)])
+            slid = maker.solved(start, told[-1].solution, clear=near)
+            return [*told[:-1], slid if not slid.why and slid.cost <= told[-1].cost else told[-1]]
     return told
 
 

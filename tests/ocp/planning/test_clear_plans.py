@@ -322,6 +322,15 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
 
 
+def test_where_no_posture_is_clear_none_is_searched_from_other_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    def other_sides(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("ocp.planning.candidates._other_sides", other_sides)
+    with pytest.raises(SolveError, match="; no other posture is clear then: each of the"):
+        plan(ARM, line(), obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+
+
 def test_postures_that_touch_are_left_out_or_named() -> None:
     at = TipTask(position=FIRST)
     obstacle = Sphere(0.08, FIRST + np.array([-0.25, 0, 0.15]))
