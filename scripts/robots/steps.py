@@ -8,6 +8,7 @@ inverse sets the feet as far with the least joint rates; its zero moment point l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,10 @@ from ocp.builders.standing import (
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 
-__all__ = ["SIDES", "alternating", "bent", "draw", "plan", "planar_biped", "planar_feet", "planar_steps"]
+__all__ = [
+    "FRICTION", "SIDES", "Walks", "alternating", "bent", "draw", "plan", "planar_biped", "planar_feet", "planar_steps",
+    "scenes_of", "walks_of",
+]  # fmt: skip
 
 SIDES = ("left", "right")
 SOLE = ((-0.08, 0.14), (-0.05, 0.05))  # m, in the frame of an ankle
@@ -52,31 +56,31 @@ METAL, DARK = (0.80, 0.82, 0.86, 1.0), (0.25, 0.27, 0.31, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class StepsExample:
-    """Two walks over the same footholds, by their names in KINDS.
+class Walks:
+    """Two walks over the same footholds, one in balance and one as a whole.
 
     Attributes:
-        plans: Audited. motions: What they take. audits: Of each.
-        local: The steps of the dynamic one by the pseudo-inverse.
+        plans, motions, audits: By the walks' names, as in KINDS.
     """
 
     plans: dict[str, Solution]
     motions: dict[str, StepsMotion]
     audits: dict[str, Audit]
-    local: StepsMotion
 
     @property
     def audit(self) -> Audit:
-        """Of the plan that is not sound, if one is not, else of the dynamic one."""
-        return next((audit for audit in self.audits.values() if not audit.passed), [*self.audits.values()][-1])
+        """Of the plan in which a fault was found, if there is one, else of the dynamic one."""
+        return next((audit for audit in self.audits.values() if audit.failures), [*self.audits.values()][-1])
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
         careful, whole = (self.motions[name] for name in KINDS)
         slow, fast = careful.summary(), whole.summary()
+        robot = whole.steps.robot
+        share = np.abs(whole.joint_torques).max(axis=0) / robot.effort
         return {
-            "robot": "planar biped",
-            "dof": whole.steps.robot.dof,
+            "robot": robot.name,
+            "dof": robot.dof,
             "task_rows": None,
             "duration_s": fast["duration_s"],
             "duration_static_s": slow["duration_s"],
@@ -85,13 +89,29 @@ class StepsExample:
             "tip_error": None,
             "joint_return_rad": None,
             "audit_passed": all(audit.passed for audit in self.audits.values()),
-            "zmp_margin_local_m": self.local.summary()["zmp_margin_min_m"],
+            "audit_feasible": all(audit.feasible for audit in self.audits.values()),
             "zmp_margin_optimal_m": fast["zmp_margin_min_m"],
             "com_margin_optimal_m": fast["com_margin_min_m"],
             "com_margin_static_m": slow["com_margin_min_m"],
             "friction": fast["friction_max"],
             "peak_joint_torque": fast["peak_joint_torque"],
+            "peak_torque_share": float(share.max()),
         }
+
+
+@dataclass(frozen=True, eq=False)
+class StepsExample(Walks):
+    """The walks of the planar biped.
+
+    Attributes:
+        local: The steps of the dynamic one by the pseudo-inverse.
+    """
+
+    local: StepsMotion
+
+    def summary(self) -> dict[str, Any]:
+        """A row of the summary."""
+        return super().summary() | {"zmp_margin_local_m": self.local.summary()["zmp_margin_min_m"]}
 
 
 def planar_biped() -> Robot:
@@ -166,32 +186,46 @@ def bent(steps: Steps, knee: float = 0.8) -> Array:
 
 def plan(coarse: bool = False) -> StepsExample:
     """Both walks, audited; on one mesh only, `coarse` or not."""
-    plans, motions, audits = {}, {}, {}
-    for name, kind in KINDS.items():
-        steps = planar_steps(2, *kind["times"])
+    walks = walks_of(planar_steps, KINDS, CLEARANCE)
+    steps = walks.motions["as a whole"].steps
+    return StepsExample(**vars(walks), local=resolve_steps(steps, bent(steps), clearance=CLEARANCE))
+
+
+def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clearance: float) -> Walks:
+    """Two steps as each of some kinds asks for them, planned and audited.
+
+    Args:
+        made: Steps of a robot, as `planar_steps`.
+        kinds: As KINDS.
+        clearance: Of a sole in the middle of its way, m.
+    """
+    plans, motions = {}, {}
+    for name, kind in kinds.items():
+        steps = made(2, *kind["times"])
         plans[name] = plan_steps(
             steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
-            clearance=CLEARANCE, method=METHOD,
+            clearance=clearance, method=METHOD,
         )  # fmt: skip
-        motions[name], audits[name] = steps_motion(steps, plans[name]), plans[name].audit()
-    steps = motions["as a whole"].steps
-    return StepsExample(plans, motions, audits, resolve_steps(steps, bent(steps), clearance=CLEARANCE))
+        motions[name] = steps_motion(steps, plans[name])
+    return Walks(plans, motions, {name: plan.audit() for name, plan in plans.items()})
 
 
-def scenes_of(example: StepsExample) -> list[Scene]:
-    """Both walks, the soles' places on the ground, the zero moment point marked."""
+def scenes_of(walks: Walks, view: tuple[float, float], footprint: Array | None = None) -> list[Scene]:
+    """Both walks, the zero moment point marked.
+
+    Args:
+        view: Elevation and azimuth, deg.
+        footprint: Corners (4, 2) of what is marked on the ground, m.
+    """
     found = []
-    for name, motion in example.motions.items():
+    for name, motion in walks.motions.items():
         turn = Rotation.from_matrix(motion.root_rotation).as_quat(scalar_first=True)
         machine = FreeFloating(motion.steps.robot)
         frames = frames_along(machine, motion.joints, np.column_stack([motion.root_position, turn]))
-        title = f"{name}: {motion.t[-1]:.1f} s"
-        low, high = SOLE[0][0], SOLE[0][1] + 2 * LENGTH
-        corners = np.array([[low, -0.15], [high, -0.15], [high, 0.15], [low, 0.15]])
         found.append(
             Scene(
-                title, motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=VIEW, floor=0.0,
-                footprint=corners, mark=motion.zero_moment_point,
+                f"{name}: {motion.t[-1]:.1f} s", motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=view,
+                floor=0.0, footprint=footprint, mark=motion.zero_moment_point,
             )
         )  # fmt: skip
     return found
@@ -215,7 +249,8 @@ def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None
         "contact simulation it falls. Masses and limits are our own; the legs move in one plane and are "
         "drawn beside each other."
     )
-    scenes = scenes_of(example)
+    low, high = SOLE[0][0], SOLE[0][1] + 2 * LENGTH
+    scenes = scenes_of(example, VIEW, np.array([[low, -0.15], [high, -0.15], [high, 0.15], [low, 0.15]]))
     with page(folder / "steps.png", scenes, 6, height=6.0, share=1.15, note=note, title=title) as axes:
         for ax, name in zip(axes, KINDS, strict=False):
             _balance(ax, name, example.motions[name])

@@ -6,22 +6,19 @@ space: the zero moment point goes from sole to sole, sideways too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from models import Foot, FreeFloating, Robot
+from models import Foot, Robot
 from models.arrays import Array
-from ocp import Audit, Collocation, Limits, Solution
-from ocp.app.frames import frames_along
-from ocp.builders.standing import Steps, StepsMotion, plan_steps, steps_motion
+from ocp.builders.standing import Steps, StepsMotion
 from scripts.drawing import COLORS
-from scripts.robots.drawing import Scene, animate, page
+from scripts.robots.drawing import animate, page
 from scripts.robots.robots import TALOS
-from scripts.robots.steps import SIDES, alternating, bent
+from scripts.robots.steps import FRICTION, SIDES, Walks, alternating, scenes_of, walks_of
 
 __all__ = ["HELD", "draw", "plan", "talos", "talos_steps"]
 
@@ -33,7 +30,6 @@ HELD = {
 """Joints of the arms that do not hang straight down, rad."""
 WIDE = 0.085  # of the feet from the middle, m
 LENGTH = 0.2  # of a step, m
-FRICTION = 0.6
 CLEARANCE = 0.04  # of a sole in the middle of its way, m
 KINDS: dict[str, dict[str, Any]] = {
     "in balance": {"balance": "static", "margin": 0.03, "times": (2.0, 2.0), "color": "orange"},
@@ -42,50 +38,7 @@ KINDS: dict[str, dict[str, Any]] = {
 """What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s.
 
 The margin of the first is what ground and servos that give take at the corner of a sole, where it stands long."""
-METHOD = Collocation(12, degree=3, scheme="legendre")
 VIEW = (13.0, -58.0)  # deg
-
-
-@dataclass(frozen=True, eq=False)
-class TalosExample:
-    """Two walks over the same footholds, by their names in KINDS.
-
-    Attributes:
-        plans: Audited. motions: What they take. audits: Of each.
-    """
-
-    plans: dict[str, Solution]
-    motions: dict[str, StepsMotion]
-    audits: dict[str, Audit]
-
-    @property
-    def audit(self) -> Audit:
-        """Of the plan that is not sound, if one is not, else of the dynamic one."""
-        return next((audit for audit in self.audits.values() if not audit.feasible), [*self.audits.values()][-1])
-
-    def summary(self) -> dict[str, Any]:
-        """A row of the summary."""
-        careful, whole = (self.motions[name] for name in KINDS)
-        slow, fast = careful.summary(), whole.summary()
-        share = np.abs(whole.joint_torques).max(axis=0) / whole.steps.robot.effort
-        return {
-            "robot": TALOS.name,
-            "dof": whole.steps.robot.dof,
-            "task_rows": None,
-            "duration_s": fast["duration_s"],
-            "duration_static_s": slow["duration_s"],
-            "cost_local": None,
-            "cost_optimal": float(self.plans["as a whole"].cost),
-            "tip_error": None,
-            "joint_return_rad": None,
-            "audit_passed": all(audit.passed for audit in self.audits.values()),
-            "audit_feasible": all(audit.feasible for audit in self.audits.values()),
-            "zmp_margin_optimal_m": fast["zmp_margin_min_m"],
-            "com_margin_optimal_m": fast["com_margin_min_m"],
-            "com_margin_static_m": slow["com_margin_min_m"],
-            "friction": fast["friction_max"],
-            "peak_torque_share": float(share.max()),
-        }
 
 
 def talos() -> Robot:
@@ -96,7 +49,7 @@ def talos() -> Robot:
     """
     names = TALOS.read().joint_names
     held = {name: HELD.get(name, 0.0) for name in names if not name.startswith("leg")}
-    return Robot.from_urdf(TALOS.path, lock=held, **TALOS.options)
+    return replace(Robot.from_urdf(TALOS.path, lock=held, **TALOS.options), name=TALOS.name)
 
 
 def talos_steps(count: int, shift: float, swing: float, *, first: str = "right", length: float = LENGTH) -> Steps:
@@ -106,41 +59,12 @@ def talos_steps(count: int, shift: float, swing: float, *, first: str = "right",
     return Steps(robot, feet, alternating(count, shift, swing, first=first, length=length, wide=WIDE))
 
 
-def plan(coarse: bool = False) -> TalosExample:
+def plan(coarse: bool = False) -> Walks:
     """Both walks, audited; from one mesh, `coarse` or not."""
-    plans = {}
-    for name, kind in KINDS.items():
-        steps = talos_steps(2, *kind["times"])
-        plans[name] = plan_steps(
-            steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
-            clearance=CLEARANCE, method=METHOD,
-        )  # fmt: skip
-    return example_of(plans)
+    return walks_of(talos_steps, KINDS, CLEARANCE)
 
 
-def example_of(plans: dict[str, Solution]) -> TalosExample:
-    """What plans take."""
-    motions = {name: steps_motion(talos_steps(2, *KINDS[name]["times"]), plan) for name, plan in plans.items()}
-    return TalosExample(plans, motions, {name: plan.audit() for name, plan in plans.items()})
-
-
-def scenes_of(example: TalosExample) -> list[Scene]:
-    """Both walks, the zero moment point marked."""
-    found = []
-    for name, motion in example.motions.items():
-        turn = Rotation.from_matrix(motion.root_rotation).as_quat(scalar_first=True)
-        machine = FreeFloating(motion.steps.robot)
-        frames = frames_along(machine, motion.joints, np.column_stack([motion.root_position, turn]))
-        found.append(
-            Scene(
-                f"{name}: {motion.t[-1]:.1f} s", motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=VIEW,
-                floor=0.0, mark=motion.zero_moment_point,
-            )
-        )  # fmt: skip
-    return found
-
-
-def draw(example: TalosExample, folder: Path, *, animation: bool = True) -> None:
+def draw(example: Walks, folder: Path, *, animation: bool = True) -> None:
     """talos.png and talos.gif."""
     careful, whole = (example.motions[name] for name in KINDS)
     out = -whole.summary()["com_margin_min_m"]
@@ -157,7 +81,7 @@ def draw(example: TalosExample, folder: Path, *, animation: bool = True) -> None
         f"description, soles {1000 * CLEARANCE:g} mm above the ground in the middle of their way, feet land at rest; "
         "the durations are given, and both walks are the cheapest found in theirs by the same weights."
     )
-    scenes = scenes_of(example)
+    scenes = scenes_of(example, VIEW)
     with page(folder / "talos.png", scenes, 4, height=6.8, share=1.55, note=note, title=title) as (above, loads, mass):
         _seen_from_above(above, example)
         _loads(loads, whole)
@@ -166,7 +90,7 @@ def draw(example: TalosExample, folder: Path, *, animation: bool = True) -> None
         animate(folder / "talos.gif", scenes, frames=44, seconds=0.12, note=note)
 
 
-def _seen_from_above(ax: Any, example: TalosExample) -> None:
+def _seen_from_above(ax: Any, example: Walks) -> None:
     """The soles on the ground, the zero moment point of the dynamic walk, and both centers of mass."""
     whole = example.motions["as a whole"]
     soles = {
