@@ -423,7 +423,7 @@ class Maker:
             if clear is not None and touching:
                 apart = clear.holding([touch.pair for touch in touching])
                 return _touching(Candidate(start, solution.cost), touching[0], solution=solution), apart
-            solution, audit = self._audited(motion, mesh, solution)
+            solution, audit = self._audited(motion, mesh, solution, check=not named)
             if np.isnan(self._start(clear)).any() and audit.feasible and audit.optimal is None:
                 first = solution[f"joints{motion.stretches[0].suffix}"][0]
                 held = self.declared(first, clear)
@@ -448,9 +448,14 @@ class Maker:
         why = f"not decided: {audit.undecided}" if worst is None else f"the audit fails, {worst.name} {worst.value:.2g}"
         return Candidate(start, solution.cost, why, solution), None
 
-    def _audited(self, motion: ToolMotion, mesh: Collocation, solution: Solution) -> tuple[Solution, Audit]:
-        """A motion, on a finer mesh where the way of its tips or its audit asks for it, and its audit."""
-        solution = self._on_its_way(motion, mesh, solution)
+    def _audited(
+        self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool = True
+    ) -> tuple[Solution, Audit]:
+        """A motion, on a finer mesh where the way of its tips or its audit asks for it, and its audit.
+
+        With `check` what fails on a finer mesh is tried from other starts, and what would have to give way is found.
+        """
+        solution = self._on_its_way(motion, mesh, solution, check)
         if self.brief and (stray := self._strays(motion, solution).max()) > OUT_OF_REACH:
             words = f"the tips stray by {stray:.2g} (m or rad) on finer meshes, too"
             raise SolveError(words, solution, name="task", value=float(stray), limit=TIP)
@@ -461,11 +466,11 @@ class Maker:
                 same = _mesh_of(mesh, solution)
                 options = _options(motion, same, solution.cost, SOLVER)
                 solution, audit = refined(motion.problem, same, solution, audit, options)
-            if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution)) is not solution:
+            if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution, check)) is not solution:
                 solution, audit = finer, finer.audit()
         return solution, audit
 
-    def _on_its_way(self, motion: ToolMotion, mesh: Collocation, solution: Solution) -> Solution:
+    def _on_its_way(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
         """A motion, on a finer mesh where its tips stray, as long as that may lead them back."""
         strays = self._strays(motion, solution)
         for _ in range(BRIEF if self.brief else MESHES):
@@ -477,7 +482,9 @@ class Maker:
             cut = split(solution.state_interpolant.breaks, pieces, strays, MOST)
             finer = mesh.with_mesh(cut)
             options = _options(motion, finer, solution.cost, SOLVER)
-            found = solve(motion.problem, finer, guess=solution, options=options)
+            found = solve(motion.problem, finer, guess=solution, options=options, check=check)
+            if not found.success:
+                raise SolveError(f"no motion was found on a finer mesh: {found.status.split(':')[0]}", found)
             before, strays = strays.max(), self._strays(motion, found)
             if strays.max() > max(OUT_OF_REACH, NEARER * before):
                 break

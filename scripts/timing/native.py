@@ -97,20 +97,20 @@ def cases() -> list[tuple[str, Problem, Any]]:
 
 
 def again(name: str, problem: Problem, method: Any, repeats: int) -> dict[str, Any]:
-    """One row: a solve from an earlier plan, by IPOPT interpreted from its values, and from its limits; native cold."""
+    """One row: a solve by IPOPT interpreted from the values of an earlier plan; native cold, and from that plan."""
     loose = {"limit": 50.0}
-    plain, ipopt = (prepare(problem, method, solver="ipopt", compiled=how) for how in (False, True))
+    plain = prepare(problem, method, solver="ipopt", compiled=False)
     native = prepare(problem, method, solver="native", compiled=True)
-    free = ipopt.solve(loose)
+    free = native.solve(loose)
     near, then = ({"limit": float(-share * free["rates"][:, LIMITED].min())} for share in (0.95, 0.949))
-    plan = ipopt.solve(near)
+    plan = native.solve(near)
     values = {**plan.states, **plan.controls, "t": plan.t}  # which say nothing of limits
     times = {
         "ipopt_s": least(lambda: plain.solve(then, values), repeats),
         "cold_s": least(lambda: native.solve(then), repeats),
-        "warm_s": least(lambda: ipopt.solve(then, plan), repeats),
+        "warm_s": least(lambda: native.solve(then, plan), repeats),
     }
-    other, warm = plain.solve(then, values), ipopt.solve(then, plan)
+    other, warm = plain.solve(then, values), native.solve(then, plan)
     return {
         "name": name,
         **times,
