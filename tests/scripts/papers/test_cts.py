@@ -112,7 +112,9 @@ def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path, fu
     example = tmp_path / "example"
     shutil.copytree(EXAMPLE, example, ignore=shutil.ignore_patterns("build"))
     export(functions, example / "build" / "cts_inverse.c")
-    subprocess.run(["make", "CC=cc", f"PYTHON={sys.executable}"], cwd=example, check=True, capture_output=True, text=True)
+    subprocess.run(
+        ["make", "CC=cc", f"PYTHON={sys.executable}"], cwd=example, check=True, capture_output=True, text=True
+    )
     targets = random_targets(np.random.default_rng(9), 500)
     targets[:, 7] = np.nan
     previous = np.random.default_rng(10).uniform(-3, 3, 500)
