@@ -35,13 +35,13 @@ Posed: TypeAlias = tuple[Callable[[float], float], str]
 
 
 def selfmotion(statement: Statement, intervals: int) -> Posed:
-    """As a user gets it: ipopt, functions interpreted."""
-    return _selfmotion(statement, intervals, solver="ipopt", compiled=False)
-
-
-def native(statement: Statement, intervals: int) -> Posed:
-    """The native stage solver with functions that were compiled before."""
+    """By the native solver, its functions compiled before."""
     return _selfmotion(statement, intervals, solver="native", compiled=True)
+
+
+def by_ipopt(statement: Statement, intervals: int) -> Posed:
+    """As without a compiler: by ipopt, functions interpreted."""
+    return _selfmotion(statement, intervals, solver="ipopt", compiled=False)
 
 
 def _selfmotion(statement: Statement, intervals: int, **how: Any) -> Posed:
@@ -362,7 +362,7 @@ def _terminal_slope(statement: Statement) -> Any:
     return ca.substitute(ca.jacobian(statement.formulas["terminal"](x, horizon), both), both, ca.DM.zeros(form.nx + 1))
 
 
-TOOLS = {"selfmotion": selfmotion, "selfmotion, native": native, "rockit": rockit, "Dymos": dymos, "Drake": drake}
+TOOLS = {"selfmotion": selfmotion, "selfmotion, ipopt": by_ipopt, "rockit": rockit, "Dymos": dymos, "Drake": drake}
 
 
 @contextlib.contextmanager
