@@ -117,10 +117,15 @@ def refine(
 
 
 def refined(
-    problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None
+    problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None, check: bool = True
 ) -> tuple[Solution, Audit]:
-    """As `refine`, from a plan that was solved on the method's mesh and audited already; with the last one's audit."""
-    return _refined(problem, method, (solution, audit), TOLERANCE, {"options": options}, {}, MOST_INTERVALS)
+    """As `refine`, from a plan that was solved on the method's mesh and audited already; with the last one's audit.
+
+    Without `check` a round that fails from the plan before it is not begun elsewhere, and what conflicts not looked
+    for: see :func:`ocp.methods.solve`.
+    """
+    given = {"options": options, "check": check}
+    return _refined(problem, method, (solution, audit), TOLERANCE, given, {}, MOST_INTERVALS)
 
 
 def _refined(
@@ -212,6 +217,8 @@ def _next(
         return None  # nothing is built
     try:
         solution = solve(problem, method, **given)
+        if not solution.success:
+            raise SolveError(f"refinement of {problem.name!r} failed: {solution.status.split(':')[0]}", solution)
         return solution, judge(problem, solution, **settings)
     except (SolveError, OutOfTime) as error:
         if isinstance(error, SolveError) and time_left() > 0:

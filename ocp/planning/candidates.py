@@ -274,8 +274,9 @@ def _held_starts(maker: Maker, starts: Sequence[Array]) -> list[Candidate]:
     From what passes the start slides again.
     """
     asked, told = maker.asked, list[Candidate]()
-    if asked.start is not None or asked.clear is None:
+    if asked.start is not None:
         return told
+    assert asked.clear is not None
     touching = touches_at_the_start(asked, np.array(starts))
     clear = [one for one, touch in zip(starts, touching, strict=True) if touch is None]
     ways = [(one, maker.followed[tuple(one)]) for one in clear]
@@ -465,7 +466,7 @@ class Maker:
                 warnings.simplefilter("ignore", RefinementWarning)
                 same = _mesh_of(mesh, solution)
                 options = _options(motion, same, solution.cost, SOLVER)
-                solution, audit = refined(motion.problem, same, solution, audit, options)
+                solution, audit = refined(motion.problem, same, solution, audit, options, check)
             if not _failing(audit) and (finer := self._on_its_way(motion, mesh, solution, check)) is not solution:
                 solution, audit = finer, finer.audit()
         return solution, audit

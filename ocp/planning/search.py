@@ -92,28 +92,38 @@ class Search:
         """
         self.space, self.instants, self.times, self.cost, self.limits = space, instants, times, cost, limits
         self.start, self.surroundings = start, surroundings
-        self.covered: list[Charts] = []
         self._known: tuple[Graph, list[Values], list[Values] | None] | None = None
-        for sets in dict.fromkeys(instant.sets for instant in instants):
-            own = [k for k, instant in enumerate(instants) if instant.sets is sets]
+        self.covered = self._cover(seeds)
+        self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
+
+    def _cover(self, seeds: Callable[[int], Array]) -> list[Charts]:
+        """Charts of all postures of each instant.
+
+        Raises:
+            Unreachable, ProblemError: As the search itself.
+        """
+        covered = list[Charts]()
+        for sets in dict.fromkeys(instant.sets for instant in self.instants):
+            own = [k for k, instant in enumerate(self.instants) if instant.sets is sets]
             found: list[tuple[int, Array]] = []
             for k in own:
                 try:
-                    found += [(instants[k].number, joints) for joints in seeds(k)]
+                    found += [(self.instants[k].number, joints) for joints in seeds(k)]
                 except Unreachable:
                     if not found:
                         raise
             layer, joints = (np.array(part) for part in zip(*found, strict=True))
             charts = sets.cover(layer, joints, RADII[sets.size], MOST)
-            self.covered += [charts.of(charts.layer == instants[k].number) for k in own]
-        if start is not None:
-            self.covered[0] = point(start)
-        self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
-        for k, charts in enumerate(self.covered):
+            covered += [charts.of(charts.layer == self.instants[k].number) for k in own]
+        if self.start is not None:
+            covered[0] = point(self.start)
+        for k, charts in enumerate(covered):
             if not len(charts):
                 seeds(k)  # says what is out of reach
-                words = f"at {times[k]:.4g} s no posture that does the tasks is within limits"
-                raise Unreachable(words, np.full(len(space.scale), np.nan), np.nan, time=float(times[k]))
+                words = f"at {self.times[k]:.4g} s no posture that does the tasks is within limits"
+                time = float(self.times[k])
+                raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=time)
+        return covered
 
     def allowed(self, charts: Charts, k: int) -> Charts:
         """But for charts on which every posture touches something."""

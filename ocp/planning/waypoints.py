@@ -10,8 +10,9 @@ pieces may be asked for (see `ocp.planning.reconfigurations`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,11 +26,12 @@ from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
 from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, inverse_kinematics
 from ocp.local.touching import Touch, distances_along, touches
-from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
-from ocp.planning.dead_end import dead_end
+from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.dead_end import KINDS, dead_end
 from ocp.planning.planner import clear_of
 from ocp.planning.reconfigurations import fewest_pieces
 from ocp.planning.search import FREE, Search
+from ocp.planning.sections import RADIUS, Sections, values_of
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
 from ocp.tasks.checks import checked_numbers
@@ -45,16 +47,28 @@ Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 EVERY = 5
 """Of so many waypoints one is searched whole; more where none of the ways found goes through all."""
 WAYPOINT = "waypoint {:g}"
+POSTURES = "postures"
+"""What an error is about where there are more than memory is for."""
+NONE_FOUND = "no way through the waypoints keeps all limits"
 STARTS = 16
 """Random starts of inverse kinematics at each of these."""
-HELD = 3
-"""Places that a joint is held at where two directions are free."""
+SPARSE = (10, 5)
+"""Likewise where two directions are free; the second where no way found by the first goes through all."""
+INSTANTS = 20
+"""Waypoints that are searched then, about, where there are so many, and more where there are many."""
+SPACED = 4 * RADIUS
+"""rad or m: how far each joint may go from one of these to the next, at least."""
+DRAWN = 3
+"""Ways that are drawn tight then, the cheapest first."""
 WIDTH, TIGHT = 0.06, 1e-6
 """rad or m, between postures beside a way that is drawn tight, at first and at last."""
 MISSED = 1e-6
 """m and rad: poses are met up to this."""
 WHOLE = 1e-9
 """rad or m: limits are kept up to this."""
+
+
+Searched = TypeVar("Searched", bound=Search)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +146,8 @@ def plan_waypoints(
 
     Args:
         machine: On a fixed base, with as many joints as a pose has rows, or one or two more. With two more the ways are
-            looked for beside those on which the joint nearest to the base stands still, and no bound is known.
+            looked for beside postures in which the joint nearest to the base has one of some values (see
+            `ocp.planning.sections`), and no bound is known.
         positions: Of the tip in the world. Shape (N, 3), m.
         quaternions: Of the tip there, [w, x, y, z], of any length. Shape (N, 4).
         cost: "length": the sum of the ways of all joints; "largest": the way of the joint that goes farthest, from
@@ -213,13 +228,11 @@ class _Ways:
         if in_pieces and self.sets.size > 1:
             words = f"reconfigurations are counted with one free direction at most, not with {self.sets.size}"
             raise ProblemError(words, name="reconfigurations", value=self.sets.size, limit=1)
-        every, bound = EVERY, 0.0
-        ways = list[tuple[float, str, Array]]()
         if self.sets.size > 1:
-            ways = self._with_one_held()
-        chosen = self._every(every)
-        while self.sets.size <= 1:
-            search = self._search(chosen)
+            return self._made(self._by_sections(), 0.0)
+        every, bound, ways = EVERY, 0.0, list[tuple[float, str, Array]]()
+        search, chosen = self._begun(self._search, every)
+        while True:
             best, least = search.best(np.inf)
             if not np.isfinite(least):
                 if in_pieces:
@@ -235,17 +248,43 @@ class _Ways:
             if len(more) == len(chosen):
                 every = max(every // 2, 1)
                 more = np.union1d(chosen, self._every(every))
-            chosen = more
+            try:
+                search, chosen = self._search(more), more
+            except ProblemError as error:
+                if error.name != POSTURES:
+                    raise
+                break
+        if in_pieces and all(why for _, why, _ in ways):
+            return self._in_pieces(search, chosen)
+        if not ways:
+            raise dead_end(search, WAYPOINT, proven=False) or SolveError(NONE_FOUND, name="waypoints")
+        return self._made(ways, bound)
+
+    def _made(self, ways: list[tuple[float, str, Array]], bound: float) -> WaypointPlan:
+        """The plan of the cheapest way that keeps all limits.
+
+        Raises:
+            SolveError: None does.
+        """
         ways.sort(key=lambda one: (bool(one[1]), one[0]))
-        if in_pieces and (not ways or ways[0][1]):
-            return self._in_pieces(self._search(self._every(1)), self._every(1))
-        if not ways or ways[0][1]:
-            reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways)) or "none goes through all"
-            raise SolveError(f"no way through the waypoints keeps all limits: {reasons}", name="waypoints")
-        length, _, joints = ways[0]
+        length, why, joints = ways[0]
+        if why:
+            reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways))
+            raise SolveError(f"{NONE_FOUND}: {reasons}", name="waypoints")
         listed = tuple((cost, why or ("" if k == 0 else "dearer")) for k, (cost, why, _) in enumerate(ways))
         bound = bound if bound <= length else 0.0
         return WaypointPlan(self.machine, joints, length, bound, listed, self._between(joints))
+
+    def _begun(self, make: Callable[[NDArray[np.intp]], Searched], every: int) -> tuple[Searched, NDArray[np.intp]]:
+        """A search of one of so many waypoints, of fewer where that were more postures than memory is for."""
+        while True:
+            chosen = self._every(every)
+            try:
+                return make(chosen), chosen
+            except ProblemError as error:
+                if error.name != POSTURES or len(chosen) == 2:
+                    raise
+            every *= 2
 
     def _in_pieces(self, search: Search, chosen: NDArray[np.intp]) -> WaypointPlan:
         """The cheapest way with the fewest reconfigurations, seen from waypoints that are searched already."""
@@ -292,44 +331,52 @@ class _Ways:
         count = len(self.places)
         return np.unique(np.linspace(0, count - 1, -(-(count - 1) // every) + 1).round().astype(int))
 
-    def _with_one_held(self) -> list[tuple[float, str, Array]]:
-        """Ways beside the shortest found on which the joint nearest to the base, that moves all others, stands."""
-        robot, chosen, found = self.machine.robot, self._every(EVERY), list[tuple[float, str, Array]]()
+    def _by_sections(self) -> list[tuple[float, str, Array]]:
+        """Ways beside the cheapest found by sections, in which the joint nearest to the base, that moves all others, is
+        held.
+
+        Raises:
+            SolveError: None leads through the waypoints that were searched.
+        """
+        robot, found = self.machine.robot, list[tuple[float, str, Array]]()
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
         held = robot.joint_names.index(names[0])
-        low, high = np.clip((self.lower[held], self.upper[held]), -np.pi, np.pi)
-        for value in (low + (high - low) * (np.arange(HELD) + 0.5) / HELD).tolist():
-            try:
-                path = self._search(chosen, (held, value)).first(np.inf)[1]
-            except Unreachable:
-                continue
-            if path is not None:
-                found.append(self._drawn(chosen, path))
+        low, high = self.lower[held], self.upper[held]
+        slides = robot.moving_joints[held].kind == "prismatic"
+
+        def sections(chosen: NDArray[np.intp]) -> Sections:
+            space, instants, times, cost, far = self._searched(chosen)
+            values = values_of(slides, low, high, float(far[:, held].min()))
+            return Sections(space, instants, times, cost, far, joint=held, values=values, **self._told(chosen))
+
+        # steps from one curve to the next are no shorter than between charts
+        least = int(np.ceil(min(SPACED / np.delete(self.step, held).min(), len(self.places))))
+        for every in SPARSE:
+            search, chosen = self._begun(sections, max(min(every, len(self.places) // INSTANTS), least))
+            paths, end = search.ways(), None
+            if not paths:
+                end = dead_end(search, WAYPOINT, proven=False)
+                gives = () if end is None else end.gives
+                paths = [one.joints for one in gives if one.kind in KINDS and one.amount <= MISSED]
+            found += [self._drawn(chosen, path) for path in paths[:DRAWN]]
+            if not found:
+                raise end or SolveError(NONE_FOUND, name="waypoints")
+            if any(not why for _, why, _ in found):
+                break
         return found
 
-    def _search(self, chosen: NDArray[np.intp], held: tuple[int, float] | None = None) -> Search:
-        """Of the postures at some waypoints, in which a joint may be held."""
-        equations, targets = self.sets.equations, self.sets.targets[chosen]
-        if held is not None:
-            equations = Held(equations.machine, equations.bound, held[0])
-            targets = np.column_stack([targets, np.full(len(chosen), held[1])])
-        sets = SelfMotions(self.space, equations, targets)
+    def _search(self, chosen: NDArray[np.intp]) -> Search:
+        """Of the postures at some waypoints."""
+        return Search(*self._searched(chosen), **self._told(chosen))
+
+    def _searched(self, chosen: NDArray[np.intp]) -> tuple[Any, ...]:
+        """What a search of some waypoints takes."""
+        sets = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen])
         instants = [Instant(sets, k) for k in range(len(chosen))]
+        return self.space, instants, chosen.astype(float), self.cost, np.diff(chosen)[:, None] * self.step
 
-        def seeds(k: int) -> Array:
-            found = self._seeds(int(chosen[k]))
-            if held is None:
-                return found
-            on, good = sets.corrected(np.full(len(found), k), found)
-            good &= self.space.within(on)
-            if not good.any():
-                words = f"waypoint {chosen[k]}: none was found with {self.machine.robot.joint_names[held[0]]!r} held"
-                raise Unreachable(words, np.full(len(self.lower), np.nan), np.nan, time=float(chosen[k]))
-            return np.asarray(on[good])
-
-        told: dict[str, Any] = {"seeds": seeds, "surroundings": self.around}
-        far = np.diff(chosen)[:, None] * self.step
-        return Search(self.space, instants, chosen.astype(float), self.cost, far, **told)
+    def _told(self, chosen: NDArray[np.intp]) -> dict[str, Any]:
+        return {"seeds": lambda k: self._seeds(int(chosen[k])), "surroundings": self.around}
 
     def _ended(self, search: Search, chosen: NDArray[np.intp]) -> SolveError:
         """Where no way goes on, at first seen from the waypoints that were searched, then from each of those there."""

@@ -1,0 +1,87 @@
+"""Ways where two directions are free, beside postures in which one joint has one of some values.
+
+The postures at an instant form surfaces, which are too many charts for an arm of eight joints. Where one joint is held
+they are curves. Such curves at several values of it lie close enough together for steps to lead from one to another, so
+that ways on which the joint moves are found as well; drawn tight through the surfaces they leave the curves. Nothing is
+proven by this, and no bound comes of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+import numpy as np
+
+from models.arrays import Array
+from ocp.planning.charts import Charts, Held, Parts, SelfMotions
+from ocp.planning.search import Search
+
+__all__ = ["Sections", "values_of"]
+
+RADIUS = 0.14
+"""rad or m, of the charts of the curves."""
+APART = {True: 0.1, False: 0.6}
+"""m or rad, from one value of the joint to the next, at most: of one that slides, of one that turns."""
+VALUES = 64
+"""Of the joint, at most."""
+MOST = 80_000
+"""Charts of all instants and values together, of which no steps are kept."""
+
+
+def values_of(slides: bool, lower: float, upper: float, far: float) -> Array:
+    """At which a joint is held: its limits and between, or all round. Shape (V,), rad or m.
+
+    Args:
+        slides: Whether it does. far: How far it may go from one instant to the next: values are no farther apart.
+    """
+    low, high = np.clip((lower, upper), -np.pi, np.pi).tolist()
+    count = int(np.ceil(min((high - low) / min(APART[slides], far), VALUES - 1.0)))
+    if not slides and high - low >= 2 * np.pi - 1e-6:
+        return np.linspace(low, high, max(count, 1), endpoint=False)
+    return np.linspace(low, high, count + 1)
+
+
+class Sections(Search):
+    """The search for ways beside postures in which one joint has one of some values."""
+
+    def __init__(self, *told: Any, joint: int, values: Array, **more: Any) -> None:
+        """
+        Args:
+            told, more: As of `Search`; the instants all of one set of postures with two directions free.
+            joint: The number of the joint. values: At which it is held. Shape (V,).
+        """
+        self._joint, self._values = joint, values
+        super().__init__(*told, **more)
+
+    def _cover(self, seeds: Callable[[int], Array]) -> list[Charts]:
+        """Charts of the curves of each instant, none where no seed leads to one; numbered by values, then instants."""
+        whole, count = self.instants[0].sets, len(self.instants)
+        numbers, each = [instant.number for instant in self.instants], len(self._values)
+        targets = np.tile(whole.targets[numbers], (each, 1))
+        held = Held(whole.equations.machine, whole.equations.bound, self._joint)
+        self._curves = SelfMotions(self.space, held, np.column_stack([targets, np.repeat(self._values, count)]))
+        found = [seeds(k) for k in range(count)]
+        own = np.repeat(np.arange(count), [len(some) for some in found])
+        layer = (own + count * np.arange(each)[:, None]).ravel()
+        joints, good = self._curves.corrected(layer, np.tile(np.concatenate(found), (each, 1)))
+        good &= self.space.within(joints)
+        charts = self._curves.cover(layer[good], joints[good], RADIUS, MOST)
+        return [charts.of(charts.layer % count == k) for k in range(count)]
+
+    def _parts(self, charts: Charts, k: int) -> Parts:
+        return self._curves.parts(charts)
+
+    def ways(self) -> list[Array]:
+        """Joints at the instants, (K, n), by rising cost of their steps: of the cheapest way that is found, and of the
+        cheapest on which the joint keeps each of its values."""
+        count = len(self.instants)
+        found = [path for path in (self.first(np.inf)[1],) if path is not None]
+        for value in range(len(self._values)):
+            own = copy(self)
+            own.layers = [charts.of(charts.layer // count == value) for charts in self.layers]
+            if all(len(charts) for charts in own.layers):
+                path = own._tight(own._through_centers(own.whole_graph()), own.layers)
+                found += [path] if path is not None else []
+        return sorted(found, key=self.steps)
