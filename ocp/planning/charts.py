@@ -338,13 +338,15 @@ class SelfMotions:
         reach = np.abs(tangents) * radii[:, None, None]
         others = reach.sum(axis=2)[:, :, None] - reach
         up, down = self.space.upper - joints + stray, joints - self.space.lower + stray
+        room = np.stack([up, down])[:, :, :, None] + others
+        room[(room < 0) & (room >= -EXACT)] = 0.0  # a joint that is held at its limit is there up to rounding
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = (np.stack([up, down])[:, :, :, None] + others) / np.abs(tangents)
-            rising = tangents > 0
-            high = np.where(rising, far[0], far[1]).min(axis=1)
-            low = np.where(rising, far[1], far[0]).min(axis=1)
-        limit = radii[:, None]
-        return Charts(layer, joints, tangents, radii, -np.fmin(low, limit), np.fmin(high, limit), strays)
+            far = room / np.abs(tangents)
+        far[np.isnan(far)] = np.inf
+        rising, limit = tangents > 0, radii[:, None]
+        high = np.where(rising, far[0], far[1]).min(axis=1).clip(-2 * limit, limit)
+        low = np.where(rising, far[1], far[0]).min(axis=1).clip(-2 * limit, limit)
+        return Charts(layer, joints, tangents, radii, -low, high, strays)
 
     def _strays(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
         """Points of the set at the rims of boxes, nan where there are none, and how far they are from these."""
