@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine, Surroundings
 from models.arrays import Array
@@ -24,9 +25,11 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics"]
+__all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics", "postures_of"]
 
 LARGEST_SEED = 2**64
+TOLERANCE, APART, ITERATIONS = 1e-10, 1e-3, 100
+"""m and rad, of a solution and between two; of each start."""
 SLIDE_SPREAD = 1.0
 """m: of the starts of slides without limits."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
@@ -87,9 +90,9 @@ def inverse_kinematics(
     near: Any = None,
     seed: int = 0,
     limits: bool = True,
-    tolerance: float = 1e-10,
-    apart: float = 1e-3,
-    iterations: int = 100,
+    tolerance: float = TOLERANCE,
+    apart: float = APART,
+    iterations: int = ITERATIONS,
     surroundings: Surroundings | None = None,
 ) -> list[Posture]:
     """Different joint positions at which the machine is where its pose tasks want it, the best first.
@@ -148,37 +151,12 @@ def inverse_kinematics(
         words = f"the task's targets are not finite at {time:g} s"
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
-    q, misfit = gauss_newton(_residual(equations, place, targets), first, lower, upper, tolerance, int(iterations))
-    turns = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
-    wrap = turns & ~np.isfinite(lower) & ~np.isfinite(upper)
-    random = slice(len(first) - int(starts), None)  # what is near a given start stays there
-    q[random, wrap] = np.remainder(q[random, wrap] + np.pi, 2 * np.pi) - np.pi
-    good = misfit <= tolerance
-    if not good.any():
-        raise unreachable(machine, equations, q[int(misfit.argmin())], float(misfit.min()), lower, upper)
-    jacobian = _jacobian(equations, place)
-
-    def rated(joints: Array, misfits: Array) -> list[Posture]:
-        """Those that do the task, the best first, each once."""
-        found = []
-        for each, off in zip(joints[misfits <= tolerance], misfits[misfits <= tolerance], strict=True):
-            values = np.linalg.svd(np.array(jacobian(each)), compute_uv=False)
-            with np.errstate(invalid="ignore"):
-                share = np.minimum(each - lower, upper - each) / ((upper - lower) / 2)
-            margin = float(np.min(share[np.isfinite(upper - lower) & (upper > lower)], initial=1.0))
-            found.append(Posture(each, float(values.prod()) * max(margin, 0.0), float(off)))
-        return _distinct(sorted(found, key=lambda posture: -posture.quality), turns, apart)
-
-    distinct = rated(q, misfit)
+    search = _Search(equations, place, targets, lower, upper, tolerance, apart, int(iterations))
+    distinct = search.postures(first, int(starts))
     if surroundings is None:
         return distinct
     nearest = _touching(distinct, surroundings, place, float(time))
     if all(nearest) and equations.size < size:
-        solved = _residual(equations, place, targets)
-
-        def back(joints: Array) -> tuple[Array, Array]:
-            return gauss_newton(solved, joints, lower, upper, tolerance, int(iterations))
-
         order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
         least = np.array([distinct[k].joints for k in order[:SLID]])
         moved = slid(
@@ -186,14 +164,82 @@ def inverse_kinematics(
             place,
             least,
             float(time),
-            jacobian=lambda joints: np.array(jacobian(joints)),
-            back=lambda joints: back(joints)[0],
+            jacobian=lambda joints: np.array(equations.jacobian_function(joints, place)),
+            back=lambda joints: search.back(joints)[0],
             lower=lower,
             upper=upper,
         )
-        distinct += rated(*back(moved))
+        distinct += search.rated(*search.back(moved))
         nearest = _touching(distinct, surroundings, place, float(time))
     return _clear(distinct, nearest, surroundings, float(time))
+
+
+def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool) -> list[Posture]:
+    """As `inverse_kinematics` on a fixed base, of poses whose targets are known; again and again at little cost.
+
+    Raises:
+        Unreachable: As there.
+    """
+    machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
+    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
+    first = starts_of(machine, lower, upper, starts, None, seed)
+    return _Search(equations, np.zeros(0), targets, lower, upper).postures(first, starts)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """For postures that do tasks at one time; arguments as of `inverse_kinematics`."""
+
+    equations: TaskEquations
+    base: Array
+    targets: Array
+    lower: Array
+    upper: Array
+    tolerance: float = TOLERANCE
+    apart: float = APART
+    iterations: int = ITERATIONS
+
+    def postures(self, first: Array, random: int) -> list[Posture]:
+        """Those that starts (K, n) lead to, the best first; of the last `random` ones angles without limits come round.
+
+        Raises:
+            Unreachable: There is none.
+        """
+        lower, upper = self.lower, self.upper
+        q, misfit = self.back(first)
+        wrap = self._turns & ~np.isfinite(lower) & ~np.isfinite(upper)
+        last = slice(len(first) - random, None)  # what is near a given start stays there
+        q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
+        if not (misfit <= self.tolerance).any():
+            nearest = int(misfit.argmin())
+            raise unreachable(self.equations.machine, self.equations, q[nearest], float(misfit[nearest]), lower, upper)
+        return self.rated(q, misfit)
+
+    def back(self, joints: Array) -> tuple[Array, Array]:
+        """Joints (K, n) and greatest misfits (K,) that others lead to."""
+        told = ca.DM(self.base), ca.DM(self.targets)
+        function = self.equations.misfit_function
+        return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, told)
+
+    def rated(self, joints: Array, misfits: Array) -> list[Posture]:
+        """Those that do the task, the best first, each once."""
+        good, lower, upper = np.flatnonzero(misfits <= self.tolerance), self.lower, self.upper
+        if not good.size:
+            return []
+        joints, size = joints[good], self.equations.size
+        slopes = np.array(self.equations.jacobian_function.map(len(good))(joints.T, ca.DM(self.base)))
+        values = np.linalg.svd(slopes.reshape(size, len(good), -1).transpose(1, 0, 2), compute_uv=False)
+        with np.errstate(invalid="ignore"):
+            share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
+        margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
+        quality = values.prod(axis=1) * np.maximum(margin, 0.0)
+        found = [Posture(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
+        return _distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
+
+    @property
+    def _turns(self) -> NDArray[np.bool_]:
+        """Which joints turn. Shape (n,)."""
+        return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
 
 
 def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: float, limits: bool, near: Any) -> None:
@@ -268,28 +314,20 @@ def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: An
     return np.asarray(np.clip(both, lower, upper))
 
 
-def _residual(equations: TaskEquations, base: Array, targets: Array) -> Any:
-    """Casadi Function joints -> (misfit, its Jacobian)."""
-    q = ca.SX.sym("q", equations.machine.joint_size)
-    misfit = equations.misfit(ca.SX(ca.DM(base)), q, ca.SX(ca.DM(targets)))
-    return ca.Function("misfit", [q], [misfit, ca.densify(ca.jacobian(misfit, q))], {"cse": True})
-
-
-def _jacobian(equations: TaskEquations, base: Array) -> Any:
-    q = ca.SX.sym("q", equations.machine.joint_size)
-    return ca.Function("jacobian", [q], [equations.jacobian(ca.SX(ca.DM(base)), q)], {"cse": True})
-
-
 def gauss_newton(
-    function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int
+    function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int, told: Sequence[Any] = ()
 ) -> tuple[Array, Array]:
-    """Joints (K, n) and greatest misfits (K,) that the starts lead to."""
+    """Joints (K, n) and greatest misfits (K,) that the starts lead to.
+
+    Args:
+        function: Casadi Function of the joints, and what else is `told` of all, -> (misfit, its Jacobian).
+    """
     q = first.copy()
     count, n = q.shape
     mapped = function.map(count)
 
     def evaluate(at: Array) -> tuple[Array, Array]:
-        residual, jacobian = (np.array(part) for part in mapped(at.T))
+        residual, jacobian = (np.array(part) for part in mapped(at.T, *told))
         rows = len(residual)
         return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
 
@@ -316,7 +354,7 @@ def gauss_newton(
     return q, np.abs(residual).max(axis=1)
 
 
-def _distinct(found: list[Posture], turns: Array, apart: float) -> list[Posture]:
+def _distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float) -> list[Posture]:
     """Of those nearer than `apart`, full turns not counted, the best."""
     kept: list[Posture] = []
     for posture in found:

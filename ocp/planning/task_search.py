@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
-from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import Unreachable, postures_of
 from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import DeadEnd, dead_end
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
@@ -174,10 +174,10 @@ class TaskSearch:
         """Postures at an instant, by closed forms and by inverse kinematics from random starts."""
         asked, time = self.asked, float(self.times[k])
         sets, number = self._instants[k]
-        tasks, listed = [part.task for part in sets.equations.bound], sets.listed(number)
-        options: dict[str, Any] = {"seed": asked.seed + k, "limits": asked.limits.joints, "starts": STARTS}
+        listed = sets.listed(number)
         try:
-            found = inverse_kinematics(asked.machine, tasks, time=time, **options)
+            told: dict[str, Any] = {"seed": asked.seed + k, "limits": asked.limits.joints, "starts": STARTS}
+            found = postures_of(sets.equations, sets.targets[number], **told)
             return np.vstack([listed, [one.joints for one in found]])
         except Unreachable as error:
             if len(listed):

@@ -24,7 +24,7 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.clearance import clearance_of
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
-from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, postures_of
 from ocp.local.touching import Touch, distances_along, touches
 from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import KINDS, dead_end
@@ -411,10 +411,10 @@ class _Ways:
         return self._known[number]
 
     def _sought(self, number: int) -> Array:
-        options: dict[str, Any] = {"seed": self.seed + number, "limits": self.kept, "starts": STARTS}
         listed = self.sets.listed(number)
         try:
-            found = inverse_kinematics(self.machine, self._task(number), **options)
+            told: dict[str, Any] = {"seed": self.seed + number, "limits": self.kept, "starts": STARTS}
+            found = postures_of(self.sets.equations, self.sets.targets[number], **told)
         except Unreachable as error:
             if len(listed):
                 return listed

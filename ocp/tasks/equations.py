@@ -345,8 +345,7 @@ class TaskEquations:
 
     @cached_property
     def _lean_function(self) -> Any:
-        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
-        targets = ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+        base, joints, targets = self._symbols
         return ca.Function("leans", [base, joints, targets], [self.leans(base, joints, targets)], {"cse": True})
 
     def function(self) -> Any:
@@ -355,11 +354,30 @@ class TaskEquations:
 
     @cached_property
     def _function(self) -> Any:
-        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
-        targets = ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+        base, joints, targets = self._symbols
         parts = [self.jacobian(base, joints)]
         parts += [what(base, joints, targets) for what in (self.right, self.error, self.misfit)]
         return ca.Function("task", [base, joints, targets], parts, {"cse": True})
+
+    @cached_property
+    def misfit_function(self) -> Any:
+        """Casadi Function (joints, base, targets) -> (misfit, its Jacobian by the joints)."""
+        base, joints, targets = self._symbols
+        misfit = self.misfit(base, joints, targets)
+        slopes = ca.densify(ca.jacobian(misfit, joints))
+        return ca.Function("misfit", [joints, base, targets], [misfit, slopes], {"cse": True})
+
+    @cached_property
+    def jacobian_function(self) -> Any:
+        """Casadi Function (joints, base) -> J."""
+        base, joints, _ = self._symbols
+        return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
+
+    @property
+    def _symbols(self) -> tuple[Any, Any, Any]:
+        """Of base, joints and targets."""
+        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
+        return base, joints, ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
 
     def target_function(self) -> Any:
         """Casadi Function time -> targets, on MX symbols where a track needs them."""

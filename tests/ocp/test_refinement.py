@@ -94,6 +94,26 @@ def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -
     assert str(audit) == str(found.audit())
 
 
+@pytest.mark.parametrize("check", [True, False])
+def test_a_round_that_fails_is_begun_elsewhere_only_where_that_is_asked(
+    check: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One iteration is not enough for a finer mesh."""
+    method, asked = START["radau"], list[bool]()
+    first = solve(van_der_pol(), method)
+
+    def briefly(*told: Any, **more: Any) -> Solution:
+        asked.append(more["check"])
+        return solve(*told, **more)
+
+    monkeypatch.setattr(refinement, "solve", briefly)
+    with pytest.raises(SolveError, match="from the guess: " if check else "^refinement of .* failed: ") as failed:
+        refinement.refined(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
+    assert asked == [check]
+    assert failed.value.solution is not None
+    assert not failed.value.solution.success
+
+
 @pytest.mark.parametrize("method", START)
 def test_every_round_tells_the_errors_of_each_kind_as_shares_of_their_limits(method: str) -> None:
     past, audit = refined(method).refinement, refined(method).audit()

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
 from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import postures_of
+from ocp.tasks.equations import bind
 from tests.models.robot.trees import seeds
 from tests.ocp.tasks.space_tasks import BASE, PANDA_START, UR5_START, floating_panda, panda, pose, two_pandas, ur5
 
@@ -34,6 +36,25 @@ def test_a_six_joint_arm_has_its_eight_postures() -> None:
         assert_poses(ur5(), posture.joints, rotation, position)
     nearest = min(np.abs(np.sin((posture.joints - UR5_START) / 2)).max() for posture in found)
     assert nearest < 1e-9
+
+
+@pytest.mark.parametrize("limits", [True, False])
+def test_from_equations_and_targets_the_same_postures_are_found(limits: bool) -> None:
+    """Again and again with one set of functions."""
+    rng, told = np.random.default_rng(3), dict[str, Any](starts=8, limits=limits)
+    equations = None
+    for seed in range(3):
+        rotation, position = pose(panda(), (), rng.uniform(panda().robot.lower, panda().robot.upper))
+        task = TipTask(position=position, orientation=rotation)
+        equations = equations or bind(panda(), task)
+        targets = np.concatenate([position, np.zeros(3), rotation.T.ravel(), np.zeros(3)])
+        found = postures_of(equations, targets, seed=seed, **told)
+        asked = inverse_kinematics(panda(), task, seed=seed, **told)
+        for one, other in zip(found, asked, strict=True):
+            np.testing.assert_allclose(one.joints, other.joints, atol=1e-8)
+            assert one.quality == pytest.approx(other.quality)
+    with pytest.raises(Unreachable):
+        postures_of(bind(panda(), task), targets + 5.0, seed=0, **told)
 
 
 def test_a_two_link_arm_has_two_elbows_in_closed_form() -> None:
