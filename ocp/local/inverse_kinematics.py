@@ -228,7 +228,7 @@ class _Search:
             return []
         joints, size = joints[good], self.equations.size
         slopes = np.array(self.equations.jacobian_function.map(len(good))(joints.T, ca.DM(self.base)))
-        values = np.linalg.svd(slopes.reshape(size, len(good), -1).transpose(1, 0, 2), compute_uv=False)
+        values = np.linalg.svd(slopes.reshape(size, *joints.shape).transpose(1, 0, 2), compute_uv=False)
         with np.errstate(invalid="ignore"):
             share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)

@@ -30,7 +30,7 @@ from ocp.planning.steps import StepCost, Values, least_in_box
 from ocp.planning.tight import DEAR, drawn_tight
 from ocp.planning.value import FARTHEST, Graph
 
-__all__ = ["FREE", "GAPS", "MOST", "Search"]
+__all__ = ["FREE", "MOST", "Search"]
 
 FREE = 2
 """Directions that a task may leave free: of more there are too many postures."""
@@ -42,7 +42,7 @@ FIRST = 10_000
 """Of these, before there is any motion: where one has hardly room, neither it nor that there is none may be found."""
 FINEST = 1e-6
 """rad or m: smaller charts are not halved."""
-GAPS = (0.01, 0.01, 0.07)
+GAPS = (0.01, 0.01, 0.04)
 """Share of what a plan's steps cost that the bound may stay below, by the directions that are free."""
 MOTIONS = 12
 """Classes of motions that are followed up, the cheapest first."""
@@ -52,6 +52,8 @@ SAME = 0.1
 """rad or m: motions nearer to each other than this everywhere are one."""
 WHOLE = 1e-9
 """rad or m: limits are kept up to this."""
+INWARDS = (0.0, 0.25, 0.5, 1.0)
+"""Shares of the way to the middle of a chart at which a posture is tried that keeps the limits."""
 SEATS = 5
 """Instants at which the cheapest motions through all charts are compared."""
 
@@ -196,7 +198,7 @@ class Search:
         """The cheapest way through a chart; None where it ends."""
         slope, box = to_come[k].slope[chart] + (passed[k].slope[chart] if k else 0.0), graph.layers[k].of([chart])
         at = np.where(slope > 0, box.low[0], np.where(slope < 0, box.high[0], 0.0))
-        first = self._on(k, box.centers[0] + box.tangents[0] @ at)
+        first = self.allowed_in(k, box, at)
         if first is None:
             return None
         path, last = {k: first}, len(self.layers) - 1
@@ -204,12 +206,21 @@ class Search:
             here = first
             for other in order:
                 ways = graph.nearest(here, other - int(np.sign(order.step)), other, values[other])
-                there = next((good for way in ways if (good := self._on(other, way)) is not None), None)
+                there = next((good for way in ways if (good := self.allowed_in(other, *way)) is not None), None)
                 if there is None:
                     return None
                 here = here + self.space.difference(there, here)
                 path[other] = here
         return np.array([path[number] for number in range(last + 1)])
+
+    def allowed_in(self, k: int, box: Charts, place: Array) -> Array | None:
+        """The posture at a place (r,) in the box of a chart, or nearer to its middle; None where none is allowed.
+
+        Boxes end beyond the limits, by how far the set strays from them.
+        """
+        middle = (box.low[0] + box.high[0]) / 2
+        ways = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in INWARDS)
+        return next((good for way in ways if (good := self._on(k, way)) is not None), None)
 
     def _on(self, k: int, joints: Array) -> Array | None:
         """The posture of an instant next to joints, None where it leaves the limits or touches something."""
@@ -241,13 +252,22 @@ class Search:
         dearest = float(self.cost.of(np.minimum(self.limits, FARTHEST), np.diff(self.times)[:, None]).max(initial=0.0))
         while True:
             path, bound = self._best(most)
-            if most >= dearest or (path is not None and self.steps(path) <= most):
+            if most >= dearest:
                 return path, bound
-            most = dearest if path is None else self.steps(path)
+            # a motion with a step that was left out costs more than `most`
+            cost, bound = np.inf if path is None else self.steps(path), min(bound, most)
+            if path is not None and (cost <= most or bound >= self._share * cost):
+                return path, bound
+            most = dearest if path is None else cost
+
+    @property
+    def _share(self) -> float:
+        """Of what a motion's steps cost, which the bound has to reach."""
+        return 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
-        share = 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
+        share = self._share
         layers, best = self.first(most)
         if not layers:
             return None, np.inf

@@ -17,7 +17,7 @@ from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import DeadEnd, dead_end
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.planning.reconfigurations import farthest, fewest_pieces
-from ocp.planning.search import FREE, GAPS, Search
+from ocp.planning.search import FREE, Search
 from ocp.planning.steps import Squares
 from ocp.tasks.equations import TaskEquations
 
@@ -25,6 +25,10 @@ __all__ = ["TaskSearch"]
 
 STARTS = 16
 """Random starts of inverse kinematics at each instant."""
+LOST = (0.0033, 0.0033, 0.045)
+"""Share of the cost that straight steps between the instants may lose, by the directions that are free. With two each
+instant is dear: with a third as much lost, and as much more for the search, a plan took half as long again.
+"""
 INSTANTS = 4
 """Steps over the motion, at least."""
 TIGHT, AT_LIMIT = 0.9, 1e-3
@@ -80,7 +84,7 @@ class TaskSearch:
                 )
                 raise ProblemError(words, name="search", value=size, limit=FREE, time=stretch.begin)
             steps = int(np.ceil(INSTANTS * stretch.duration / asked.horizon))
-            own = instants_of(part.t, part.joints[best], asked.weights, GAPS[max(size, 0)] / 3, steps)
+            own = instants_of(part.t, part.joints[best], asked.weights, LOST[max(size, 0)], steps)
             times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
         if not times:
             words = f"the tasks have no part of {asked.horizon:g} s: the horizon is that much longer"

@@ -13,6 +13,7 @@ whose values are affine.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
@@ -113,8 +114,12 @@ class Graph:
             order = np.argsort(i, kind="stable")
             yield i[order], j[order]
 
-    def nearest(self, joints: Array, k: int, other: int, after: Values) -> Iterator[Array]:
-        """Postures of an instant to go on to from one (n,) of another, the cheapest first."""
+    def nearest(self, joints: Array, k: int, other: int, after: Values) -> Iterator[tuple[Charts, Array]]:
+        """Charts of an instant to go on to from a posture (n,) of another, the cheapest first, and where in them.
+
+        Returns:
+            Of each a chart alone, turned as the posture is, and the place in its box, (r,).
+        """
         there = self.layers[other]
         between = min(k, other)
         seconds = float(self.seconds[between])
@@ -126,7 +131,7 @@ class Graph:
         into = there.of(chosen)
         costs, places = self.cost.cheapest(delta[chosen], into, after.of(chosen), seconds)
         for i in np.argsort(costs, kind="stable")[:LOOKED].tolist():
-            yield joints + delta[chosen[i]] + into.tangents[i] @ places[i]
+            yield replace(into.of([i]), centers=joints + delta[chosen[[i]]]), places[i]
 
     def _swept(self, order: range, direction: int, rest: list[Values] | None, most: float) -> list[Values]:
         layers = self.layers

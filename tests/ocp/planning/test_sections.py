@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from models import Box, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import locked
-from ocp import DeadEnd, ProblemError, WaypointPlan, plan_waypoints
+from ocp import DeadEnd, ProblemError, Unreachable, WaypointPlan, plan_waypoints
 from ocp.planning import search, sections
 from ocp.planning.sections import APART, VALUES, values_of
 from tests.redundancy_benchmark import problem_of
@@ -72,6 +72,18 @@ def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_hel
         arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
         held = plan_waypoints(arm, *task(40), clearance=None, step=STEP)
         assert found.cost <= held.cost * (1 + 1e-6)
+
+
+def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> None:
+    machine, count = problem_of("fetch__square").machine, 40
+    places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
+    turns = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    found = plan_waypoints(machine, places, turns, clearance=None, step=STEP)
+    assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
+    for height in (0.0, 0.2, 0.38):
+        arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
+        with pytest.raises(Unreachable):
+            plan_waypoints(arm, places, turns, clearance=None, step=STEP)
 
 
 def test_back_it_is_as_long_and_heavy_it_is_dearer() -> None:

@@ -104,6 +104,29 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
 
 
+def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
+    """Where the end of the box lies beyond a limit, as it may where the set bends, nearer to its middle."""
+    _, lengths, places, weights = random_case(4)
+    search, beyond = search_of(planar(lengths, 2.0), places, Squares(weights)), 0
+    for k, charts in enumerate(search.layers):
+        for i in range(len(charts)):
+            box = charts.of([i])
+            for end in (box.low[0], box.high[0]):
+                at = box.centers + (box.tangents @ end[:, None])[:, :, 0]
+                there, good = search.instants[k].sets.corrected(np.array([k]), at)
+                found = search.allowed_in(k, box, end)
+                if found is not None:
+                    assert search.space.within(found)
+                    assert search.instants[k].sets.linearised(np.array([k]), found[None])[0] == pytest.approx(
+                        0, abs=1e-9
+                    )
+                if good[0] and search.space.within(there)[0]:
+                    assert found == pytest.approx(there[0])
+                else:
+                    beyond += found is not None
+    assert beyond > 0
+
+
 @pytest.mark.parametrize("seed", [0, 13])
 def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
@@ -127,7 +150,8 @@ def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheape
     assert every == sorted(every)
     assert told[0] <= 1.02 * search.steps(path)  # one of a few is drawn from chart to chart, not tight
     assert every[0] <= told[0] * 1.01
-    assert every[-1] > 1.3 * told[-1]
+    assert len(every) > len(told)
+    assert every[-1] > 1.1 * told[-1]
 
 
 def flat_charts(rng: np.random.Generator, count: int, scale: Array, free: int, half: float) -> Charts:
