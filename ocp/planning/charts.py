@@ -439,8 +439,7 @@ class SelfMotions:
         layer = np.repeat(charts.layer, shape[1])
         joints, good = self.corrected(layer, flat.reshape(-1, shape[2]))
         like = np.repeat(charts.tangents, shape[1], axis=0)
-        stray = self.space.length(charts.strays).max(axis=1, initial=0.0)
-        radii = np.repeat(charts.radii / 2 + stray, shape[1])  # a box is turned against that which it lies in
+        radii = self._half(charts, signs)
         whole = good.reshape(shape[:2]).all(axis=1)
         part = np.flatnonzero(np.repeat(whole, shape[1]))
         layer, joints, radii = layer[part], joints[part], radii[part]
@@ -456,6 +455,22 @@ class SelfMotions:
         none = low > high  # of a box that ends before: what is there belongs to its other side
         low, high = np.where(none, ends[0], low), np.where(none, ends[1], high)
         return Parts(together([new.of(inside), charts.of(rest)]), owners, low, high)
+
+    def _half(self, charts: Charts, signs: Array) -> Array:
+        """Radii of the parts of charts, of middles at signs (c, r) of their boxes. Shape (N c,).
+
+        Beside the middle of a part, where the set leaves the chart by Ds, a shift u in the chart is one by
+        (1 + Ds' Ds)^1/2 u in the part, whose axes are turned as little as may be, and Ds' of what the set bends within
+        it; beyond that, what it strays from the quadratic form.
+        """
+        r = charts.tangents.shape[2]
+        bends, rest = charts.bent()
+        slopes = np.einsum("knab,cb->kcna", bends * self.space.scale[:, None, None], signs)
+        lean = charts.radii[:, None] * np.sqrt((slopes**2).sum(axis=(2, 3)))
+        longer = 1 + np.sqrt(max(r, 1)) * (np.sqrt(1 + lean**2) - 1)
+        bent = self.space.length(charts.strays - rest).max(axis=1, initial=0.0) / 4
+        strays = self.space.length(rest).max(axis=1, initial=0.0)
+        return np.asarray(charts.radii[:, None] / 2 * longer + lean * bent[:, None] + strays[:, None]).ravel()
 
     def covered(self, charts: Charts, layer: Indices, joints: Array, but: Indices | None = None) -> NDArray[np.bool_]:
         """Whether postures lie in charts; of edges, in others `but` their own. Shape (M,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -150,6 +151,40 @@ def test_parts_are_of_the_charts_that_they_lie_in() -> None:
     whole = ((owners.low < 0) & (owners.high > 0)).all(axis=1) & (parts.high - parts.low > 0).all(axis=1)
     assert good.all()
     assert (np.abs(place) <= parts.charts.radii[:, None])[whole].all()
+
+
+@pytest.mark.parametrize(
+    ("machine", "task", "radius"),
+    [
+        (planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0), TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0), 0.2),
+        (planar(np.array([0.5, 0.4, 0.3])), TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0), 0.07),
+        (panda(), moved(panda(), PANDA_START, "pose"), 0.07),
+    ],
+    ids=["two", "one", "panda"],
+)
+def test_what_lies_in_a_chart_lies_in_its_parts_which_are_hardly_larger_than_half(
+    machine: FixedBase, task: TipTask, radius: float
+) -> None:
+    sets, times = sets_of(machine, task)
+    charts = sets.cover(*found(machine, task, times, 16, 0), radius, 50_000)
+    r, scale = charts.tangents.shape[2], sets.space.scale
+    wide = replace(charts, low=np.full((len(charts), r), -1e9), high=np.full((len(charts), r), 1e9))
+    parts = sets.parts(wide)
+    order = np.lexsort((*(parts.high > 1e6).T[::-1], parts.owners))
+    whole = np.flatnonzero(np.bincount(parts.owners, minlength=len(charts)) == 2**r)  # no part is beyond the limits
+    of_whole = order[np.isin(parts.owners[order], whole)].reshape(len(whole), 2**r)
+    assert parts.charts.radii.max() < 0.55 * charts.radii.max()
+    rng, owners, seen = np.random.default_rng(0), charts.of(whole), 0
+    for _ in range(10):
+        shift = rng.uniform(-1, 1, (len(whole), r)) * owners.radii[:, None]
+        on, good = sets.corrected(owners.layer, owners.centers + np.einsum("knr,kr->kn", owners.tangents, shift))
+        place = np.einsum("kn,knr->kr", (on - owners.centers) * scale, owners.tangents * scale[:, None])
+        good &= (np.abs(place) <= owners.radii[:, None]).all(axis=1)
+        own = parts.charts.of(of_whole[np.arange(len(whole)), (place > 0) @ 2 ** np.arange(r)[::-1]])
+        there = np.einsum("kn,knr->kr", (on - own.centers) * scale, own.tangents * scale[:, None])
+        assert (np.abs(there) <= own.radii[:, None])[good].all()
+        seen += int(good.sum())
+    assert seen > 5 * len(whole)
 
 
 def test_boxes_end_at_the_limits_of_the_joints() -> None:
