@@ -355,9 +355,9 @@ class Search:
                 least[i[first]], onward[i[first]] = total[first], j[first]
             cost = np.where(self._clear(here, k), least, np.inf)
             back.append(onward)
-        chart = int(cost.argmin())
-        if not np.isfinite(cost[chart]):
+        if not np.isfinite(cost).any():
             return None
+        chart = int(cost.argmin())
         path = [layers[0].centers[chart]]
         for k, onward in enumerate(reversed(back)):
             chart = int(onward[chart])

@@ -20,8 +20,8 @@ from ocp.planning.search import Search
 
 __all__ = ["Sections", "values_of"]
 
-RADIUS = 0.14
-"""rad or m, of the charts of the curves."""
+RADII = (0.07, 0.14)
+"""rad or m, of the charts of the curves at few instants, and at many."""
 APART = {True: 0.1, False: 0.6}
 """m or rad, from one value of the joint to the next, at most: of one that slides, of one that turns."""
 VALUES = 64
@@ -46,13 +46,14 @@ def values_of(slides: bool, lower: float, upper: float, far: float) -> Array:
 class Sections(Search):
     """The search for ways beside postures in which one joint has one of some values."""
 
-    def __init__(self, *told: Any, joint: int, values: Array, **more: Any) -> None:
+    def __init__(self, *told: Any, joint: int, values: Array, radius: float, **more: Any) -> None:
         """
         Args:
             told, more: As of `Search`; the instants all of one set of postures with two directions free.
             joint: The number of the joint. values: At which it is held. Shape (V,).
+            radius: Of the charts, at most.
         """
-        self._joint, self._values = joint, values
+        self._joint, self._values, self._radius = joint, values, radius
         super().__init__(*told, **more)
 
     def _cover(self, seeds: Callable[[int], Array]) -> list[Charts]:
@@ -67,7 +68,7 @@ class Sections(Search):
         layer = (own + count * np.arange(each)[:, None]).ravel()
         joints, good = self._curves.corrected(layer, np.tile(np.concatenate(found), (each, 1)))
         good &= self.space.within(joints)
-        charts = self._curves.cover(layer[good], joints[good], RADIUS, MOST)
+        charts = self._curves.cover(layer[good], joints[good], self._radius, MOST)
         return [charts.of(charts.layer % count == k) for k in range(count)]
 
     def _parts(self, charts: Charts, k: int) -> Parts:

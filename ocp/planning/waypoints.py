@@ -11,6 +11,7 @@ pieces may be asked for (see `ocp.planning.reconfigurations`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
@@ -31,7 +32,7 @@ from ocp.planning.dead_end import KINDS, dead_end
 from ocp.planning.planner import clear_of
 from ocp.planning.reconfigurations import fewest_pieces
 from ocp.planning.search import FREE, Search
-from ocp.planning.sections import RADIUS, Sections, values_of
+from ocp.planning.sections import RADII, Sections, values_of
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
 from ocp.tasks.checks import checked_numbers
@@ -54,11 +55,13 @@ STARTS = 16
 """Random starts of inverse kinematics at each of these."""
 SPARSE = (10, 5)
 """Likewise where two directions are free; the second where no way found by the first goes through all."""
+FEW = 6
+"""Steps from one waypoint that is searched to the next, where short ways are looked for."""
 INSTANTS = 20
 """Waypoints that are searched then, about, where there are so many, and more where there are many."""
-SPACED = 4 * RADIUS
+SPACED = 4 * RADII[1]
 """rad or m: how far each joint may go from one of these to the next, at least."""
-DRAWN = 3
+DRAWN = 2
 """Ways that are drawn tight then, the cheapest first."""
 WIDTH, TIGHT = 0.06, 1e-6
 """rad or m, between postures beside a way that is drawn tight, at first and at last."""
@@ -344,25 +347,34 @@ class _Ways:
         low, high = self.lower[held], self.upper[held]
         slides = robot.moving_joints[held].kind == "prismatic"
 
-        def sections(chosen: NDArray[np.intp]) -> Sections:
+        def sections(chosen: NDArray[np.intp], radius: float = RADII[1]) -> Sections:
             space, instants, times, cost, far = self._searched(chosen)
             values = values_of(slides, low, high, float(far[:, held].min()))
-            return Sections(space, instants, times, cost, far, joint=held, values=values, **self._told(chosen))
+            told = self._told(chosen)
+            return Sections(space, instants, times, cost, far, joint=held, values=values, radius=radius, **told)
 
+        # ways with short steps are seen in finer charts, at few waypoints
+        few = self._every(-(-len(self.places) // FEW))
+        with suppress(ProblemError):
+            found += [self._drawn(few, path) for path in sections(few, RADII[0]).ways()[:1]]
         # steps from one curve to the next are no shorter than between charts
         least = int(np.ceil(min(SPACED / np.delete(self.step, held).min(), len(self.places))))
         for every in SPARSE:
             search, chosen = self._begun(sections, max(min(every, len(self.places) // INSTANTS), least))
             paths, end = search.ways(), None
-            if not paths:
+            if not paths and (empty := [k for k, charts in enumerate(search.covered) if not len(charts)]):
+                at, name = float(chosen[empty[0]]), robot.joint_names[held]
+                words = f"{NONE_FOUND}: none was found at waypoint {at:g} with {name!r} where it was held"
+                end = SolveError(words, name=name, time=at)
+            elif not paths:
                 end = dead_end(search, WAYPOINT, proven=False)
                 gives = () if end is None else end.gives
                 paths = [one.joints for one in gives if one.kind in KINDS and one.amount <= MISSED]
             found += [self._drawn(chosen, path) for path in paths[:DRAWN]]
-            if not found:
-                raise end or SolveError(NONE_FOUND, name="waypoints")
             if any(not why for _, why, _ in found):
                 break
+            if not paths:
+                raise end or SolveError(NONE_FOUND, name="waypoints")
         return found
 
     def _search(self, chosen: NDArray[np.intp]) -> Search:

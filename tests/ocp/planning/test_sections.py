@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from models import Box, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import locked
-from ocp import DeadEnd, ProblemError, Unreachable, WaypointPlan, plan_waypoints
-from ocp.planning import search, sections
+from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
+from ocp.planning import search, sections, waypoints
 from ocp.planning.sections import APART, VALUES, values_of
 from tests.redundancy_benchmark import problem_of
 
@@ -123,6 +123,23 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
     assert refused.value.time is not None
     assert refused.value.time < 20 <= refused.value.until + 10
     assert "obstacle 0" in str(refused.value)
+
+
+def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
+    lifting, arm = problem_of("fetch__square"), problem_of("fetch_arm__s")
+    for problem in (lifting, arm):
+        places, turns = task(40)
+        box = Box((0.1, 0.1, 0.1), tuple(places[0]))
+        with pytest.raises(DeadEnd, match="none begins at waypoint 0"):
+            plan_waypoints(problem.machine, places, turns, step=STEP, obstacles=[box], ignored=problem.ignored)
+
+
+def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waypoints, "values_of", lambda *_: np.array([10.0]))
+    machine = problem_of("fetch__square").machine
+    with pytest.raises(SolveError, match="none was found at waypoint 0 with 'torso_lift_joint'") as refused:
+        plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+    assert (refused.value.name, refused.value.time) == ("torso_lift_joint", 0.0)
 
 
 def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: pytest.MonkeyPatch) -> None:
