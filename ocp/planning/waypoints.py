@@ -11,7 +11,6 @@ pieces may be asked for (see `ocp.planning.reconfigurations`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
@@ -354,14 +353,15 @@ class _Ways:
             return Sections(space, instants, times, cost, far, joint=held, values=values, radius=radius, **told)
 
         # ways with short steps are seen in finer charts, at few waypoints
-        few = self._every(-(-len(self.places) // FEW))
-        with suppress(ProblemError):
-            found += [self._drawn(few, path) for path in sections(few, RADII[0]).ways()[:1]]
+        search, chosen = self._begun(lambda some: sections(some, RADII[0]), -(-len(self.places) // FEW))
+        found += [self._drawn(chosen, path) for path in search.ways()[:1]]
         # steps from one curve to the next are no shorter than between charts
         least = int(np.ceil(min(SPACED / np.delete(self.step, held).min(), len(self.places))))
         for every in SPARSE:
-            search, chosen = self._begun(sections, max(min(every, len(self.places) // INSTANTS), least))
+            search, chosen = self._begun(sections, max(min(every, len(self.places) // INSTANTS), least, 1))
             paths, end = search.ways(), None
+            if not paths and any(not why for _, why, _ in found):
+                break
             if not paths and (empty := [k for k, charts in enumerate(search.covered) if not len(charts)]):
                 at, name = float(chosen[empty[0]]), robot.joint_names[held]
                 words = f"{NONE_FOUND}: none was found at waypoint {at:g} with {name!r} where it was held"

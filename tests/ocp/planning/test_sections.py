@@ -125,6 +125,27 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
     assert "obstacle 0" in str(refused.value)
 
 
+@pytest.mark.parametrize("count", [2, 5])
+def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
+    places, turns = (rows[:count] for rows in task(40))
+    machine = problem_of("fetch__square").machine
+    found = plan_waypoints(machine, places, turns, clearance=None)
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    assert np.array(tips) == pytest.approx(places, abs=1e-6)
+    assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
+
+
+def test_a_waypoint_out_of_reach_is_named_wherever_it_is_seen_first() -> None:
+    """Also among the few that short ways are looked for at, and not among the many."""
+    places, turns = task(40)
+    number = 13
+    away = places.copy()
+    away[number] += (0.0, 0.0, 3.0)
+    with pytest.raises(Unreachable, match=f"^waypoint {number} at") as refused:
+        plan_waypoints(problem_of("fetch__square").machine, away, turns, clearance=None, step=STEP)
+    assert refused.value.time == number
+
+
 def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
     lifting, arm = problem_of("fetch__square"), problem_of("fetch_arm__s")
     for problem in (lifting, arm):
