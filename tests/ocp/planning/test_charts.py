@@ -12,7 +12,7 @@ import pytest
 from models import FixedBase, Joint, Link, Robot
 from models.arrays import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
-from ocp.planning.charts import JointSpace, SelfMotions
+from ocp.planning.charts import Charts, JointSpace, SelfMotions
 from ocp.tasks.equations import bind
 from tests.ocp.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
@@ -185,6 +185,21 @@ def test_what_lies_in_a_chart_lies_in_its_parts_which_are_hardly_larger_than_hal
         assert (np.abs(there) <= own.radii[:, None])[good].all()
         seen += int(good.sum())
     assert seen > 5 * len(whole)
+
+
+def test_parts_of_a_parabola_reach_its_ends_and_hardly_farther() -> None:
+    """Of (t, bend t^2 / 2): along the tangent at half the radius its end is as far away as is told in closed form."""
+    sets, _ = sets_of(planar(np.array([0.5, 0.4, 0.3])), TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0))
+    radius, bend = 0.2, 3.0
+    sets.space.scale[:] = 1.0
+    tangents, strays = np.zeros((1, 3, 1)), np.zeros((1, 2, 3))
+    tangents[0, 0], strays[0, :, 1] = 1.0, bend * radius**2 / 2
+    ends = np.array([[-radius]]), np.array([[radius]])
+    whole = Charts(np.zeros(1, dtype=np.intp), np.zeros((1, 3)), tangents, np.array([radius]), *ends, strays)
+    lean, half = bend * radius / 2, radius / 2
+    exact = (half + lean * bend * (radius**2 - half**2) / 2) / np.sqrt(1 + lean**2)
+    for found in sets._half(whole, np.array([[-0.5], [0.5]])):
+        assert exact <= found <= 1.003 * exact
 
 
 def test_boxes_end_at_the_limits_of_the_joints() -> None:
