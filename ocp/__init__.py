@@ -22,7 +22,7 @@ from ocp.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.confirmation import certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError
+from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError, StorageWarning
 from ocp.indirect.method import Indirect
 from ocp.local.accelerations import resolve_accelerations
 from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
@@ -91,6 +91,7 @@ __all__ = [
     "StepWeights",
     "Steps",
     "StepsMotion",
+    "StorageWarning",
     "TipTask",
     "Unreachable",
     "WaypointPlan",

@@ -24,6 +24,7 @@ __all__ = [
     "ProblemError",
     "RefinementWarning",
     "SolveError",
+    "StorageWarning",
     "about",
     "check_entries",
     "checked_choice",
@@ -106,6 +107,10 @@ class AuditError(Detailed, RuntimeError):
 
 class RefinementWarning(Detailed, UserWarning):
     """A refinement that stopped where the audit does not pass; ``value`` is the share of its limit that a row is at."""
+
+
+class StorageWarning(Detailed, UserWarning):
+    """A part that a file cannot hold as data, such as a problem that calls a function of Python's."""
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -14,10 +15,11 @@ import numpy as np
 
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, floats, unknown_name
+from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, StorageWarning, floats, unknown_name
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import own_of
 from ocp.problem.problem import Problem
+from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
 from ocp.storage import read_arrays, write_arrays
 
 __all__ = [
@@ -38,7 +40,7 @@ __all__ = [
 T = TypeVar("T")
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
-VERSION = 2
+VERSION = 3
 MOST_HEAD = 2**24  # bytes of its text: a mesh of half a million intervals
 SLACK = 1e-12  # relative, of what rounding may do to times
 HEAD = {
@@ -385,15 +387,35 @@ class Solution:
         """The same solution tied to a problem, after :meth:`load`, or to None."""
         return replace(self, problem=problem, problem_lost="")
 
+    def tied_to(self, problem: Problem) -> Solution:
+        """Return the same solution tied to a problem that was read from a file.
+
+        Raises:
+            ProblemError: The problem is damaged, or has other states or controls.
+        """
+        try:
+            check_belongs(Formulation.of(problem), self)
+        except ProblemError:
+            raise
+        except DAMAGED as error:
+            raise ProblemError(f"the problem that was written is damaged: {error}", name="problem") from error
+        return self.with_problem(problem)
+
     # ---- files -----------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan and its problem as arrays, JSON and CasADi's text (no pickle) to one ``.npz`` file.
+        """Write the plan and its problem as arrays and JSON to one ``.npz`` file.
+
+        The file is data: reading it runs nothing.
 
         The file is whole or as it was before, on the disk when this returns, of the mode that it had; a link is
         followed. What a killed save of the same file left behind is removed.
 
-        A problem whose expressions CasADi cannot write, such as one that calls a function of Python, is left out.
+        A problem whose expressions are no elementary operations, such as one that calls a function of Python, is left
+        out with a warning.
+
+        Warns:
+            StorageWarning: The problem is left out, and why.
 
         Raises:
             ProblemError: path is a folder, a pipe or a device, or the plan or its head is larger than :meth:`load`
@@ -402,8 +424,11 @@ class Solution:
         """
         write_arrays(path, self.arrays(path))
 
-    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """What :meth:`save` writes to a file at ``path``, by name.
+    def arrays(self, path: str | os.PathLike[str], why_none: str = "") -> dict[str, np.ndarray]:
+        """Return what :meth:`save` writes to a file at ``path``, by name.
+
+        Args:
+            why_none: Why the file shall hold no problem; "" where it shall.
 
         Raises:
             ProblemError: The head of the plan is larger than :meth:`load` reads.
@@ -419,10 +444,12 @@ class Solution:
             head["refinement"] = self.refinement.__dict__
         if self.drawn_in is not None:
             arrays["drawn_in"] = self.drawn_in
-        head["problem"], head["problem_lost"] = self._written_problem()
-        if head["problem"] is not None:
-            function = head["problem"].pop("function")  # long, and apart from what a reader of the head looks for
-            arrays["problem"] = np.frombuffer(function.encode(), dtype=np.uint8)
+        written, head["problem_lost"] = (None, why_none) if why_none else self._written_problem()
+        if written is None and self.problem is not None and not why_none:
+            words = f"{path} is saved without its problem, so that nobody can audit it: {head['problem_lost']}"
+            warnings.warn(StorageWarning(words), stacklevel=3)
+        head["problem"], numbers = packed(written)
+        arrays |= {f"problem/{name}": values for name, values in numbers.items()}
         arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
         if arrays["head"].nbytes > MOST_HEAD:
             words = f"{path}: the settings of the plan take more than the {MOST_HEAD:.3g} bytes that are read"
@@ -433,19 +460,26 @@ class Solution:
     def load(cls, path: str | os.PathLike[str]) -> Solution:
         """Read a file written by :meth:`save`, with its problem, whose guesses by functions are left out.
 
-        Files of the first version of the format hold no problem. Open files of people you trust only: the expressions
-        of a problem are CasADi's to read.
+        The file is data. Its problem is rebuilt operation by operation, each of them checked: nothing of it is run.
 
         Raises:
             FileNotFoundError: There is no such file.
             ProblemError: The file cannot be read, is none, is larger than any plan, is of an unknown version or is not
                 whole; names the part.
         """
-        arrays = read_arrays(path)
+        return cls.of_arrays(path, read_arrays(path))
+
+    @classmethod
+    def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
+        """Return the solution whose arrays a file holds, as :meth:`load`; they are taken out of ``arrays``.
+
+        Raises:
+            ProblemError: As :meth:`load`.
+        """
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")
-            if isinstance(version, bool) or version not in (1, VERSION):
+            if isinstance(version, bool) or version != VERSION:
                 words = f"{path}: written by another version of the format ({version}, not {VERSION})"
                 raise ProblemError(words, name="version", value=version, limit=VERSION)
             order = head.pop("order")
@@ -464,12 +498,8 @@ class Solution:
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
             fields["drawn_in"] = arrays.pop("drawn_in", None)
             fields |= {name: arrays.pop(name) for name in PLAIN}
-            problem = head.pop("problem", None)
-            if problem is not None:
-                function = arrays.pop("problem").tobytes().decode()
-                fields["problem"] = Problem.restored({**problem, "function": function})
-            elif version == 1:
-                fields["problem_lost"] = "the file is of the first version, which holds none"
+            numbers = {name: arrays.pop(f"problem/{name}") for name in NUMBERS}
+            written = unpacked(head.pop("problem"), numbers)
             parts = [name for name in arrays if "/" in name]  # what else stands in the file is somebody else's
             if parts:
                 words = f"{path} holds {', '.join(parts)}, which no plan has"
@@ -477,7 +507,7 @@ class Solution:
             solution = cls(**head, **fields)
             check_structure(solution)
             check_finite(solution)
-            return solution
+            return solution if written is None else solution.tied_to(Problem.restored(written))
         except ProblemError:
             raise
         except Exception as error:  # what JSON and wrong types say is of many kinds

@@ -6,7 +6,7 @@ between the two moves them towards each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -28,10 +28,11 @@ from models.errors import ModelError
 from models.machines.machine import Machine
 from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gradients
 from models.robot.kinematics import link_frames
+from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
 from models.shapes.intervals import bounds
-from models.shapes.pairs import ALWAYS, COVERED, TOLD, checked_pairs
+from models.shapes.pairs import ALWAYS, COVERED, SRDF, TOLD, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
@@ -163,6 +164,8 @@ class Surroundings:
         folders: Where meshes are looked for.
         missing: "raise" where a mesh is missing; "skip" goes on without it, and warns.
         limits: Whether the joints keep to the robot's position limits, by which pairs are left that never touch.
+        covered: Bodies that stand for the meshes of links, as of `models.shapes.bodies.bodies_of`; from the files of
+            the meshes if None, and in either case told afterwards.
         bodies: All that is looked at: of the links, obstacles, hulls of meshes.
         pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
         covers: Of pairs of hulls, by their places, all pairs of the bodies that cover the two meshes; hulls are as far
@@ -182,6 +185,7 @@ class Surroundings:
     folders: Sequence[str | Path] = ()
     missing: MissingRule = "raise"
     limits: bool = True
+    covered: Mapping[tuple[str, int], tuple[Body, ...]] | None = None
     bodies: tuple[Placed, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
@@ -202,7 +206,8 @@ class Surroundings:
         near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
         object.__setattr__(self, "clearance", near)
         robot = self.machine.robot
-        own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing)
+        own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered)
+        object.__setattr__(self, "covered", _by_mesh(robot, own))
         links, around = self._told()
         reach: dict[str, Any] = (
             {} if checked_flag(self.limits, "surroundings", "limits") else {"lower": -np.inf, "upper": np.inf}
@@ -292,6 +297,11 @@ class Surroundings:
         own = range(len(self._carriers))
         one, other = (self._carriers[body.frame] if body.frame in own else body.name for body in placed)
         return one, other
+
+    @property
+    def disabled(self) -> list[tuple[str, str]]:
+        """Pairs of links that the SRDF file names."""
+        return [pair for pair, why in self.left.items() if why == SRDF]
 
     @property
     def moves_by_itself(self) -> bool:
@@ -472,6 +482,20 @@ def _named(bodies: Sequence[Body]) -> list[str]:
     """Names of bodies: of their links, with a number where a link has several."""
     links = [body.link for body in bodies]
     return [link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}" for k, link in enumerate(links)]
+
+
+def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
+    """The bodies that cover each mesh, by its link and its place among the collision shapes of the link."""
+    found: dict[tuple[str, int], tuple[Body, ...]] = {
+        (link.name, number): ()
+        for link in robot.links
+        for number, shape in enumerate(link.collisions)
+        if shape.kind == "mesh"
+    }
+    for body in bodies:
+        if body.mesh is not None:
+            found[body.link, body.mesh.number] += (body,)
+    return found
 
 
 def _listed(values: Any, what: str) -> tuple[Any, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias, get_args
@@ -38,9 +38,11 @@ class LinkMesh:
 
     Attributes:
         points: Its corners, in the frame of the link. Shape (n, 3), m.
+        number: Its place among the collision shapes of the link.
     """
 
     points: Array
+    number: int = 0
 
     @cached_property
     def hull(self) -> Mesh:
@@ -79,7 +81,13 @@ class Body:
         object.__setattr__(self, "overhang", checked_nonnegative(self.overhang, owner, "overhang", "m"))
 
 
-def bodies_of(robot: Robot, *, folders: Folders = (), missing: MissingRule = "raise") -> tuple[Body, ...]:
+def bodies_of(
+    robot: Robot,
+    *,
+    folders: Folders = (),
+    missing: MissingRule = "raise",
+    covered: Mapping[tuple[str, int], Sequence[Body]] | None = None,
+) -> tuple[Body, ...]:
     """The bodies of a robot's links, from their collision shapes, in the order of the links.
 
     Boxes, spheres and capsules stay what they are. A cylinder becomes a capsule around it, of which distances are exact
@@ -90,6 +98,8 @@ def bodies_of(robot: Robot, *, folders: Folders = (), missing: MissingRule = "ra
         folders: Where meshes are looked for before the folder of the URDF file and those above it; see
             `models.shapes.mesh_files.find_mesh`.
         missing: What to do about a mesh that is not found or not read: "raise", or "skip" it with a warning.
+        covered: Bodies in place of meshes, by the link and the place among its collision shapes; those without any are
+            skipped, and no file is opened. None: meshes are read and covered.
 
     Raises:
         ModelError: A mesh that is missing or broken, named with its link; a robot, folder or rule that is none.
@@ -106,12 +116,20 @@ def bodies_of(robot: Robot, *, folders: Folders = (), missing: MissingRule = "ra
     found: list[Body] = []
     skipped: dict[str, str] = {}
     for link in robot.links:
-        for shape in link.collisions:
+        for number, shape in enumerate(link.collisions):
             if shape.kind != "mesh":
                 found.append(_simple(link, shape))
                 continue
+            if covered is not None:
+                if (link.name, number) not in covered:
+                    message = f"link {link.name!r}: nothing covers its mesh {shape.file!r}"
+                    raise ModelError(message, name=link.name, value=shape.file)
+                found += covered[link.name, number]
+                if not covered[link.name, number]:
+                    skipped[f"{link.name}: {shape.file}"] = f"{shape.file!r} of link {link.name!r} was skipped before"
+                continue
             try:
-                covers, mesh = _covers(link, shape, folders)
+                covers, mesh = _covers(link, shape, number, folders)
             except ModelError as error:
                 if missing == "raise":
                     raise
@@ -165,7 +183,7 @@ def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, fl
     return float(volumes[k]), (wide, float(lengths[k])), wide + float(lengths[k]) / 2 - length / 2
 
 
-def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[Cover, ...], LinkMesh]:
+def _covers(link: Link, shape: CollisionShape, number: int, folders: Folders) -> tuple[tuple[Cover, ...], LinkMesh]:
     """Of a mesh, scaled, in the axes of the shape; and the mesh in the frame of the link."""
     path = find_mesh(shape.file, shape.folder or None, folders)
     if path is None:
@@ -178,7 +196,7 @@ def _covers(link: Link, shape: CollisionShape, folders: Folders) -> tuple[tuple[
         vertices, faces = read_mesh(path)
         scaled = _scaled(vertices, shape)
         points = scaled[np.unique(faces)] @ shape.rotation.T + shape.translation
-        return cover(scaled, faces), LinkMesh(np.asarray(points))
+        return cover(scaled, faces), LinkMesh(np.asarray(points), number)
     except ModelError as error:
         raise ModelError(
             f"link {link.name!r}: {error}", name=error.name, value=error.value, limit=error.limit

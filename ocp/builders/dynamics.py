@@ -44,7 +44,7 @@ from ocp.errors import (
     floats,
     unknown_name,
 )
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, remembers_request
 from ocp.tasks.checks import (
     check_length,
     check_rest,
@@ -275,6 +275,7 @@ def _require_momentum(machine: FreeFloating, base: Any, wrenches: Sequence[Wrenc
 
 
 @interruptible
+@remembers_request("dynamics")
 def dynamics_problem(
     machine: Motors,
     start_joints: Any,

@@ -14,7 +14,7 @@ from models.arrays import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import Nearest
 from ocp.builders.clearance import APART, LOOKS, Clear
-from ocp.builders.tool_motion import CLOCK, ToolMotion, tool_motion_problem
+from ocp.builders.tool_motion import CLOCK, ToolMotion
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
@@ -32,6 +32,7 @@ from ocp.planning.postures import (
     others_told,
     touches_at_the_start,
 )
+from ocp.planning.request import declared_motion
 from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
@@ -306,19 +307,7 @@ class Maker:
 
     def declared(self, start: Array, clear: Clear | None) -> ToolMotion:
         """The problem from a start, nan where it is free."""
-        asked = self.asked
-        return tool_motion_problem(
-            asked.machine,
-            asked.stretches,
-            base=asked.base,
-            start=start,
-            reference=self.reference,
-            cyclic=asked.cyclic,
-            weights=asked.weights,
-            bounds=asked.bounds,
-            time_cost=asked.time_cost,
-            clear=clear,
-        )
+        return declared_motion(self.asked, start=start, reference=self.reference, clear=clear)
 
     def made(self, clear: Clear | None, fine: bool, cost: float = np.inf) -> tuple[ToolMotion, Collocation, Prepared]:
         """The problem with some bodies held apart, a mesh for it, and both prepared for guesses of about a cost."""

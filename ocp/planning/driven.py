@@ -17,11 +17,12 @@ from models.arrays import Array
 from ocp.builders.clearance import Clear
 from ocp.builders.dynamics import checked_motors, joint_torques
 from ocp.builders.dynamics_plan import within_limits
-from ocp.builders.tool_motion import ToolMotion, tool_motion_problem
+from ocp.builders.tool_motion import ToolMotion
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.planning.motion import Candidate, Plan
 from ocp.planning.postures import Asked
+from ocp.planning.request import declared_motion
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tasks.limits import Limits
@@ -157,24 +158,12 @@ def _brief(error: SolveError) -> str:
 
 def _solved(asked: Asked, start: Array | None, reference: Array, moved: Plan, limits: Limits) -> Solution:
     """A motion within the limits, from one without; judged from its own start where many are as good."""
-    bounds = limits.bounds(asked.machine)
     if asked.start is None and start is not None:
         # a joint that began elsewhere is not ignorable: bodies are held apart by it
         start = np.where(np.abs(moved.at(0.0)["joints"] - start) <= SAME_PLACE, start, np.nan)
 
     def declared(begin: Array | None, clear: Clear | None) -> ToolMotion:
-        return tool_motion_problem(
-            asked.machine,
-            asked.stretches,
-            base=asked.base,
-            start=begin,
-            reference=reference,
-            cyclic=asked.cyclic,
-            weights=asked.weights,
-            bounds=bounds,
-            driven=True,
-            clear=clear,
-        )
+        return declared_motion(asked, start=begin, reference=reference, clear=clear, limits=limits)
 
     def planned(begin: Array | None) -> Solution:
         def declare(clear: Clear | None) -> Problem:

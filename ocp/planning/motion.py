@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -13,17 +14,19 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import Machine
+from models import Machine, ModelError
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
+from ocp.audit.audit import Finding
 from ocp.audit.clearance import Nearest
 from ocp.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_positive, floats, unknown_name
+from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, StorageWarning, checked_positive, floats, unknown_name
 from ocp.local.touching import Touch
-from ocp.planning.machines import machine_of, written_machine
+from ocp.planning.request import MotionRequest, request_of, restored_request, stored_request
+from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
 from ocp.schedule.trajectory import JointTrajectory
-from ocp.solution import Solution
+from ocp.solution import Solution, read_head
 from ocp.storage import read_arrays, write_arrays, write_text
 from ocp.tasks.targets import Target, targets_along
 from ocp.tasks.tip_task import TipTask
@@ -36,6 +39,10 @@ MOST_LINES = 15
 HALVINGS = 52
 ASKED = 401
 """Times at which it is kept what tasks ask for."""
+ACCURACY = 1e-3
+"""Share of its limit by which a joint may pass it, as in the audit."""
+CHECKED_TIMES = 2001
+"""Times, beside those of the plan, at which joints are held against the limits of their machine."""
 SLACK = 1e-9
 """Of the horizon: times beyond it by less are its ends."""
 
@@ -189,13 +196,43 @@ class Plan:
             t, at["joints"], at["rates"], self._over(t, self._accelerations), self._tips(bases, at["joints"])
         )
 
+    @property
+    def request(self) -> MotionRequest | None:
+        """What was asked, from which the problem can be declared again; None of a problem of one's own."""
+        return request_of(self.solution.problem)
+
     @interruptible
     def audit(self, **settings: Any) -> Any:
-        """Check the motion independently of what made it; see `ocp.audit.audit.audit`. Done once for each setting."""
+        """Check the motion independently of what made it; see `ocp.audit.audit.audit`. Done once for each setting.
+
+        A plan without a `request` is also held against the limits of its own machine, for nobody knows what those of
+        its problem stand for.
+        """
         key = repr(sorted(settings.items()))
         if key not in self._audits:
-            self._audits[key] = self.solution.audit(**settings)
+            audit = self.solution.audit(**settings)
+            if self.request is None:
+                audit = replace(audit, findings=(*audit.findings, *self._against_machine()))
+            self._audits[key] = audit
         return self._audits[key]
+
+    def _against_machine(self) -> list[Finding]:
+        """How far joints are beyond the limits of the machine, where they are most."""
+        robot, t = self.machine.robot, np.union1d(self.t, np.linspace(0.0, self.horizon, CHECKED_TIMES))
+        at, findings = self.at(t), list[Finding]()
+        for name, values, lower, upper in (
+            ("joints", at["joints"], robot.lower, robot.upper),
+            ("rates", at["rates"], -robot.velocity, robot.velocity),
+        ):
+            excess = np.maximum(values - upper, lower - values)
+            row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            size = max(abs(float(lower[joint])), abs(float(upper[joint])))
+            unit = ("rad", "m")[robot.moving_joints[joint].kind == "prismatic"] + ("/s" if name == "rates" else "")
+            label = f"{name} of the machine, {self.names[joint]!r}"
+            value = max(float(excess[row, joint]), 0.0)
+            limit = ACCURACY * (size if np.isfinite(size) else 1.0)
+            findings.append(Finding(label, value, limit, float(t[row]), unit=unit))
+        return findings
 
     @property
     def audits(self) -> tuple[Any, ...]:
@@ -266,52 +303,78 @@ class Plan:
     # ---- files -------------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan with its machine and its problem to one `.npz` file, whole or not at all, without pickle.
+        """Write the plan to one `.npz` file, whole or not at all. The file is data: reading it runs nothing.
+
+        It holds what was asked, from which `load` declares the problem again; of a problem of one's own its machine and
+        its expressions, operation by operation.
 
         Raises:
             ProblemError, OSError: As `Solution.save`; a machine that is none of models'.
+
+        Warns:
+            StorageWarning: A part of the request is no data, such as a callback of Python's, so that the problem is
+                written in its place; or the problem cannot be written, either.
         """
-        told = {
-            "machine": written_machine(self.machine),
-            "parts": self.parts,
-            "bound": self.bound,
-            "candidates": [[c.start.tolist(), c.cost, c.why] for c in self.candidates],
-        }
-        text = json.dumps(told).encode()
-        targets = {
-            f"target.{k}": np.column_stack([one.t, one.position, one.rotation.reshape(-1, 9)])
-            for k, one in enumerate(self.targets)
-        }
-        arrays = {**self.solution.arrays(path), **targets, "plan": np.frombuffer(text, dtype=np.uint8)}
-        write_arrays(path, arrays)
+        try:
+            request, why_none = stored_request("", {"machine": self.machine}), ""
+        except ProblemError as error:
+            words = f"the machine cannot be written to a file: {error}; save the plan's solution alone"
+            raise ProblemError(words, name="machine", value=error.value) from error
+        if self.request is not None and self.request.machine is self.machine:
+            try:
+                request = stored_request(self.request.builder, self.request.arguments)
+                why_none = "it is declared again from what the plan was asked: read the file with Plan.load"
+            except ProblemError as error:
+                words = f"{path} is saved without what was asked, by the problem alone: {error}"
+                warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
+        told, numbers = packed(
+            {
+                "request": request,
+                "parts": self.parts,
+                "bound": self.bound,
+                "candidates": [[c.start.tolist(), c.cost, c.why] for c in self.candidates],
+                "targets": [np.column_stack([o.t, o.position, o.rotation.reshape(-1, 9)]) for o in self.targets],
+            }
+        )
+        arrays = {**self.solution.arrays(path, why_none), "plan": np.frombuffer(json.dumps(told).encode(), np.uint8)}
+        write_arrays(path, {**arrays, **{f"plan.{name}": values for name, values in numbers.items()}})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
         """Read a file that `save` wrote. Of the candidates only the plan has its solution.
 
+        The problem is declared again from what was asked, by the code that plans, so that the audit holds the motion
+        against the machine, limits, tasks and obstacles of the request. What the file says of its bound and of other
+        candidates is told as it stands there.
+
         Raises:
             FileNotFoundError, ProblemError: As `Solution.load`; a file that is no plan's.
         """
-        solution = Solution.load(path)
         arrays = read_arrays(path)
+        solution = Solution.of_arrays(path, arrays)
         if "plan" not in arrays:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
             raise ProblemError(words, name="path", value=str(path))
         try:
-            told = json.loads(arrays["plan"].tobytes())
+            told = unpacked(read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in NUMBERS})
+            request = restored_request(told["request"])
+            if request.builder:
+                solution = solution.tied_to(request.problem())
             parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in told["parts"])
             candidates = tuple(
                 Candidate(np.array(start, dtype=float), float(cost), str(why), None if why else solution)
                 for start, cost, why in told["candidates"]
             )
             bound = None if told["bound"] is None else float(told["bound"])
-            stored = [arrays[name] for name in arrays if name.startswith("target.")]
-            targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in stored)
-            made = cls(machine_of(told["machine"]), solution, parts, candidates, bound, targets)
-            made._check_parts()
-            return made
-        except (*NOT_NUMBERS, KeyError, AttributeError, IndexError) as error:
-            raise ProblemError(f"{path}: the plan in it is damaged: {error}", name="plan", value=str(path)) from error
+            targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in told["targets"])
+            plan = cls(request.machine, solution, parts, candidates, bound, targets)
+            plan._check_parts()
+            return plan.with_targets(request.tasks) if request.builder and targets else plan
+        except (*DAMAGED, ModelError) as error:
+            name = getattr(error, "name", None) or "plan"
+            raise ProblemError(
+                f"{path}: the plan in it is damaged: {error}", name=str(name), value=str(path)
+            ) from error
 
     def trajectory(self, period: float) -> JointTrajectory:
         """The joints every `period` s, as a trajectory of joints."""

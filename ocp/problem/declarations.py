@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from ocp.errors import ProblemError
 from ocp.problem.separation import Separation
 
 __all__ = ["ENDS", "Constraint", "Declarations", "Guess", "Horizon", "PhaseTimes", "Signal", "Variable"]
@@ -152,6 +154,60 @@ class Declarations:
     running: Any = None
     terminal: Any = None
 
+    def check(self, symbols: Any) -> None:
+        """Raise ProblemError, which names the part, where declarations that were read from a file do not fit together.
+
+        Args:
+            symbols: ``casadi.SX`` or ``casadi.MX``, of which every expression is made.
+        """
+
+        def require(holds: bool, what: str) -> None:
+            if not holds:
+                raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
+
+        def column(value: Any, size: int, what: str) -> None:
+            require(isinstance(value, symbols) and value.shape == (size, 1), what)
+
+        for pool, kind in PART_KINDS.items():
+            for name, part in getattr(self, pool).items():
+                require(isinstance(part, kind) and isinstance(name, str) and part.name == name, f"{pool}: {name!r}")
+        columns = {"parameters": ["symbol"], "controls": ["symbol", "lower", "upper"]}
+        columns["states"] = [*columns["controls"], *ENDS]
+        for pool, needed in columns.items():
+            for name, one in getattr(self, pool).items():
+                what, n = f"{pool[:-1]} {name!r}", int(np.prod(one.symbol.shape))
+                for part in needed:
+                    column(getattr(one, part), n, what)
+                for value, sizes in ((one.guess, (1, n)), (one.scale, (n,))):
+                    require(value is None or np.asarray(value, dtype=float).size in sizes, what)
+                require(isinstance(one.unit, str), what)
+        for name, rate in self.dynamics.items():
+            require(name in self.states, f"dynamics of {name!r}")
+            column(rate, self.states[name].size, f"dynamics of {name!r}")
+        for name, symbol in self.at_start.items():
+            require(name in self.states or name in self.controls, f"start of {name!r}")
+            column(symbol, {**self.states, **self.controls}[name].size, f"start of {name!r}")
+        for signal in self.signals.values():
+            shape = isinstance(signal.function, ca.Function) and (signal.function.n_in(), signal.function.size_in(0))
+            require(shape == (1, (1, 1)) and signal.function.numel_out(0) == signal.size, f"signal {signal.name!r}")
+        for one in (*self.path.values(), *self.start.values(), *self.end.values(), *self.watch.values()):
+            for value in (one.expression, one.lower, one.upper, *(() if one.way is None else (one.way,))):
+                column(value, one.size, f"constraint {one.name!r}")
+            require(isinstance(one.unit, str) and isinstance(one.integral, bool), f"constraint {one.name!r}")
+        for apart in self.apart.values():
+            movers = {name: self.states[name].size for name in apart.movers if name in self.states}
+            require(movers == apart.movers and isinstance(apart.placements, symbols), f"separation {apart.name!r}")
+        for phase in self.phases.values():
+            for value in (phase.begin, phase.duration, phase.running, phase.terminal):
+                column(value, 1, f"phase {phase.name!r}")
+        if self.horizon is not None:
+            require(isinstance(self.horizon, Horizon) and isinstance(self.horizon.fixed, bool), "horizon")
+            for value in (self.horizon.symbol, self.horizon.lower, self.horizon.upper):
+                column(value, 1, "horizon")
+            require(self.horizon.guess is None or np.isfinite(float(self.horizon.guess)), "horizon")
+        for value in (self.running, self.terminal):
+            require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
+
     def __str__(self) -> str:
         """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
         lines = ["  horizon      not declared" if self.horizon is None else f"  horizon      {self.horizon}"]
@@ -168,6 +224,15 @@ class Declarations:
         if self.running is not None:
             lines.append(f"  minimize     integral of {short(self.running)} dt + {short(self.terminal)}")
         return "\n".join(lines)
+
+
+PART_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("states", "controls", "parameters"), Variable),
+    **dict.fromkeys(("path", "start", "end", "watch"), Constraint),
+    "signals": Signal,
+    "apart": Separation,
+    "phases": PhaseTimes,
+}
 
 
 def column_text(value: Any) -> str:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import wraps
-from typing import Any, TypeVar, cast
+from inspect import signature
+from typing import Any, ParamSpec, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -32,11 +33,12 @@ from ocp.problem.values import (
     table,
 )
 
-__all__ = ["Problem", "checked_problem"]
+__all__ = ["Problem", "checked_problem", "remembers_request"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
 RESERVED = ("t", "time", "horizon")
 Declare = TypeVar("Declare", bound=Callable[..., Any])
+Given = ParamSpec("Given")
 
 
 def _about_its_name(method: Declare) -> Declare:
@@ -55,6 +57,21 @@ def checked_problem(problem: Any) -> Problem:
     if not isinstance(problem, Problem):
         raise ProblemError(f"a Problem is expected, not {type(problem).__name__}", name="problem", value=problem)
     return problem
+
+
+def remembers_request(builder: str) -> Callable[[Callable[Given, Problem]], Callable[Given, Problem]]:
+    """Let the problems of a builder remember its name and arguments, from which they can be declared again."""
+
+    def decorate(declare: Callable[Given, Problem]) -> Callable[Given, Problem]:
+        @wraps(declare)
+        def declared(*args: Given.args, **kwargs: Given.kwargs) -> Problem:
+            problem = declare(*args, **kwargs)
+            problem.origin = builder, signature(declare).bind(*args, **kwargs).arguments
+            return problem
+
+        return declared
+
+    return decorate
 
 
 class Problem:
@@ -80,30 +97,32 @@ class Problem:
         self.time = symbols.sym("time")
         self.declared = Declarations()
         self.formulated: Any = None  # see ocp.problem.formulation.Formulation.of
+        self.origin: Any = None  # the builder that declared it and its arguments, see `remembers_request`
 
     # ---- copies and files ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Expressions as CasADi writes them, so that a problem can be pickled; guesses that are functions are left.
+        """Return the problem as data, see :mod:`ocp.problem.stored`. Guesses that are functions are left out.
 
         Raises:
-            ProblemError: CasADi cannot write an expression, such as one that calls a function of Python.
+            ProblemError: An expression calls what is no elementary operation, such as a function of Python's.
         """
         return stored(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """The same of what :meth:`__getstate__` gave, with symbols of its own.
+        """Restore what :meth:`__getstate__` returned, with new symbols.
 
         Raises:
-            ProblemError: It is something else.
+            ProblemError: The record is damaged.
         """
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = restored(state, kinds)
-        self.formulated = None
+        self.declared.check(self.symbols)
+        self.formulated = self.origin = None
 
     @classmethod
     def restored(cls, state: dict[str, Any]) -> Problem:
-        """A problem of what :meth:`__getstate__` gave."""
+        """Return the problem of which :meth:`__getstate__` returned the state."""
         problem = cls.__new__(cls)
         problem.__setstate__(state)
         return problem

@@ -1,10 +1,8 @@
-"""A problem as numbers, text and bytes: its expressions as CasADi writes a function of all its symbols. No pickle."""
+"""A problem as data: names, numbers, and its expressions as functions written by elementary operations."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -12,24 +10,39 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
+from ocp.problem.function_reader import FunctionReader
+from ocp.problem.function_writer import FunctionWriter
 
-__all__ = ["restored", "stored"]
+__all__ = ["DAMAGED", "NUMBERS", "packed", "restored", "stored", "unpacked"]
 
-FUNCTIONS = {"SX": (ca.SX, "SXFunction"), "MX": (ca.MX, "MXFunction")}
+SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
+DAMAGED = (
+    AttributeError, IndexError, KeyError, NotImplementedError, OverflowError, RecursionError, RuntimeError, TypeError,
+    ValueError,
+)  # fmt: skip
+"""What it raises to build something of data that has another form than was written."""
+ARRAYS = {"i": "integers", "f": "numbers"}
+NUMBERS = tuple(ARRAYS.values())
+"""Names of the arrays that a record is packed into."""
+
+
+# ---- a problem ---------------------------------------------------------------------------------------------------
 
 
 def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
-    """What JSON can hold, ``function`` being CasADi's text. Guesses that are functions are left out.
+    """Return a record of names, numbers and arrays. Guesses that are functions are left out.
 
     Args:
-        name: Of the problem. symbols: ``casadi.SX`` or ``casadi.MX``. time: Its symbol.
-        declared: A dataclass of expressions, values, dictionaries and dataclasses of such, whatever it has. What is
-            called ``symbol``, and what stands in ``at_start``, are symbols; all else is made of them.
+        name: Name of the problem.
+        symbols: ``casadi.SX`` or ``casadi.MX``.
+        time: Its symbol of time.
+        declared: A dataclass of expressions, values, dictionaries and dataclasses of such. What is called ``symbol``,
+            and what stands in ``at_start``, are symbols; all other expressions are made of them.
 
     Raises:
-        ProblemError: CasADi cannot write an expression.
+        ProblemError: An expression calls what is no elementary operation, such as a function of Python's.
     """
-    inputs, outputs = [time], list[Any]()
+    inputs, outputs, writer = [time], list[Any](), FunctionWriter()
 
     def put(value: Any, is_symbol: bool = False) -> Any:
         if is_symbol:
@@ -39,10 +52,10 @@ def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
             outputs.append(value)
             return {"output": len(outputs) - 1}
         if isinstance(value, ca.Function):
-            return {"function": value.serialize()}
+            return {"function": writer.write(value)}
         if value is None or callable(value):
             return None
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             return {"pool": [[key, put(item)] for key, item in value.items()]}
         if is_dataclass(value):
             parts = {f.name: getattr(value, f.name) for f in fields(value)}
@@ -54,55 +67,48 @@ def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
             return {"kind": type(value).__name__, "fields": inside}
         if isinstance(value, str | bool | int | float):
             return value
-        return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).tolist()
+        return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
 
-    record = {"name": name, "symbols": symbols.__name__, "declared": put(declared)}
     try:
-        record["function"] = ca.Function("problem", inputs, outputs).serialize()
-        ca.Function.deserialize(record["function"])  # a function of Python's is written, but cannot be read
-    except (RuntimeError, NotImplementedError) as error:
+        record = {"name": name, "symbols": symbols.__name__, "declared": put(declared)}
+        record["expressions"] = writer.write(ca.Function("expressions", inputs, outputs))
+    except (ProblemError, RuntimeError) as error:
         words = f"problem {name!r} cannot be written: {str(error).strip().splitlines()[-1]}"
         raise ProblemError(words, name=name) from error
-    return {**record, "digest": digest(record)}
+    return {**record, "functions": writer.records}
 
 
-def restored(record: dict[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
-    """Name, kind of symbols, the symbol of time and all declarations, with new symbols.
+def restored(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
+    """Return the name, the kind of symbols, the symbol of time and all declarations, with new symbols.
 
     Args:
-        record: What :func:`stored` gave. kinds: The dataclasses that stand in it.
+        record: As :func:`stored` returns it, from wherever. Nothing in it is trusted.
+        kinds: The dataclasses that may stand in it.
 
     Raises:
         ProblemError: The record is damaged.
     """
     try:
         return _restored(record, {kind.__name__: kind for kind in kinds})
-    except (AttributeError, KeyError, IndexError, TypeError, ValueError, RuntimeError, NotImplementedError) as error:
+    except (*DAMAGED, ProblemError) as error:
         raise ProblemError(f"the problem that was written is damaged: {error}", name="problem") from error
 
 
-def _restored(record: dict[str, Any], kinds: dict[str, type]) -> tuple[str, Any, Any, Any]:
-    if digest({key: value for key, value in record.items() if key != "digest"}) != record["digest"]:
-        raise ValueError("it is not what was written")
-    symbols, kind_of_function = FUNCTIONS[record["symbols"]]
-    function = ca.Function.deserialize(record["function"])
-    if not function.is_a(kind_of_function):
-        raise ValueError(f"it is no {kind_of_function}")
+def _restored(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
+    symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
+    expressions = functions[record["expressions"]]
     time = symbols.sym("time")
-    inputs = [time, *(None for _ in range(function.n_in() - 1))]
+    inputs: list[Any] = [time] + [None] * (expressions.n_in() - 1)
+    for written in _symbols_in(record["declared"]):
+        if inputs[written["input"]] is not None or not isinstance(written["name"], str):
+            raise ValueError(f"symbol {written['input']} stands twice in it")
+        size = expressions.size_in(written["input"])
+        if size != (written["size"], 1):
+            raise ValueError(f"symbol {written['name']!r} has {written['size']} entries, its place {size}")
+        inputs[written["input"]] = symbols.sym(written["name"], size[0])
+    outputs = expressions.call(inputs, True, False)
 
-    def find(value: Any) -> None:
-        """Make the symbols."""
-        if isinstance(value, dict) and "input" in value:
-            inputs[value["input"]] = symbols.sym(value["name"], value["size"])
-        elif isinstance(value, dict):
-            for part in value.values():
-                find(part)
-        elif isinstance(value, list):
-            for part in value:
-                find(part)
-
-    def got(value: Any) -> Any:
+    def read(value: Any) -> Any:
         if not isinstance(value, dict):
             return value
         if "input" in value:
@@ -110,22 +116,64 @@ def _restored(record: dict[str, Any], kinds: dict[str, type]) -> tuple[str, Any,
         if "output" in value:
             return outputs[value["output"]]
         if "function" in value:
-            return ca.Function.deserialize(value["function"])
+            return functions[value["function"]]
         if "pool" in value:
-            return {key: got(item) for key, item in value["pool"]}
-        return kinds[value["kind"]](**{key: got(part) for key, part in value["fields"].items()})
+            return {key: read(item) for key, item in value["pool"]}
+        return kinds[value["kind"]](**{key: read(part) for key, part in value["fields"].items()})
 
-    find(record["declared"])
-    outputs = function.call(inputs, True, False)
-    return str(record["name"]), symbols, time, got(record["declared"])
+    return str(record["name"]), symbols, time, read(record["declared"])
+
+
+def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
+    """The records of symbols in what was declared."""
+    if isinstance(value, dict) and "input" in value:
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _symbols_in(part)
 
 
 def symbol_name(symbol: Any) -> str:
-    """The name that a symbol was made with."""
+    """Return the name that a symbol was made with."""
     first = str(ca.symvar(symbol)[0].name())
     return first.rpartition("_")[0] if isinstance(symbol, ca.SX) and symbol.numel() > 1 else first
 
 
-def digest(record: dict[str, Any]) -> str:
-    """What changes when anything of a record does."""
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+# ---- records in files of arrays ----------------------------------------------------------------------------------
+
+
+def packed(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return what JSON can hold of a record, and its arrays, one behind the other, by the kind of their numbers."""
+    gathered: dict[str, list[np.ndarray]] = {name: [] for name in NUMBERS}
+    lengths = dict.fromkeys(gathered, 0)
+
+    def pack(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            name = ARRAYS[value.dtype.kind]
+            gathered[name].append(value.ravel())
+            lengths[name] += value.size
+            return {"array": name, "begin": lengths[name] - value.size, "shape": list(value.shape)}
+        if isinstance(value, dict):
+            return {key: pack(part) for key, part in value.items()}
+        return [pack(part) for part in value] if isinstance(value, list | tuple) else value
+
+    told = pack(record)
+    empty = {"integers": np.zeros(0, dtype=np.int64), "numbers": np.zeros(0)}
+    return told, {name: np.concatenate([empty[name], *parts]) for name, parts in gathered.items()}
+
+
+def unpacked(told: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the record of which :func:`packed` returned these parts.
+
+    Raises:
+        ValueError, KeyError, TypeError: They are damaged.
+    """
+    if isinstance(told, dict) and told.get("array") in NUMBERS:
+        shape, begin = [int(size) for size in told["shape"]], int(told["begin"])
+        size = int(np.prod(shape, dtype=object))
+        if begin < 0 or min(shape, default=0) < 0 or begin + size > arrays[told["array"]].size:
+            raise ValueError("an array lies outside the numbers of the file")
+        return arrays[told["array"]][begin : begin + size].reshape(shape)
+    if isinstance(told, dict):
+        return {key: unpacked(part, arrays) for key, part in told.items()}
+    return [unpacked(part, arrays) for part in told] if isinstance(told, list) else told

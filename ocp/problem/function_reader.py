@@ -1,0 +1,308 @@
+"""CasADi functions read from data: lists of elementary operations, checked one by one before a function is built.
+
+A function is a list of scalar operations in which each may use the results of those before it. It may call functions
+that stand before it, so that no chain of calls closes. What is no scalar arithmetic (a look-up table, a spline, an
+interpolant, a linear solve, an integrator) stands there by the numbers that define it. Nothing of a record reaches
+CasADi's own reader of serialised functions, which can load libraries and run a compiler.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+
+__all__ = ["FunctionReader"]
+
+UNARY = (
+    "NEG", "EXP", "LOG", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "NOT", "FLOOR", "CEIL",
+    "FABS", "SIGN", "ERF", "INV", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH", "ERFINV", "LOG1P", "EXPM1",
+)  # fmt: skip
+BINARY = (
+    "ADD", "SUB", "MUL", "DIV", "POW", "CONSTPOW", "LT", "LE", "EQ", "NE", "AND", "OR", "FMOD", "COPYSIGN",
+    "IF_ELSE_ZERO", "FMIN", "FMAX", "ATAN2", "HYPOT", "REMAINDER",
+)  # fmt: skip
+STRUCTURAL = ("INPUT", "CONSTANT", "CALL", "RESULT")
+OPERATIONS = (*STRUCTURAL, *UNARY, *BINARY)
+"""The names of the operations. Files hold places in this list: append new operations, never reorder them."""
+INPUT, CONSTANT, CALL, RESULT = range(len(STRUCTURAL))
+CODES = [getattr(ca, f"OP_{name}") for name in OPERATIONS[len(STRUCTURAL) :]]
+PLACES = {code: place for place, code in enumerate(CODES, len(STRUCTURAL))}
+FIRST_BINARY = len(STRUCTURAL) + len(UNARY)
+
+MAX_OPERATIONS = 2**20
+"""Operations in all functions of a file; an operation takes about 5 microseconds and 200 bytes to rebuild."""
+MAX_WORK = 2**26
+"""Operations of one evaluation with all the calls in it: a short file can call functions that call functions."""
+MAX_ENTRIES = 2**20
+"""Entries of an argument or a result."""
+MAX_DIMENSIONS = 6
+"""Dimensions of a table that is interpolated."""
+MAX_DEGREE = 9
+"""Degree of a spline."""
+INTEGRATORS = {"RungeKutta": "rk", "Collocation": "collocation", "CvodesInterface": "cvodes", "IdasInterface": "idas"}
+INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
+    "number_of_finite_elements": ("FixedStepIntegrator::nk_target", int),
+    "interpolation_order": ("Collocation::deg", int),
+    "abstol": ("SundialsInterface::abstol", float),
+    "reltol": ("SundialsInterface::reltol", float),
+    "max_num_steps": ("SundialsInterface::max_num_steps", int),
+}
+"""Options of integrators that are kept, and what CasADi's debugging output calls them."""
+
+
+class FunctionReader:
+    """Builds the functions of records, and refuses what a `FunctionWriter` cannot have written.
+
+    Args:
+        records: As of a `FunctionWriter`, from wherever. Nothing in them is trusted.
+
+    Attributes:
+        functions: One for each record, as CasADi Functions.
+
+    Raises:
+        ProblemError: An operation, a place, a size or a number that cannot be; more operations than are read, in the
+            file or in one evaluation.
+    """
+
+    def __init__(self, records: Sequence[Mapping[str, Any]]) -> None:
+        self.functions: list[Any] = []
+        self._work: list[int] = []
+        total = sum(len(record["rows"]) for record in records if record.get("kind") == "operations")
+        if total + len(records) > MAX_OPERATIONS:
+            raise ProblemError(f"{total} operations, at most {MAX_OPERATIONS} are read", name="rows", value=total)
+        for number, record in enumerate(records):
+            kind = record["kind"]
+            if kind == "operations":
+                function, work = self._rebuilt(record, f"stored_{number}")
+            elif kind in BUILDERS:
+                function, work = BUILDERS[kind](record, self.functions), MAX_ENTRIES if kind == "integrator" else 1
+            else:
+                raise ProblemError(f"functions of kind {kind!r} are not known", name="kind", value=kind)
+            if work > MAX_WORK:
+                words = f"function {number} takes {work} operations, at most {MAX_WORK} are accepted"
+                raise ProblemError(words, name="rows", value=work, limit=MAX_WORK)
+            self.functions.append(function)
+            self._work.append(work)
+
+    def _rebuilt(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
+        """A function of a list of operations, and how many operations an evaluation takes.
+
+        It has SX symbols, or MX symbols where it calls others: only these differentiate all calls as CasADi does.
+        """
+        patterns = [_read_pattern(one) for one in record["inputs"]]
+        table, constants = _integers(record["rows"], (None, 3)), _floats(record["constants"]).tolist()
+        rows, kind = table.tolist(), ca.MX if (table[:, 0] == CALL).any() else ca.SX
+        inputs = [kind.sym(f"i{k}", pattern) for k, pattern in enumerate(patterns)]
+        given = [_nonzeros(symbol) for symbol in inputs]
+        arguments, work = _integers(record["arguments"], (None,)).tolist(), len(rows)
+        values: list[Any] = []  # a scalar each; of a call the list of its results
+
+        def operand(row: int) -> Any:
+            value = values[_place(row, len(values), "operand")]
+            if isinstance(value, list):
+                raise ProblemError(f"operand {row} is a call, not a number", name="rows", value=row)
+            return value
+
+        for operation, first, second in rows:
+            if operation == INPUT:
+                values.append(given[_place(first, len(given), "input")][_place(second, len(given[first]), "entry")])
+            elif operation == CONSTANT:
+                values.append(kind(constants[_place(first, len(constants), "constant")]))
+            elif operation == CALL:
+                callee = self.functions[_place(first, len(self.functions), "function")]
+                work += self._work[first]
+                values.append(_call(callee, [operand(row) for row in arguments[max(second, 0) :][: _entries(callee)]]))
+            elif operation == RESULT:
+                results = values[_place(first, len(values), "call")]
+                if not isinstance(results, list):
+                    raise ProblemError(f"row {first} is no call", name="rows", value=first)
+                values.append(results[_place(second, len(results), "result")])
+            elif CALL < operation < FIRST_BINARY:
+                values.append(kind.unary(CODES[operation - len(STRUCTURAL)], operand(first)))
+            elif operation < len(OPERATIONS) and operation > 0:
+                values.append(kind.binary(CODES[operation - len(STRUCTURAL)], operand(first), operand(second)))
+            else:
+                words = f"operation {operation} is not known, only 0 to {len(OPERATIONS) - 1}"
+                raise ProblemError(words, name="operation", value=operation, limit=len(OPERATIONS) - 1)
+        shapes = [_read_pattern(one) for one in record["outputs"]]
+        results = _integers(record["results"], (sum(one.nnz() for one in shapes),)).tolist()
+        outputs, begin = [], 0
+        for shape in shapes:
+            outputs.append(shaped(shape, [operand(row) for row in results[begin : begin + shape.nnz()]], kind))
+            begin += shape.nnz()
+        return ca.Function(name, inputs, outputs), work
+
+
+def shaped(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
+    return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
+
+
+def _nonzeros(matrix: Any) -> list[Any]:
+    return matrix.nonzeros() if isinstance(matrix, ca.SX) else [matrix.nz[k] for k in range(matrix.nnz())]
+
+
+def _entries(function: Any) -> int:
+    return sum(function.nnz_in(k) for k in range(function.n_in()))
+
+
+def _call(callee: Any, entries: list[Any]) -> list[Any]:
+    """The entries of all results of a call on the entries of all its arguments."""
+    if len(entries) != _entries(callee):
+        raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
+    given, begin = [], 0
+    for k in range(callee.n_in()):
+        given.append(shaped(callee.sparsity_in(k), entries[begin : begin + callee.nnz_in(k)], ca.MX))
+        begin += callee.nnz_in(k)
+    return [entry for result in callee.call(given, False, True) for entry in _nonzeros(result)]
+
+
+def _place(place: int, count: int, what: str) -> int:
+    if not 0 <= place < count:
+        raise ProblemError(f"{what} {place} does not exist, only {count}", name=what, value=place, limit=count)
+    return place
+
+
+def _whole(value: Any, what: str, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        words = f"{what} {value!r} is no whole number from {least} to {most}"
+        raise ProblemError(words, name=what, value=value, limit=(least, most))
+    return value
+
+
+def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    array = np.asarray(values)
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if not fits or (array.dtype.kind not in "iu" and array.size):
+        raise ProblemError(
+            f"whole numbers of shape {shape} are expected, not {array.dtype} of {array.shape}", name="rows"
+        )
+    return array
+
+
+def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
+    array = np.asarray(values)
+    if array.ndim != 1 or (array.dtype.kind not in "fiu" and array.size) or (finite and not np.isfinite(array).all()):
+        raise ProblemError(f"a list of {'finite ' if finite else ''}numbers is expected", name="constants")
+    return array.astype(float)
+
+
+def _read_pattern(written: Any) -> Any:
+    """A sparsity pattern of [rows, columns] or [rows, columns, places of the entries]."""
+    if not isinstance(written, list) or len(written) not in (2, 3):
+        raise ProblemError(f"a shape is expected, not {written!r:.80}", name="shape")
+    rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in written[:2])
+    if rows * columns > MAX_ENTRIES:
+        raise ProblemError(f"{rows} x {columns} entries, at most {MAX_ENTRIES}", name="shape", limit=MAX_ENTRIES)
+    if len(written) == 2:
+        return ca.Sparsity.dense(rows, columns)
+    places = _integers(written[2], (None,))
+    if places.size and (places[0] < 0 or places[-1] >= rows * columns or (np.diff(places) <= 0).any()):
+        raise ProblemError("places of entries do not increase within the matrix", name="shape")
+    return ca.Sparsity.nonzeros(rows, columns, places.tolist())
+
+
+# ---- what is no scalar arithmetic -----------------------------------------------------------------------------------
+
+
+def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+    """The cell of a table in which a number lies."""
+    table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
+    count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
+    if len(table) < 2 or (np.diff(table) < 0).any():
+        raise ProblemError("the places of a table do not increase", name="table")
+    x = ca.MX.sym("x", count)
+    return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})])
+
+
+def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+    """Entries of a table at places that are computed; nan outside."""
+    table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
+    if not len(table):
+        raise ProblemError("a table is empty", name="table")
+    return ca.Function("gather", [x], [ca.MX(ca.DM(table)).get_nz(False, x)])
+
+
+def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+    """The solution of a system of linear equations."""
+    size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
+    matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
+    return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)])
+
+
+def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
+    """The places along each dimension of a table."""
+    places, offsets = _floats(record[what], finite=True), _integers(record["offsets"], (None,)).tolist()
+    if not 2 <= len(offsets) <= MAX_DIMENSIONS + 1 or offsets[0] != 0 or offsets[-1] != len(places):
+        raise ProblemError(f"a table has {len(offsets) - 1} dimensions or loses places", name="offsets")
+    grids = [places[begin:end] for begin, end in pairwise(offsets)]
+    if any(len(grid) < 2 or (np.diff(grid) < 0).any() for grid in grids):
+        raise ProblemError("the places of a table do not increase", name=what)
+    return [grid.tolist() for grid in grids]
+
+
+def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+    """A spline of one or several variables."""
+    knots, coefficients = _grids(record, "knots"), _floats(record["coefficients"])
+    degrees = [_whole(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
+    modes = [("linear", "exact", "binary")[_whole(mode, "mode", 0, 2)] for mode in record["modes"]]
+    size, count = (_whole(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
+    if len(degrees) != len(knots) or len(modes) != len(knots):
+        raise ProblemError(f"{len(degrees)} degrees for {len(knots)} dimensions", name="degrees")
+    lengths = [len(own) - degree - 1 for own, degree in zip(knots, degrees, strict=True)]
+    if min(lengths) < 1 or any(length <= degree for length, degree in zip(lengths, degrees, strict=True)):
+        raise ProblemError("a spline has fewer knots than its degree asks for", name="knots")
+    if len(coefficients) != size * int(np.prod(lengths, dtype=object)):
+        raise ProblemError(f"{len(coefficients)} coefficients for {lengths} x {size}", name="coefficients")
+    x = ca.MX.sym("x", len(knots), count)
+    return ca.Function(
+        "bspline", [x], [ca.bspline(x, ca.DM(coefficients), knots, degrees, size, {"lookup_mode": modes})]
+    )
+
+
+def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+    """A table that is interpolated linearly, or the derivative of one."""
+    grids, values = _grids(record, "grid"), _floats(record["values"])
+    cells = int(np.prod([len(grid) for grid in grids], dtype=object))
+    if not len(values) or len(values) % cells or any((np.diff(grid) <= 0).any() for grid in grids):
+        raise ProblemError(f"{len(values)} values for a table of {cells}", name="values", value=len(values))
+    found = ca.interpolant("interpolant", "linear", grids, values.tolist())
+    return found.jacobian() if record["derivative"] is True else found
+
+
+def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
+    """An integrator of the differential equations that a function gives."""
+    equations = functions[_place(_whole(record["equations"], "equations", 0, MAX_ENTRIES), len(functions), "equations")]
+    if record["plugin"] not in INTEGRATORS.values():
+        raise ProblemError(f"integrator {record['plugin']!r} is not known", name="plugin", value=record["plugin"])
+    begin, times = float(record["begin"]), _floats(record["times"], finite=True)
+    if not np.isfinite(begin) or not len(times) or (np.diff([begin, *times]) < 0).any():
+        raise ProblemError("an integrator's times do not increase", name="times")
+    options = dict(record["options"])
+    for option, value in options.items():
+        kind = INTEGRATOR_OPTIONS[option][1]
+        if kind is int:
+            _whole(value, option, 0, 9 if option == "interpolation_order" else 100_000)
+        elif not (isinstance(value, float) and 0 < value < 1):
+            raise ProblemError(f"{option} {value!r} is no tolerance", name=option, value=value)
+    names = [("t", "x", "z", "p", "u"), ("ode", "alg", "quad", "zero")]
+    if [tuple(one) for one in record["names"]] != names or (equations.n_in(), equations.n_out()) != (5, 4):
+        raise ProblemError("an integrator's equations have other arguments", name="names", value=record["names"])
+    symbols = [ca.MX.sym(name, equations.sparsity_in(k)) for k, name in enumerate(names[0])]
+    named = ca.Function("equations", symbols, equations.call(symbols), *(list(one) for one in names))
+    return ca.integrator("integrator", record["plugin"], named, begin, times.tolist(), options)
+
+
+BUILDERS: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Any]] = {
+    "low": _low,
+    "gather": _gather,
+    "solve": _solve,
+    "bspline": _bspline,
+    "interpolant": _interpolant,
+    "integrator": _integrator,
+}
