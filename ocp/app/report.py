@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from models import FreeFloating, Machine
-from models.arrays import Array
+from models import Machine
 from ocp.app.joint_limits import Row
 from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.pictures import curves, scene
 from ocp.app.pieces import Motion
-from ocp.app.verdict import Check, bounds_of, check_trajectory
-from ocp.files import RawTrajectory
+from ocp.app.plan_verdict import verdict_of
+from ocp.app.verdict import Check, bounds_of
 from ocp.planning import Plan
 from ocp.tasks.limits import JointBounds
 
@@ -154,13 +153,8 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     machine, robot = plan.machine, plan.machine.robot
     sample = plan.sample(period)
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
-    lines = np.arange(1, len(sample.t) + 1)
-    given = sample.joints, sample.rates, sample.accelerations
-    raw = RawTrajectory(plan.names, sample.t, *given, None, lines, True, (), title)
-    base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
-    place: dict[str, Any] = {} if machine.base_size else _mount(machine)
-    check = check_trajectory(robot, raw, base=base, clearance=None, **place)
-    audit = plan.audit()
+    verdict = verdict_of(plan, sample, title)
+    audit, check = verdict.audit, verdict.check
     rows = tuple(
         Row(
             f.name,
@@ -180,8 +174,8 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     told = [row for row in check.rows if row.verdict != "unlimited"]
     return Report(
         title,
-        f"The plan {audit.sentence}.",
-        bool(audit.passed),
+        f"The plan {verdict.sentence}.",
+        verdict.passed,
         (
             f"{robot.name}",
             f"{plan.horizon:.5g} s",
@@ -195,11 +189,3 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         (("The audit", rows), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )
-
-
-def _mount(machine: Machine) -> dict[str, Array]:
-    frame = machine.world_from_base(())
-    return {
-        "translation": np.array(frame.position, dtype=float).ravel(),
-        "rotation": np.array(frame.rotation, dtype=float),
-    }

@@ -18,8 +18,10 @@ from ocp.app.bases import floating_base
 from ocp.app.joint_limits import Row
 from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.oddities import readable
+from ocp.app.plan_verdict import PlanVerdict, verdict_of
 from ocp.app.quantities import Curve, Footing, footing_of, joint_curves, machine_curves, so_far
 from ocp.app.verdict import bounds_of
+from ocp.audit.audit import Audit
 from ocp.audit.clearance import nearest_along
 from ocp.builders.tool_motion import CLOCK
 from ocp.errors import ProblemError, unknown_name
@@ -113,7 +115,7 @@ def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
         "cost": plan.cost,
         "targets": plan.targets,
     }
-    about |= _audited(plan.solution, lambda: plan.audit(**settings))
+    about |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
     return _shown(name, plan.machine, times, base, *given, _base_rates(times, base), told, **about)
 
 
@@ -268,12 +270,13 @@ def _torque_like(solution: Solution, joints: str) -> bool:
     )
 
 
-def _audited(solution: Solution, audit: Callable[[], Any]) -> dict[str, Any]:
+def _audited(solution: Solution, judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
     """What the audit says; of a solution without its problem that there can be none."""
     if solution.problem is None:
         return {"verdict": f"Its problem is not in the file, so that nothing is audited: {solution.problem_lost}."}
-    found = audit()
-    return {"verdict": f"The plan {found.sentence}.", "passed": found.passed, "rows": tuple(rows_of(found))}
+    verdict = judge()
+    audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
+    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(rows_of(audit))}
 
 
 def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
