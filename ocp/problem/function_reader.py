@@ -40,7 +40,7 @@ MAX_OPERATIONS = 2**20
 MAX_WORK = 2**26
 """Operations of one evaluation with all the calls in it: a short file can call functions that call functions."""
 MAX_ENTRIES = 2**20
-"""Entries of an argument or a result."""
+"""Entries of all arguments and results of the functions of a file together."""
 MAX_DIMENSIONS = 6
 """Dimensions of a table that is interpolated."""
 MAX_DEGREE = 9
@@ -73,9 +73,14 @@ class FunctionReader:
     def __init__(self, records: Sequence[Mapping[str, Any]]) -> None:
         self.functions: list[Any] = []
         self._work: list[int] = []
-        total = sum(len(record["rows"]) for record in records if record.get("kind") == "operations")
-        if total + len(records) > MAX_OPERATIONS:
-            raise ProblemError(f"{total} operations, at most {MAX_OPERATIONS} are read", name="rows", value=total)
+        self._passed = 0  # entries that calls hand over
+        total = len(records) + sum(len(record["rows"]) for record in records if record["kind"] == "operations")
+        for what, count, most in (
+            ("operations", total, MAX_OPERATIONS),
+            ("entries", sum(map(_declared_entries, records)), MAX_ENTRIES),
+        ):
+            if not 0 <= count <= most:
+                raise ProblemError(f"{count} {what}, at most {most} are read", name=what, value=count, limit=most)
         for number, record in enumerate(records):
             kind = record["kind"]
             if kind == "operations":
@@ -117,6 +122,10 @@ class FunctionReader:
             elif operation == CALL:
                 callee = self.functions[_place(first, len(self.functions), "function")]
                 work += self._work[first]
+                self._passed += _entries(callee)
+                if self._passed > MAX_OPERATIONS:
+                    words = f"calls hand over more than {MAX_OPERATIONS} numbers"
+                    raise ProblemError(words, name="arguments", limit=MAX_OPERATIONS)
                 values.append(_call(callee, [operand(row) for row in arguments[max(second, 0) :][: _entries(callee)]]))
             elif operation == RESULT:
                 results = values[_place(first, len(values), "call")]
@@ -145,6 +154,14 @@ def shaped(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
 
 def _nonzeros(matrix: Any) -> list[Any]:
     return matrix.nonzeros() if isinstance(matrix, ca.SX) else [matrix.nz[k] for k in range(matrix.nnz())]
+
+
+def _declared_entries(record: Mapping[str, Any]) -> int:
+    """How many entries the arguments and results of a function will have, as its record says."""
+    if record["kind"] == "operations":
+        return sum(abs(one[0] * one[1]) for one in (*record["inputs"], *record["outputs"]))
+    sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
+    return int(np.prod(sizes, dtype=object)) + sizes[1] ** 2
 
 
 def _entries(function: Any) -> int:

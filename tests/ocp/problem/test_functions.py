@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, strategies
 
 from ocp import ProblemError
-from ocp.problem.function_reader import BINARY, MAX_OPERATIONS, MAX_WORK, OPERATIONS, UNARY, FunctionReader
+from ocp.problem.function_reader import BINARY, MAX_ENTRIES, MAX_OPERATIONS, MAX_WORK, OPERATIONS, UNARY, FunctionReader
 from ocp.problem.function_writer import FunctionWriter
 
 GRID = np.linspace(0.0, 1.0, 5)
@@ -258,6 +258,14 @@ def test_calls_that_multiply_are_refused_before_they_are_worked_out() -> None:
         FunctionReader(chain)
     with pytest.raises(ProblemError, match=f"at most {MAX_OPERATIONS}"):
         FunctionReader([record_of(rows=np.zeros((MAX_OPERATIONS + 1, 3), dtype=np.int64))])
+    many = [{**IDENTITY, "inputs": [[1024, 1]], "outputs": [[1, 1]]} for _ in range(1200)]
+    with pytest.raises(ProblemError, match=f"entries, at most {MAX_ENTRIES}"):
+        FunctionReader(many)
+    wide = record_of(*[(INPUT, 0, k) for k in range(1024)], inputs=[[1024, 1]], results=(0,))
+    calls = [row for k in range(1100) for row in ((CALL, 0, 0), (RESULT, 1024 + 2 * k, 0))]
+    caller = {**wide, "rows": np.concatenate([wide["rows"], calls]), "arguments": np.arange(1024)}
+    with pytest.raises(ProblemError, match="hand over more than"):
+        FunctionReader([wide, caller])
 
 
 def test_no_file_reaches_the_readers_of_casadi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
