@@ -147,6 +147,12 @@ def test_functions_that_are_called_twice_are_written_once() -> None:
     assert [record["kind"] for record in written(outer)] == ["operations", "operations"]
 
 
+def test_only_functions_that_call_others_are_made_of_matrices() -> None:
+    inner = ca.Function("inner", [Y], [ca.sin(Y) * Y])
+    kinds = [one.class_name() for one in FunctionReader(written(ca.Function("outer", [X], [inner(X)[0]]))).functions]
+    assert kinds == ["SXFunction", "MXFunction"]
+
+
 class OfPython(ca.Callback):  # type: ignore[misc]
     """x^2, as a function that only Python knows."""
 
@@ -259,8 +265,15 @@ def test_calls_that_multiply_are_refused_before_they_are_worked_out() -> None:
     with pytest.raises(ProblemError, match=f"at most {MAX_OPERATIONS}"):
         FunctionReader([record_of(rows=np.zeros((MAX_OPERATIONS + 1, 3), dtype=np.int64))])
     many = [{**IDENTITY, "inputs": [[1024, 1]], "outputs": [[1, 1]]} for _ in range(1200)]
-    with pytest.raises(ProblemError, match=f"entries, at most {MAX_ENTRIES}"):
-        FunctionReader(many)
+    square = [{**IDENTITY, "inputs": [[200, 300]]} for _ in range(20)]
+    solves = [{"kind": "solve", "size": 512, "columns": 1} for _ in range(5)]
+    for crowd in (many, square, solves):
+        with pytest.raises(ProblemError, match=f"entries, at most {MAX_ENTRIES}"):
+            FunctionReader(crowd)
+    runs = [row for k in range(70) for row in ((CALL, 1, 0), (RESULT, 2 + 2 * k, 0))]
+    caller = record_of((INPUT, 0, 0), (INPUT, 0, 1), *runs, inputs=[[2, 1]], arguments=np.array([0, 1]))
+    with pytest.raises(ProblemError, match=f"at most {MAX_WORK}"):
+        FunctionReader([*RUN[:2], caller])
     wide = record_of(*[(INPUT, 0, k) for k in range(1024)], inputs=[[1024, 1]], results=(0,))
     calls = [row for k in range(1100) for row in ((CALL, 0, 0), (RESULT, 1024 + 2 * k, 0))]
     caller = {**wide, "rows": np.concatenate([wide["rows"], calls]), "arguments": np.arange(1024)}
