@@ -30,14 +30,13 @@ from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gr
 from models.robot.kinematics import link_frames
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.intervals import bounds
 from models.shapes.pairs import ALWAYS, COVERED, TOLD, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
-PIECES = 512
-"""Of a time, in which the motion of an obstacle is bounded one after the other."""
+CHECKED = 513
+"""Times at which the motion of an obstacle is looked at before anything is planned."""
 CLOSE = 3
 """Joints between links whose meshes are looked at as they are."""
 FINEST = 1e-6
@@ -93,44 +92,29 @@ class Moving:
         for what, part in zip(("position", "rotation"), parts, strict=True):
             if not ca.symvar(part):
                 checked_array(ca.DM(part).full(), part.shape, "moving", what)
-        self._check_rotation(0.0)
+        turn = self._at(0.0)[0].full()
+        if np.isfinite(turn).all():
+            checked_rotation(turn, "moving", "rotation")
 
     def frame(self, time: Expression) -> Frame:
         """Of its shape in world, at a time (s)."""
         return Frame(*self._at(time))
 
-    def _check_rotation(self, time: float) -> None:
-        """Raise where there is a rotation at a time (s) that is none."""
-        turn = self._at(time)[0].full()
-        if np.isfinite(turn).all():
+    def check(self, begin: float, end: float) -> None:
+        """Raise ModelError where the position is no number, or the rotation none, at a time between two, s."""
+        times = np.linspace(begin, end, CHECKED)
+        turns, places = (np.array(part) for part in self._at(times[None]))
+        broken = ~np.isfinite(places).all(axis=0)
+        if broken.any():
+            time = float(times[broken.argmax()])
+            value = places[:, broken.argmax()].tolist()
+            message = f"moving: position {value} is not finite, at {time:g} s"
+            raise ModelError(message, name="position", value=value, time=time)
+        for turn, time in zip(turns.reshape(3, -1, 3).transpose(1, 0, 2), times.tolist(), strict=True):
             try:
                 checked_rotation(turn, "moving", "rotation")
             except ModelError as error:
                 raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error
-
-    def fastest(self, begin: float, end: float) -> tuple[float, float]:
-        """Bounds of speed and acceleration of its points between two times, m/s and m/s^2.
-
-        Raises:
-            ModelError: They are not bounded, as far as interval arithmetic can tell; a rotation that is none.
-        """
-        time = ca.SX.sym("time")
-        turn, place = self._at(time)
-        points = ca.densify(ca.mtimes(turn, ca.SX(self.shape.core.T)) + ca.repmat(place, 1, len(self.shape.core)))
-        cuts = np.linspace(begin, end, PIECES + 1)
-        for at in cuts[[0, PIECES // 2, PIECES]].tolist():
-            self._check_rotation(at)
-        found, value = [], ca.vec(points)
-        for what in ("speed", "acceleration"):
-            value = ca.jacobian(value, time)
-            low, high = bounds(ca.densify(value), time, cuts[:-1], cuts[1:])
-            most = np.maximum(np.abs(low), np.abs(high)).reshape(PIECES, -1, 3)
-            largest = float(np.linalg.norm(most, axis=2).max())
-            if not np.isfinite(largest):
-                message = f"moving: the {what} of the obstacle has no bound from {begin:g} to {end:g} s"
-                raise ModelError(message, name="position", value=largest)
-            found.append(largest)
-        return found[0], found[1]
 
 
 class Levers(NamedTuple):
@@ -395,20 +379,11 @@ class Surroundings:
                     most[row] = np.maximum(most[row], sum(found))
         return Levers(base, base_turns, joints, turns)
 
-    def fastest(self, begin: float, end: float) -> tuple[Array, Array]:
-        """Bounds of speed and acceleration of each pair by time alone, m/s and m/s^2. Shape (n,) each.
-
-        Raises:
-            ModelError: Those of a moving obstacle are not bounded.
-        """
-        known = {
-            f"obstacle {k}": one.fastest(begin, end) for k, one in enumerate(self.obstacles) if isinstance(one, Moving)
-        }
-        still = (0.0, 0.0)
-        moving = [known.get(self.bodies[one].name, still) for one, _, _ in self.pairs]
-        moved = [known.get(self.bodies[other].name, still) for _, other, _ in self.pairs]
-        both = (np.array(moving) + np.array(moved)).reshape(-1, 2)
-        return both[:, 0], both[:, 1]
+    def check_motions(self, begin: float, end: float) -> None:
+        """Raise ModelError where the motion of an obstacle is not defined at a time between two, s."""
+        for one in self.obstacles:
+            if isinstance(one, Moving):
+                one.check(begin, end)
 
     # ---- inside ------------------------------------------------------------------------------------------------
 
