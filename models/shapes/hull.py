@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from models.arrays import Array, frozen
-from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
 
 FLAT = 1e-10
@@ -77,33 +75,6 @@ def convex_hull(points: Array) -> Hull:
     np.maximum.at(offsets, same, heights)
     normals = outwards[first]
     return Hull(frozen(points[corners]), faces, frozen(normals), frozen(size * (offsets + ROUNDING) + normals @ middle))
-
-
-def kept_hull(points: Array) -> Hull:
-    """The convex hull of points, sought once and kept in a file by their content, see `models.cache`.
-
-    Args, Raises: As `convex_hull`.
-    """
-    key = key_of(version_of(__name__), "hull", points)
-    known = _read(kept(key), points)
-    if known is None:
-        known = convex_hull(points)
-        parts = known.vertices, known.faces, known.normals, known.offsets
-        keep(key, [part.tolist() for part in parts])
-    return known
-
-
-def _read(value: Any, points: Array) -> Hull | None:
-    """A hull as it was kept; None where it is something else, or does not hold the points."""
-    try:
-        vertices, faces, normals, offsets = (np.array(part) for part in value)
-        found = Hull(frozen(vertices), faces.astype(np.intp), frozen(normals), frozen(offsets))
-        slack = SAME_PLANE * float(np.abs(points).max())
-        farthest = [(each @ normals.T).max(axis=0) for each in (points, vertices)]
-        sound = vertices[faces].shape == (len(faces), 3, 3)
-        return found if sound and np.abs(np.array(farthest) - offsets).max() <= slack else None
-    except (TypeError, ValueError, IndexError):
-        return None
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -13,8 +13,8 @@ bounded over the interval itself, kinks and jumps included (:mod:`ocp.problem.pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from math import comb
 from typing import NamedTuple
 
@@ -50,6 +50,8 @@ MOST = 400_000
 """Intervals of pairs looked at, beyond which what is left is not proven."""
 BLOCKS = 128
 """Intervals of the whole time that are looked at first, at most: of finer pieces several together."""
+SHOWN = 4
+"""Pairs left out by assumption that are named in a line; all are in `Clearance.assumed`."""
 MOST_TIMES = 512
 """Of those at which the balls about bodies are looked at first."""
 
@@ -118,6 +120,7 @@ class Clearance:
         settled: Whether every pair's least distance was told from what is asked, one way or the other.
         looked: Number of intervals of pairs that were looked at.
         reason: Why it is not settled, where a motion that time prescribes jumps or has no bound; else empty.
+        assumed: Pairs of bodies that were not looked at, by an assumption of the separation, and why.
     """
 
     name: str
@@ -125,6 +128,7 @@ class Clearance:
     settled: bool
     looked: int
     reason: str = ""
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def worst(self) -> Nearest | None:
@@ -133,9 +137,17 @@ class Clearance:
 
     def __str__(self) -> str:
         if self.worst is None:
-            return "no pairs"
+            return "; ".join(["no pairs", *self._assumptions])
         verdict = "proven" if not self.worst.missed else "violated" if self.settled else "not proven"
-        return f"{verdict}; least {self.worst}" + (f"; {self.reason}" if self.reason else "")
+        parts = [verdict, f"least {self.worst}", *([self.reason] if self.reason else []), *self._assumptions]
+        return "; ".join(parts)
+
+    @property
+    def _assumptions(self) -> list[str]:
+        """What was not looked at, in words; nothing where all was."""
+        some = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:SHOWN]]
+        more = [f"{len(self.assumed) - SHOWN} more"] if len(self.assumed) > SHOWN else []
+        return [f"left out by assumption: {', '.join([*some, *more])}"] if some else []
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
@@ -151,7 +163,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 def clearance_along(apart: Separation, track: Track | None) -> Clearance:
     """How near each pair of bodies comes along any track, at any time; no track is needed where there are no pairs."""
     if not len(apart) or track is None:
-        return Clearance(apart.name, (), True, 0)
+        return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
     return _Search(apart, track).run()
 
 
@@ -264,7 +276,7 @@ class _Search:
         found = self._found(np.minimum(lower, self.best))
         found.sort(key=lambda one: (-one.missed, one.distance - one.asked))
         reason = "" if settled else self._reason(pair[left], block[left], level)
-        return Clearance(self.apart.name, tuple(found), settled, looked, reason)
+        return Clearance(self.apart.name, tuple(found), settled, looked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
         """What is told of intervals that are left, where a motion that time prescribes is why."""

@@ -130,6 +130,7 @@ class Clear:
             levers={name: pair[0] for name, pair in moved.items()},
             turns={name: pair[1] for name, pair in moved.items()},
             covers=around.covers,
+            assumed=around.assumed,
         )
         if self.margins:
             pairs = sorted(self.margins)
@@ -194,6 +195,7 @@ def clearance_of(
         levers=levers.joints,
         turns=levers.joint_turns,
         covers=around.covers,
+        assumed=around.assumed,
     )
     sampler = Sampler([q], [placements])
     frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))

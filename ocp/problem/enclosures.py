@@ -97,7 +97,8 @@ class Enclosures:
                 elif code == ca.OP_CONST:
                     found = _Jet(constant(function.instruction_constant(k), still.low), still)
                 else:
-                    found = _KINKED.get(code, _smooth)(code, *(slots[slot] for slot in given))
+                    rule: Callable[..., _Jet] = _KINKED.get(code, _smooth)
+                    found = rule(code, *(slots[slot] for slot in given))
                 slots[function.instruction_output(k)[0]] = found
         return [outputs[k] for k in range(len(outputs))]
 
@@ -179,7 +180,7 @@ def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
             (x.slope.low, x.slope.high), (y.slope.low, y.slope.high), (np.minimum, np.maximum), strict=True
         )
     ]
-    return _Jet(RULES[code](x.value, y.value), Interval(*ends))
+    return _Jet(RULES[code](x.value, y.value), Interval(ends[0], ends[1]))
 
 
 def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:

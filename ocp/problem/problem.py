@@ -347,6 +347,7 @@ class Problem:
         levers: Mapping[str, Any],
         turns: Mapping[str, Any],
         covers: Mapping[int, Any] | None = None,
+        assumed: Mapping[str, str] | None = None,
     ) -> None:
         """Declare bodies that have to stay apart at every time, which the audit proves and no method holds.
 
@@ -361,12 +362,13 @@ class Problem:
             levers, turns: By the name of a state: how far, and by what angle, it moves and turns one body seen from the
                 other at most, by its unit; see :mod:`ocp.problem.separation`. Shape (n, size) each.
             covers: By the place of a pair, pairs of bodies that hold its two between them. Shape (m, 2) each.
+            assumed: Pairs that are left out by assumption, in words, and why: the audit tells them.
         """
         self._unused_constraint("separation", name)
         movers = {}
         for each in (*levers, *turns):
             movers[each] = self._find(self.declared.states, each, "separation").size
-        parts = {}
+        parts: dict[str, Any] = {}
         count = len(index_rows(f"separation {name!r}", "pairs", pairs, 3))
         for label, given in (("levers", levers), ("turns", turns)):
             what = f"separation {name!r}: {label}"
@@ -377,8 +379,8 @@ class Problem:
         parameters = [v.symbol for v in self.declared.parameters.values()]
         known = [*(v.symbol for v in self.declared.states.values()), *parameters, self.time]
         frames = self._expression(f"separation {name!r}: placements", placements, known)
-        covers = {} if covers is None else covers
-        apart = Separation(name, frames, dict(hulls), pairs, least, movers, covers=covers, **parts)
+        parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
+        apart = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         PrescribedMotion(apart, frames, self.time, parameters, [ca.DM.zeros(each.shape) for each in parameters])
         self.declared.apart[name] = apart
 

@@ -51,6 +51,8 @@ class Separation:
             of the state.
         covers: By the place of a pair, pairs of bodies, shape (m, 2), that hold its two between them: where the nearest
             of these is farther apart than the pair is by itself, it is so far apart. Levers and turns hold for all.
+        assumed: Pairs of bodies that are not looked at, though no proof says that they may be left, and why. They are
+            told wherever the separation is judged.
 
     Raises:
         ProblemError: Other shapes, what is not finite, or negative, a body or frame that there is none of.
@@ -65,6 +67,7 @@ class Separation:
     levers: np.ndarray
     turns: np.ndarray
     covers: Mapping[int, np.ndarray] = field(default_factory=dict)
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         what = f"separation {checked_text('separation: its name', self.name)!r}"
@@ -80,6 +83,9 @@ class Separation:
                 words = f"{what}: covers: there is no pair {pair!r}, only {n}"
                 raise ProblemError(words, name="covers", value=pair, limit=n)
             covers[int(pair)] = index_rows(what, "covers", both, 2)
+        for other, why in checked_mapping(f"{what}: assumed", self.assumed).items():
+            checked_text(f"{what}: assumed", other)
+            checked_text(f"{what}: assumed", why)
         object.__setattr__(self, "covers", {pair: both for pair, both in covers.items() if len(both)})
         for label, both in (("pairs", pairs[:, :2]), *(("covers", each) for each in covers.values())):
             if both.size and (both.min() < 0 or both.max() >= len(self.hulls) or (both[:, 0] == both[:, 1]).any()):
@@ -128,7 +134,9 @@ class Separation:
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {place: self.covers[pair] for place, pair in enumerate(keep) if pair in self.covers}
-        return Separation(self.name, self.placements, self.hulls, movers=self.movers, covers=covers, **parts)
+        return Separation(
+            self.name, self.placements, self.hulls, movers=self.movers, covers=covers, assumed=self.assumed, **parts
+        )
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:

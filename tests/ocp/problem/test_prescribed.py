@@ -88,7 +88,7 @@ def test_what_cannot_be_proven_is_refused_by_name() -> None:
     problem = Problem("moved")
     q, p = problem.state("q", 3), problem.parameter("p")
     hulls = {"a": Hull(0, np.zeros((1, 3)), 0.1), "b": Hull(1, np.zeros((1, 3)), 0.1)}
-    told = {"levers": {"q": np.ones((1, 3))}, "turns": {"q": np.zeros((1, 3))}}
+    told: dict[str, Any] = {"levers": {"q": np.ones((1, 3))}, "turns": {"q": np.zeros((1, 3))}}
     frame = ca.vertcat(EYE, q)
     for other, seen, word in (
         (ca.vertcat(EYE, q + problem.time), -1, "frame 1 is moved by time and by states"),
