@@ -8,12 +8,13 @@ from models.machines.actuators import Gyro, Thruster, gyro_matrix, gyros_of, whe
 from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
+from models.machines.moving import Moving
 from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
 from models.machines.stance import Foot, Foothold, Stance
 from models.machines.standing import Standing
 from models.machines.support import Support, rectangle
-from models.machines.surroundings import Moving, Surroundings
+from models.machines.surroundings import Surroundings
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix

@@ -56,7 +56,7 @@ LAZY = {
 """Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
 SEEN_BY_ALL = {"models.cache"}
 """What all of ocp may import of models: it knows no machine."""
-FOREIGN = {"models": {"casadi", "numpy"}}
+FOREIGN = {"models": {"casadi", "numpy", "scipy"}}
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
         {"models/errors.py": "from models.robot.tree import x"},
     ),
     (upward_imports, "ocp.schedule.limits imports ocp.tasks", {"ocp/schedule/limits.py": "import ocp.tasks"}),
-    (forbidden_packages, "models.robot.tree imports scipy", {"models/robot/tree.py": "import scipy.optimize"}),
+    (forbidden_packages, "models.robot.tree imports matplotlib", {"models/robot/tree.py": "import matplotlib.pyplot"}),
     (forbidden_packages, "models.robot.tree imports ocp", {"models/robot/tree.py": "from ocp.errors import x"}),
     (forbidden_packages, "ocp.direct.nlp imports models", {"ocp/direct/nlp.py": "from models import Robot"}),
     (shadowed_modules, "'methods' hides", {"ocp/__init__.py": "from ocp.methods import solve as methods"}),

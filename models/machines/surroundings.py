@@ -6,7 +6,7 @@ between the two moves them towards each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,123 +15,26 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    MOST,
-    Array,
-    checked_array,
-    checked_flag,
-    checked_indices,
-    checked_nonnegative,
-    checked_rotation,
-)
+from models.arrays import MOST, Array, checked_flag, checked_indices, checked_nonnegative
 from models.errors import ModelError
 from models.machines.machine import Machine
+from models.machines.moving import Moving
 from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.intervals import bounds
-from models.shapes.pairs import ALWAYS, COVERED, SRDF, TOLD, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, SRDF, TOLD, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
-from models.shapes.shapes import KINDS, Box, HalfSpace, Shape, checked_shape
+from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
-PIECES = 512
-"""Of a time, in which the motion of an obstacle is bounded one after the other."""
 CLOSE = 3
 """Joints between links whose meshes are looked at as they are."""
 FINEST = 1e-6
 """m: of the least of several distances."""
 TURN_OF_QUATERNION = 2.0
 """rad: a unit quaternion that changes by dq turns by 2 |dq|."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moving:
-    """An obstacle that moves: a part on a conveyor, a target that tumbles.
-
-    Attributes:
-        shape: In a frame of its own; no half-space.
-        position: Time (s), a casadi symbol -> origin of that frame in world, shape (3,), m.
-        rotation: The same of its axes, as columns. Shape (3, 3). None: those of the world.
-
-    Raises:
-        ModelError: No shape, a half-space, functions that give something else, or that change with anything but time;
-            a rotation that is none.
-    """
-
-    shape: Shape
-    position: Callable[[Any], Any]
-    rotation: Callable[[Any], Any] | None = None
-    _at: Any = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        if isinstance(checked_shape(self.shape, "moving", "shape"), HalfSpace):
-            message = "moving: a half-space cannot move; give a box that is large enough"
-            raise ModelError(message, name="shape", value=self.shape)
-        time = ca.SX.sym("time")
-        parts = []
-        for what, given, shape in (("position", self.position, (3, 1)), ("rotation", self.rotation, (3, 3))):
-            if given is None and what == "rotation":
-                parts.append(ca.SX.eye(3))
-                continue
-            if not callable(given):
-                message = f"moving: {what} must be a function of time, not {given!r}"
-                raise ModelError(message, name=what, value=given)
-            try:
-                value = ca.densify(ca.SX(expression(given(time))))
-            except Exception as error:  # of the function's own, too
-                message = f"moving: {what} is no function of a casadi symbol, the time: {error}"
-                raise ModelError(message, name=what, value=given) from error
-            if value.shape != shape or any(not ca.is_equal(symbol, time) for symbol in ca.symvar(value)):
-                message = (
-                    f"moving: {what} gives {value.shape} of {ca.symvar(value)}; {shape} of the time alone expected"
-                )
-                raise ModelError(message, name=what, value=value.shape, limit=shape)
-            parts.append(value)
-        object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
-        for what, part in zip(("position", "rotation"), parts, strict=True):
-            if not ca.symvar(part):
-                checked_array(ca.DM(part).full(), part.shape, "moving", what)
-        self._check_rotation(0.0)
-
-    def frame(self, time: Expression) -> Frame:
-        """Of its shape in world, at a time (s)."""
-        return Frame(*self._at(time))
-
-    def _check_rotation(self, time: float) -> None:
-        """Raise where there is a rotation at a time (s) that is none."""
-        turn = self._at(time)[0].full()
-        if np.isfinite(turn).all():
-            try:
-                checked_rotation(turn, "moving", "rotation")
-            except ModelError as error:
-                raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error
-
-    def fastest(self, begin: float, end: float) -> tuple[float, float]:
-        """Bounds of speed and acceleration of its points between two times, m/s and m/s^2.
-
-        Raises:
-            ModelError: They are not bounded, as far as interval arithmetic can tell; a rotation that is none.
-        """
-        time = ca.SX.sym("time")
-        turn, place = self._at(time)
-        points = ca.densify(ca.mtimes(turn, ca.SX(self.shape.core.T)) + ca.repmat(place, 1, len(self.shape.core)))
-        cuts = np.linspace(begin, end, PIECES + 1)
-        for at in cuts[[0, PIECES // 2, PIECES]].tolist():
-            self._check_rotation(at)
-        found, value = [], ca.vec(points)
-        for what in ("speed", "acceleration"):
-            value = ca.jacobian(value, time)
-            low, high = bounds(ca.densify(value), time, cuts[:-1], cuts[1:])
-            most = np.maximum(np.abs(low), np.abs(high)).reshape(PIECES, -1, 3)
-            largest = float(np.linalg.norm(most, axis=2).max())
-            if not np.isfinite(largest):
-                message = f"moving: the {what} of the obstacle has no bound from {begin:g} to {end:g} s"
-                raise ModelError(message, name="position", value=largest)
-            found.append(largest)
-        return found[0], found[1]
 
 
 class Levers(NamedTuple):
@@ -271,7 +174,7 @@ class Surroundings:
                     hulls[mesh] = len(bodies)
                     bodies.append(Placed(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
             held[len(pairs)] = tuple(stand_ins)
-            if self.left.get((first.link, second.link)) not in (ALWAYS, COVERED):
+            if self.left.get((first.link, second.link)) not in ASSUMED:
                 of = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (one_mesh, other_mesh)]
                 covers[len(pairs)] = np.array([(i, j) for i in of[0] for j in of[1]])
             pairs.append((hulls[one_mesh], hulls[other_mesh], places[self._seen_from(first, second)]))
@@ -302,6 +205,16 @@ class Surroundings:
     def disabled(self) -> list[tuple[str, str]]:
         """Pairs of links that the SRDF file names."""
         return [pair for pair, why in self.left.items() if why == SRDF]
+
+    @property
+    def assumed(self) -> dict[str, str]:
+        """Pairs of links that are left out by assumption, "one and other": no proof says that they always touch."""
+        looked_at = {frozenset(self.told_as(pair)) for pair in self._held}  # by their hulls
+        return {
+            " and ".join(pair): why
+            for pair, why in self.left.items()
+            if why in ASSUMED and frozenset(pair) not in looked_at
+        }
 
     @property
     def moves_by_itself(self) -> bool:
@@ -405,20 +318,11 @@ class Surroundings:
                     most[row] = np.maximum(most[row], sum(found))
         return Levers(base, base_turns, joints, turns)
 
-    def fastest(self, begin: float, end: float) -> tuple[Array, Array]:
-        """Bounds of speed and acceleration of each pair by time alone, m/s and m/s^2. Shape (n,) each.
-
-        Raises:
-            ModelError: Those of a moving obstacle are not bounded.
-        """
-        known = {
-            f"obstacle {k}": one.fastest(begin, end) for k, one in enumerate(self.obstacles) if isinstance(one, Moving)
-        }
-        still = (0.0, 0.0)
-        moving = [known.get(self.bodies[one].name, still) for one, _, _ in self.pairs]
-        moved = [known.get(self.bodies[other].name, still) for _, other, _ in self.pairs]
-        both = (np.array(moving) + np.array(moved)).reshape(-1, 2)
-        return both[:, 0], both[:, 1]
+    def check_motions(self, begin: float, end: float) -> None:
+        """Raise ModelError where the motion of an obstacle is not defined at a time between two, s."""
+        for one in self.obstacles:
+            if isinstance(one, Moving):
+                one.check(begin, end)
 
     # ---- inside ------------------------------------------------------------------------------------------------
 
@@ -436,13 +340,15 @@ class Surroundings:
     ) -> dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]]:
         """Pairs of bodies, by the two meshes that they cover, of links two or three joints apart.
 
-        These may be a few millimetres from each other by design, less than covers stand out: their hulls are looked at.
+        These may be a few millimetres from each other by design, less than covers stand out: their hulls are looked at,
+        and those of meshes whose covers always touch.
         """
         found: dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]] = {}
         for i, j in checked:
             one, other = own[i], own[j]
             up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (one, other)))
-            if one.mesh is not None and other.mesh is not None and len(up) + len(down) <= CLOSE:
+            near = len(up) + len(down) <= CLOSE or self.left.get((one.link, other.link)) == COVERED
+            if near and one.mesh is not None and other.mesh is not None:
                 found.setdefault((one.mesh, other.mesh), []).append((i, j))
         return found
 

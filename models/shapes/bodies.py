@@ -16,7 +16,7 @@ from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Link
 from models.robot.robot import Robot
 from models.shapes.covering import Cover, cover
-from models.shapes.hull import kept_hull
+from models.shapes.hull import convex_hull
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.shapes.shapes import CORNERS, SIDES, Box, Capsule, Cylinder, Mesh, Shape, Sphere, checked_shape
 
@@ -48,9 +48,9 @@ class LinkMesh:
     def hull(self) -> Mesh:
         """Its convex hull, in the frame of the link; of points in a plane, which have none, that of THIN cubes."""
         try:
-            return Mesh.around(kept_hull(self.points))
+            return Mesh.around(convex_hull(self.points))
         except ModelError:
-            return Mesh.around(kept_hull((self.points[:, None] + THIN * CORNERS).reshape(-1, 3)))
+            return Mesh.around(convex_hull((self.points[:, None] + THIN * CORNERS).reshape(-1, 3)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import count
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from models.arrays import Array, frozen
-from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
 
 FLAT = 1e-10
-"""Share of the size of all points: thinner is flat, and what stands out less counts as inside."""
+"""Share of the size of all points: thinner is flat."""
 SAME_PLANE = 1e-9
 """Normals of faces that differ by less are one."""
-TRIES = 6
+ROUNDING = 1e-12
+"""Share of the size of all points by which planes stand out: more than qhull leaves points outside."""
+SPREAD = 1000
+"""Points, at most about twice, by which the plane that they may lie in is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +41,7 @@ class Hull:
 
 
 def convex_hull(points: Array) -> Hull:
-    """The convex hull of points, by the farthest point of a face first (Barber, Dobkin & Huhdanpaa 1996).
-
-    A point that stands out by less than FLAT of the size of all may be left out. Where rounding spoils the faces of
-    points that nearly lie in a plane, the points are shaken by a few times that and all is done again.
+    """Return the convex hull of points, by qhull (Barber, Dobkin & Huhdanpaa 1996).
 
     Args:
         points: Shape (n, 3), m.
@@ -49,157 +49,39 @@ def convex_hull(points: Array) -> Hull:
     Raises:
         ModelError: Points in a plane, on a line, at one place.
     """
-    unique = np.unique(points, axis=0)
-    middle = (unique.min(axis=0) + unique.max(axis=0)) / 2
-    centred = unique - middle
-    size = float(np.abs(centred).max())
-    rng = np.random.default_rng(0)
-    for attempt in range(TRIES):
-        tolerance = FLAT * size * 4**attempt
-        shaken = centred + (rng.uniform(-tolerance, tolerance, centred.shape) if attempt else 0.0)
-        triangles = _triangles(shaken, tolerance)
-        corners, faces = np.unique(triangles, return_inverse=True)
-        vertices, faces = centred[corners], faces.reshape(triangles.shape)
-        normals = _distinct(_normals(vertices, faces))
-        offsets = (vertices @ normals.T).max(axis=0)
-        if (_normals(shaken[corners], faces) @ shaken.T <= _heights(shaken[corners], faces) + 8 * tolerance).all():
-            break
-    offsets = (centred @ normals.T).max(axis=0)  # of all points: nothing stands out, whatever rounding did
-    return Hull(frozen(vertices + middle), faces, frozen(normals), frozen(offsets + normals @ middle))
-
-
-def kept_hull(points: Array) -> Hull:
-    """The convex hull of points, sought once and kept in a file by their content, see `models.cache`.
-
-    Args, Raises: As `convex_hull`.
-    """
-    key = key_of(version_of(__name__), "hull", points)
-    known = _read(kept(key), points)
-    if known is None:
-        known = convex_hull(points)
-        parts = known.vertices, known.faces, known.normals, known.offsets
-        keep(key, [part.tolist() for part in parts])
-    return known
-
-
-def _read(value: Any, points: Array) -> Hull | None:
-    """A hull as it was kept; None where it is something else, or does not hold the points."""
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    size = float(np.abs(points - middle).max()) or 1.0
+    centred = (points - middle) / size
+    few = centred[:: 1 + len(centred) // SPREAD]
+    across = np.linalg.svd(few - few.mean(axis=0), full_matrices=False)[2][-1]
     try:
-        vertices, faces, normals, offsets = (np.array(part) for part in value)
-        found = Hull(frozen(vertices), faces.astype(np.intp), frozen(normals), frozen(offsets))
-        slack = SAME_PLANE * float(np.abs(points).max())
-        farthest = [(each @ normals.T).max(axis=0) for each in (points, vertices)]
-        sound = vertices[faces].shape == (len(faces), 3, 3)
-        return found if sound and np.abs(np.array(farthest) - offsets).max() <= slack else None
-    except (TypeError, ValueError, IndexError):
-        return None
-
-
-def _normals(vertices: Array, faces: NDArray[np.intp]) -> Array:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    return np.asarray(cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300))
-
-
-def _heights(vertices: Array, faces: NDArray[np.intp]) -> Array:
-    """Of the planes of triangles above the origin, as a column."""
-    return np.asarray((_normals(vertices, faces) * vertices[faces[:, 0]]).sum(axis=1)[:, None])
-
-
-def _distinct(normals: Array) -> Array:
-    """Each direction once, as it comes first."""
-    kept: list[Array] = []
-    for normal in normals:
-        if normal.any() and (not kept or (np.abs(np.array(kept) - normal).max(axis=1) > SAME_PLANE).all()):
-            kept.append(normal)
-    return np.array(kept)
-
-
-def _first_four(points: Array, tolerance: float) -> list[int]:
-    """Corners of a tetrahedron of points that are far from each other."""
-    low, high = (int(k) for k in _farthest_pair(points))
-    along = (points[high] - points[low]) / max(float(np.linalg.norm(points[high] - points[low])), 1e-300)
-    across = points - points[low]
-    across = across - np.outer(across @ along, along)
-    side = int(np.linalg.norm(across, axis=1).argmax())
-    normal = np.cross(along, across[side])
-    width = float(np.linalg.norm(normal))
-    heights = (points - points[low]) @ normal / max(width, 1e-300)
-    top = int(np.abs(heights).argmax())
-    if width <= tolerance or abs(heights[top]) <= tolerance:
+        if len(points) < 4 or np.ptp(centred @ across) <= FLAT:
+            raise QhullError
+        found = ConvexHull(centred, qhull_options="Qt")
+    except QhullError as error:
         message = "mesh: its vertices lie in a plane; it has no volume. Give a Box as thick as it is"
-        raise ModelError(message, name="vertices", value=len(points), limit=tolerance)
-    return [low, high, side, top] if heights[top] < 0 else [high, low, side, top]
+        raise ModelError(message, name="vertices", value=len(points), limit=FLAT * size) from error
+    corners, faces = np.unique(found.simplices, return_inverse=True)
+    faces = faces.reshape(found.simplices.shape)
+    a, b, c = (centred[corners][faces[:, k]] for k in range(3))
+    outwards = found.equations[:, :3]
+    inwards = (np.cross(b - a, c - a) * outwards).sum(axis=1) < 0
+    faces[inwards] = faces[inwards][:, [0, 2, 1]]
+    # a closed surface is convex where it is so across each edge (Tietze, Nakajima): its neighbours' corners decide
+    around = centred[corners][faces[found.neighbors].reshape(len(faces), -1)]
+    heights = np.einsum("fkj,fj->fk", around, outwards).max(axis=1)
+    first, same = _distinct(outwards)
+    offsets = np.full(len(first), -np.inf)
+    np.maximum.at(offsets, same, heights)
+    normals = outwards[first]
+    return Hull(frozen(points[corners]), faces, frozen(normals), frozen(size * (offsets + ROUNDING) + normals @ middle))
 
 
-def _farthest_pair(points: Array) -> tuple[int, int]:
-    axis = int(np.ptp(points, axis=0).argmax())
-    return int(points[:, axis].argmin()), int(points[:, axis].argmax())
-
-
-def _triangles(points: Array, tolerance: float) -> NDArray[np.intp]:
-    """Triangles of the hull of points as indices. Shape (k, 3)."""
-    a, b, c, d = _first_four(points, tolerance)
-    growing = _Growing(points, tolerance)
-    everything = np.arange(len(points))
-    growing.close([(a, b, c), (a, d, b), (b, d, c), (c, d, a)], everything)
-    while growing.waiting:
-        growing.take(next(iter(growing.waiting)))
-    return np.array(list(growing.corners.values()), dtype=np.intp)
-
-
-class _Growing:
-    """A hull as it grows: triangles by number, who lies across each edge, the points outside of each triangle."""
-
-    def __init__(self, points: Array, tolerance: float) -> None:
-        self.points, self.tolerance, self.numbers = points, tolerance, count()
-        self.corners: dict[int, tuple[int, int, int]] = {}
-        self.planes: dict[int, tuple[Array, float]] = {}
-        self.owner: dict[tuple[int, int], int] = {}
-        self.waiting: dict[int, NDArray[np.intp]] = {}
-
-    def close(self, triangles: list[tuple[int, int, int]], loose: NDArray[np.intp]) -> None:
-        """Add triangles; each of the loose points waits at the one that it is highest above."""
-        corners = np.array(triangles)
-        origin = self.points[corners[:, 0]]
-        normals = np.cross(self.points[corners[:, 1]] - origin, self.points[corners[:, 2]] - origin)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        levels = (normals * origin).sum(axis=1)
-        above = self.points[loose] @ normals.T - levels
-        best = above.argmax(axis=1)
-        outside = above.max(axis=1) > self.tolerance
-        for k, (a, b, c) in enumerate(triangles):
-            number = next(self.numbers)
-            self.corners[number], self.planes[number] = (a, b, c), (normals[k], float(levels[k]))
-            self.owner |= {(a, b): number, (b, c): number, (c, a): number}
-            mine = loose[outside & (best == k)]
-            if len(mine):
-                self.waiting[number] = mine
-
-    def take(self, start: int) -> None:
-        """Put the farthest point above a triangle on the hull, in place of all triangles that it sees."""
-        mine = self.waiting[start]
-        normal, level = self.planes[start]
-        apex = int(mine[(self.points[mine] @ normal).argmax()])
-        seen, edges, stack = {start}, [], [start]
-        while stack:
-            a, b, c = self.corners[stack.pop()]
-            for edge in ((a, b), (b, c), (c, a)):
-                other = self.owner.get((edge[1], edge[0]), start)
-                if other in seen:
-                    continue
-                normal, level = self.planes[other]
-                if self.points[apex] @ normal - level > -self.tolerance:  # one in its plane is merged
-                    seen.add(other)
-                    stack.append(other)
-        for number in seen:
-            a, b, c = self.corners[number]
-            edges += [e for e in ((a, b), (b, c), (c, a)) if self.owner.get((e[1], e[0]), start) not in seen]
-        loose = [self.waiting.pop(number) for number in seen if number in self.waiting]
-        for number in seen:
-            a, b, c = self.corners.pop(number)
-            del self.planes[number]
-            for edge in ((a, b), (b, c), (c, a)):
-                self.owner.pop(edge, None)
-        left = np.concatenate(loose)
-        self.close([(*edge, apex) for edge in edges], left[left != apex])
+def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Each direction once, by where it comes first, and which of these each of them is. Shapes (f,), (k,)."""
+    near = cKDTree(normals).query_pairs(SAME_PLANE, p=np.inf, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), near.T), shape=(len(normals), len(normals)))
+    _, same = connected_components(links, directed=False)
+    first = np.unique(same, return_index=True)[1]
+    order = np.argsort(np.argsort(first))
+    return np.sort(first), order[same]

@@ -34,7 +34,9 @@ from models.spatial import Frame
 
 NEIGHBOURS, RIGID, ALWAYS, NEVER = "neighbours", "one rigid part", "always touch", "never touch"
 COVERED = "always touch, perhaps only in their covers"
-"""Where in some posture bodies overlap by no more than their covers stand out of the meshes: these may be apart."""
+"""Where in some posture bodies overlap by no more than their covers stand out of what they cover: this may be apart."""
+ASSUMED = (ALWAYS, COVERED)
+"""Reasons that no proof stands behind: bodies touch in each of many configurations."""
 SRDF, TOLD = "the SRDF file", "told"
 LIMITLESS = 1.0
 """m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
@@ -61,7 +63,8 @@ class Pairs:
         checked: Those that are checked, as indices of the bodies, the lower first.
         left: Why pairs of links are not: "one rigid part", "neighbours", "told", "the SRDF file", "always touch",
             "always touch, perhaps only in their covers" or "never touch", by their names in the order of the bodies. A
-            pair of links with several bodies may be in both where only some of their bodies always touch.
+            pair of links with several bodies may be in both where only some of their bodies always touch, and one of
+            meshes where their covers always touch and their convex hulls do not.
     """
 
     checked: tuple[tuple[int, int], ...]
@@ -84,9 +87,10 @@ def checked_pairs(
 
     Not checked are bodies with no moving joint between them; neighbours, with one moving joint between or with none but
     links without bodies in between; pairs that the user or an SRDF file names; bodies that touch in each of many random
-    postures; bodies that never touch, nor come as near as a clearance. The last is proven: the distance changes no
-    faster than the joints between the two times their lever arms, so that the space of postures is halved until each
-    part is settled. Where that takes too long the pair is checked.
+    postures, and of meshes their hulls as well, which is no proof (`ASSUMED`); bodies that never touch, nor come as
+    near as a clearance. The last is proven: the distance changes no faster than the joints between the two times their
+    lever arms, so that the space of postures is halved until each part is settled. Where that takes too long the pair
+    is checked.
 
     Args:
         bodies: As `bodies_of` makes them.
@@ -144,22 +148,25 @@ def checked_pairs(
             reason = between.settled(low, high, postures, near, bodies[i].overhang + bodies[j].overhang)
             one_mesh, other_mesh = bodies[i].mesh, bodies[j].mesh
             two_joints = len(between.up) + len(between.down) == 2
-            if reason != NEVER and two_joints and one_mesh is not None and other_mesh is not None:
+            near_by = reason != NEVER if two_joints else reason == COVERED
+            if near_by and one_mesh is not None and other_mesh is not None:
                 of_meshes = id(one_mesh), id(other_mesh)
                 if of_meshes not in of_hulls:
                     one_hull = one_mesh.hull.placed(*parts.place[one])
                     other_hull = other_mesh.hull.placed(*parts.place[other])
                     hulls = _Between(robot, one_hull, other_hull, *ends, _bound(one_hull, other_hull))
-                    of_hulls[of_meshes] = hulls.seen(low, high)
-                reason = of_hulls[of_meshes] or (None if reason == COVERED else reason)
+                    of_hulls[of_meshes] = hulls.seen(low, high) if two_joints else hulls.together(postures)
+                by_hull = reason == COVERED and of_hulls[of_meshes] is None
+                reason = of_hulls[of_meshes] or (None if by_hull else reason)
+                if by_hull and not two_joints:  # those are looked at by their hulls in any case
+                    left[one, other] = COVERED
         if reason is None:
             checked.append((i, j))
-        elif left.get((one, other)) not in (ALWAYS, COVERED) or reason == COVERED:
+        elif left.get((one, other)) not in ASSUMED or reason == COVERED:
             left[one, other] = reason
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
     found = Pairs(
-        tuple(checked),
-        {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in (ALWAYS, COVERED))},
+        tuple(checked), {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
     )
     keep(key, {"checked": found.checked, "left": [[*pair, why] for pair, why in found.left.items()]})
     return found
@@ -232,7 +239,7 @@ def _postures(robot: Robot, low: Array, high: Array, count: int, rng: np.random.
     room = np.where(slides, LIMITLESS, np.pi)
     first = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * room, -room))
     last = np.where(np.isfinite(high), high, first + 2 * room)
-    return rng.uniform(first, last, (count, robot.dof))
+    return np.asarray(first + (last - first) * rng.random((count, robot.dof)))  # uniform refuses 0.0 to -0.0
 
 
 # ------------------------------------------------------------------------------------------------- one pair of bodies
@@ -300,6 +307,10 @@ class _Between:
             tried = np.clip((nearest[:, None] + offsets).reshape(-1, len(columns)), first, last)
             step = step / 4
         return NEVER
+
+    def together(self, postures: Array) -> str | None:
+        """ALWAYS for bodies that touch in all postures, else None."""
+        return None if (self.gaps(postures)[0] > 0).any() else ALWAYS
 
     def _nested(self, q: Array) -> bool:
         """Whether at all joint vectors (k, dof) a corner of one of two hulls lies in the other."""

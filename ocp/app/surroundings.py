@@ -68,10 +68,14 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     Where the base moves, `bases` (M, base_size) at the samples, pairs are looked at there and at the middles between
     them, and nothing is proven.
     """
+    assumed = [f"{pair} ({why})" for pair, why in around.assumed.items()]
+    left = f"left out by assumption: {', '.join(assumed)}"
+    told = [Row("pairs not looked at", len(assumed), None, "", None, "told", left)] if assumed else []
     if not len(around.pairs):
-        return [Row("clearance", np.inf, around.clearance, "m", None, "told", "no pairs that may touch")], []
+        return [Row("clearance", np.inf, around.clearance, "m", None, "told", "no pairs that may touch"), *told], []
     if bases is not None:
-        return _sampled(around, motion, bases)
+        rows, faults = _sampled(around, motion, bases)
+        return [*rows, *told], faults
     found = proof(around, motion)
     start = float(motion.t[0])
     rows, faults = [], []
@@ -102,7 +106,7 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         if near.missed > TOUCHING and near.distance >= near.asked - TOUCHING and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
             rows.append(Row(name, near.distance, near.asked, "m", start + near.time, "not decided", note))
-    return rows, faults
+    return [*rows, *told], faults
 
 
 def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) -> list[Fault]:

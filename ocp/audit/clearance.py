@@ -7,13 +7,14 @@ no more than the points' acceleration (:mod:`ocp.problem.separation`). Between t
 
 and the distance is no less than the gap. The direction is that in which the bodies are nearest in the middle. Of a pair
 that others cover the same is said of each of them, and the least of it is as good. Where the bound does not settle it,
-the time between is halved. The plan's own polynomials say how fast its states change.
+the time between is halved. The plan's own polynomials say how fast its states change. What moves by time alone is
+bounded over the interval itself, kinks and jumps included (:mod:`ocp.problem.prescribed`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from math import comb
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
 from ocp.problem.hulls import Frames, PairsOfBodies, frames_of
+from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of
@@ -48,6 +50,8 @@ MOST = 400_000
 """Intervals of pairs looked at, beyond which what is left is not proven."""
 BLOCKS = 128
 """Intervals of the whole time that are looked at first, at most: of finer pieces several together."""
+SHOWN = 4
+"""Pairs left out by assumption that are named in a line; all are in `Clearance.assumed`."""
 MOST_TIMES = 512
 """Of those at which the balls about bodies are looked at first."""
 
@@ -92,6 +96,7 @@ class Track(NamedTuple):
             every piece. Shape (N, k).
         smooth: Whether the rates do not jump from piece to piece.
         frames: Fractions (M,) to the frames there.
+        prescribed: What time alone moves; None where that is nothing.
     """
 
     breaks: np.ndarray
@@ -100,6 +105,7 @@ class Track(NamedTuple):
     seconds: np.ndarray
     smooth: bool
     frames: Callable[[np.ndarray], Frames]
+    prescribed: PrescribedMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -113,12 +119,16 @@ class Clearance:
             nearer than that one.
         settled: Whether every pair's least distance was told from what is asked, one way or the other.
         looked: Number of intervals of pairs that were looked at.
+        reason: Why it is not settled, where a motion that time prescribes jumps or has no bound; else empty.
+        assumed: Pairs of bodies that were not looked at, by an assumption of the separation, and why.
     """
 
     name: str
     pairs: tuple[Nearest, ...]
     settled: bool
     looked: int
+    reason: str = ""
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def worst(self) -> Nearest | None:
@@ -127,9 +137,17 @@ class Clearance:
 
     def __str__(self) -> str:
         if self.worst is None:
-            return "no pairs"
+            return "; ".join(["no pairs", *self._assumptions])
         verdict = "proven" if not self.worst.missed else "violated" if self.settled else "not proven"
-        return f"{verdict}; least {self.worst}"
+        parts = [verdict, f"least {self.worst}", *([self.reason] if self.reason else []), *self._assumptions]
+        return "; ".join(parts)
+
+    @property
+    def _assumptions(self) -> list[str]:
+        """What was not looked at, in words; nothing where all was."""
+        some = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:SHOWN]]
+        more = [f"{len(self.assumed) - SHOWN} more"] if len(self.assumed) > SHOWN else []
+        return [f"left out by assumption: {', '.join([*some, *more])}"] if some else []
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
@@ -145,7 +163,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 def clearance_along(apart: Separation, track: Track | None) -> Clearance:
     """How near each pair of bodies comes along any track, at any time; no track is needed where there are no pairs."""
     if not len(apart) or track is None:
-        return Clearance(apart.name, (), True, 0)
+        return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
     return _Search(apart, track).run()
 
 
@@ -210,7 +228,8 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         controls = np.zeros((len(at), form.nu))
         return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, kept=kept)[0])
 
-    return Track(curve.breaks, horizon, *_fastest(curve, columns, horizon), False, frames)
+    prescribed = PrescribedMotion(apart, form.apart[apart.name], form.t, [form.p], [p])
+    return Track(curve.breaks, horizon, *_fastest(curve, columns, horizon), False, frames, prescribed)
 
 
 class _Search:
@@ -242,7 +261,7 @@ class _Search:
             check_time()
             looked += len(pair)
             bound, enough = self._bounds(pair, block, level)
-            left = bound < enough[pair]
+            left = ~(bound >= enough[pair])
             last = level == -HALVINGS or looked + 2 * left.sum() > MOST
             told = np.ones_like(left) if last else ~left
             np.minimum.at(lower, pair[told], bound[told])
@@ -256,7 +275,21 @@ class _Search:
                 pair, block = pair[inside], block[inside]
         found = self._found(np.minimum(lower, self.best))
         found.sort(key=lambda one: (-one.missed, one.distance - one.asked))
-        return Clearance(self.apart.name, tuple(found), settled, looked)
+        reason = "" if settled else self._reason(pair[left], block[left], level)
+        return Clearance(self.apart.name, tuple(found), settled, looked, reason, self.apart.assumed)
+
+    def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
+        """What is told of intervals that are left, where a motion that time prescribes is why."""
+        begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
+        if self.track.prescribed is None:
+            return ""
+        stray, _ = self.track.prescribed.bounds(pair, begin, end)
+        k = int(stray.argmax())
+        if not stray[k] > SHORT:
+            return ""
+        names = " and ".join(self.apart.labels[pair[k]])
+        how = f"jumps by up to {stray[k]:.3g} m" if np.isfinite(stray[k]) else "has no bound"
+        return f"the prescribed motion between {names} {how} at {begin[k]:.6g} s"
 
     def at(self, time: float) -> list[Nearest]:
         """Each pair at one time, s."""
@@ -317,6 +350,9 @@ class _Search:
         first, middle, last = np.split(where, 3)
         frames = self.track.frames(times)
         sway, bow = self._moves(pair, block, level, width)
+        if self.track.prescribed is not None:
+            more = self.track.prescribed.bounds(pair, begin * self.track.horizon, end * self.track.horizon)
+            sway, bow = sway + more[0], bow + more[1]
         enough = self._enough()[pair]
         bound = self.bodies.balls(frames, middle, pair) - sway
         chosen = np.flatnonzero(bound < enough)
@@ -353,8 +389,7 @@ class _Search:
         turns = (rates[piece] * apart.turns[pair]).sum(axis=1)
         with np.errstate(invalid="ignore"):  # nothing that moves a pair, times no bound
             bends = np.where(levers > 0, seconds[piece] * levers, 0.0).sum(axis=1)
-        speed, acceleration = moves + apart.speed[pair], bends + 2 * turns * moves + apart.acceleration[pair]
-        return speed * width / 2, acceleration * width**2 / 8
+        return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
         """Keep what is nearer than what was found before."""

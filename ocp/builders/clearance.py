@@ -104,15 +104,14 @@ class Clear:
             horizon: Of the problem, s; None where it is free, and then nothing may move by itself.
 
         Raises:
-            ProblemError: A moving obstacle and a free horizon; obstacles whose motion has no bound.
+            ProblemError: A moving obstacle and a free horizon; obstacles whose motion is not
+                defined all the time, or made of operations without bounds.
         """
         around, time = self.surroundings, begin + pace * problem.time
         _check_limits(around, problem.declared.states[joints_name])
-        n = len(around.pairs)
-        speed, acceleration = np.zeros(n), np.zeros(n)
         if horizon is not None:
             try:
-                speed, acceleration = around.fastest(begin, begin + pace * horizon)
+                around.check_motions(begin, begin + pace * horizon)
             except ModelError as error:
                 raise ProblemError(str(error), **vars(error)) from error
         elif around.moves_by_itself:
@@ -127,12 +126,11 @@ class Clear:
             _said(around.placements, base, joints, time),
             hulls_of(around),
             around.pairs,
-            np.full(n, around.clearance),
+            np.full(len(around.pairs), around.clearance),
             levers={name: pair[0] for name, pair in moved.items()},
             turns={name: pair[1] for name, pair in moved.items()},
-            speed=pace * speed,
-            acceleration=pace**2 * acceleration,
             covers=around.covers,
+            assumed=around.assumed,
         )
         if self.margins:
             pairs = sorted(self.margins)
@@ -196,9 +194,8 @@ def clearance_of(
         movers={"joints": machine.joint_size},
         levers=levers.joints,
         turns=levers.joint_turns,
-        speed=np.zeros(n),
-        acceleration=np.zeros(n),
         covers=around.covers,
+        assumed=around.assumed,
     )
     sampler = Sampler([q], [placements])
     frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))

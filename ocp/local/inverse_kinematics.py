@@ -308,7 +308,7 @@ def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: An
     if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
         words = f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected"
         raise ProblemError(words, name="near", value=given, limit=(size,))
-    both = np.vstack([given, rng.uniform(low, high, size=(count, size))])
+    both = np.vstack([given, low + (high - low) * rng.random((count, size))])
     if not len(both):
         raise ProblemError("starts = 0 and near = None leave no start", name="starts", value=0, limit=1)
     return np.asarray(np.clip(both, lower, upper))

@@ -255,7 +255,7 @@ def _round(asked: Asked, clear: Clear, before: Array, after: Array) -> Array:
     bounds, least = asked.bounds, clear.surroundings.clearance
     low = np.maximum(np.minimum(before, after) - BESIDE, bounds.lower)
     high = np.minimum(np.maximum(before, after) + BESIDE, bounds.upper)
-    some = np.random.default_rng(asked.seed).uniform(low, high, size=(SEEN, len(before)))
+    some = low + (high - low) * np.random.default_rng(asked.seed).random((SEEN, len(before)))
     apart = distances_along(clear.surroundings, np.zeros(0), some, np.zeros(SEEN), least)
     free = some[(apart >= least).all(axis=1)]
     return np.asarray(free[np.argsort(((free - (before + after) / 2) ** 2).sum(axis=1))[:ROUND]])

@@ -181,6 +181,9 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
             parts = {one.name: getattr(value, one.name) for one in fields(value) if one.init}
             tracks = TRACKS.get(type(value), ())
+            if isinstance(value, Moving):  # as it takes them: its tables are polynomials already
+                parts |= {"position": lambda time: value.frame(time).position}
+                parts |= {"rotation": lambda time: value.frame(time).rotation}
             return {
                 "kind": type(value).__name__,
                 "fields": {

@@ -41,6 +41,8 @@ MAX_WORK = 2**26
 """Operations of one evaluation with all the calls in it: a short file can call functions that call functions."""
 MAX_ENTRIES = 2**20
 """Entries of all arguments and results of the functions of a file together."""
+OPAQUE = {"never_inline": True}
+"""Of functions that are no scalar arithmetic: where they are called on scalars, they stay calls."""
 MAX_DIMENSIONS = 6
 """Dimensions of a table that is interpolated."""
 MAX_DEGREE = 9
@@ -234,7 +236,7 @@ def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     if len(table) < 2 or (np.diff(table) < 0).any():
         raise ProblemError("the places of a table do not increase", name="table")
     x = ca.MX.sym("x", count)
-    return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})])
+    return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})], OPAQUE)
 
 
 def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
@@ -242,14 +244,14 @@ def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
-    return ca.Function("gather", [x], [ca.MX(ca.DM(table)).get_nz(False, x)])
+    return ca.Function("gather", [x], [ca.MX(ca.DM(table)).get_nz(False, x)], OPAQUE)
 
 
 def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """The solution of a system of linear equations."""
     size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
     matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
-    return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)])
+    return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)], OPAQUE)
 
 
 def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
@@ -277,9 +279,8 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     if len(coefficients) != size * int(np.prod(lengths, dtype=object)):
         raise ProblemError(f"{len(coefficients)} coefficients for {lengths} x {size}", name="coefficients")
     x = ca.MX.sym("x", len(knots), count)
-    return ca.Function(
-        "bspline", [x], [ca.bspline(x, ca.DM(coefficients), knots, degrees, size, {"lookup_mode": modes})]
-    )
+    value = ca.bspline(x, ca.DM(coefficients), knots, degrees, size, {"lookup_mode": modes})
+    return ca.Function("bspline", [x], [value], OPAQUE)
 
 
 def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:

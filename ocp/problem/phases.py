@@ -319,18 +319,14 @@ class _Placed:
         return replace(given, name=self._called(given.name), way=way, **parts)
 
     def _apart(self, given: Separation, length: float | None) -> Separation:
-        moved = given.speed.any() or given.acceleration.any()
-        if moved and length is None:
+        if length is None and ca.depends_on(given.placements, self.problem.time):
             words = f"phase {self.name!r}: {given.name!r} keeps clear of what moves by time, and needs a horizon that"
             raise ProblemError(f"{words} is a number", name=given.name)
-        scale = length if moved and length is not None else 1.0
         return replace(
             given,
             name=self._called(given.name),
             placements=self._placed(given.placements),
             movers={self._called(name): size for name, size in given.movers.items()},
-            speed=given.speed * scale,
-            acceleration=given.acceleration * scale**2,
         )
 
 

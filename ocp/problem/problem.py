@@ -18,6 +18,7 @@ import numpy as np
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
 from ocp.problem.hulls import Hull
+from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.separation import Separation, index_rows
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import (
@@ -364,30 +365,29 @@ class Problem:
         *,
         levers: Mapping[str, Any],
         turns: Mapping[str, Any],
-        speed: Any = 0.0,
-        acceleration: Any = 0.0,
         covers: Mapping[int, Any] | None = None,
+        assumed: Mapping[str, str] | None = None,
     ) -> None:
         """Declare bodies that have to stay apart at every time, which the audit proves and no method holds.
 
         Args:
             name: Unique among the constraints.
-            placements: Of F frames in world: rotation column by column, then position, one below the other. Of states,
-                parameters and time. Shape (12 F, 1).
+            placements: Of F frames in world: rotation column by column, then position, one below the other. Each of
+                states and parameters, or of time and parameters. Shape (12 F, 1).
             hulls: The bodies by name, on these frames or in world.
             pairs: Of each pair the two bodies, by their places in ``hulls``, and the frame from which one is seen from
                 the other, -1 for the world. Shape (n, 3).
             least: Least distance. Shape (n,) or a number, m.
             levers, turns: By the name of a state: how far, and by what angle, it moves and turns one body seen from the
                 other at most, by its unit; see :mod:`ocp.problem.separation`. Shape (n, size) each.
-            speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,) or a number.
             covers: By the place of a pair, pairs of bodies that hold its two between them. Shape (m, 2) each.
+            assumed: Pairs that are left out by assumption, in words, and why: the audit tells them.
         """
         self._unused_constraint("separation", name)
         movers = {}
         for each in (*levers, *turns):
             movers[each] = self._find(self.declared.states, each, "separation").size
-        parts = {}
+        parts: dict[str, Any] = {}
         count = len(index_rows(f"separation {name!r}", "pairs", pairs, 3))
         for label, given in (("levers", levers), ("turns", turns)):
             what = f"separation {name!r}: {label}"
@@ -395,20 +395,13 @@ class Problem:
             parts[label] = (
                 np.hstack([np.reshape(column, (count, -1)) for column in columns]) if columns else np.zeros((count, 0))
             )
-        known = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
-        frames = self._expression(f"separation {name!r}: placements", placements, [*known, self.time])
-        self.declared.apart[name] = Separation(
-            name,
-            frames,
-            dict(hulls),
-            pairs,
-            least,
-            movers,
-            speed=speed,
-            acceleration=acceleration,
-            covers={} if covers is None else covers,
-            **parts,
-        )
+        parameters = [v.symbol for v in self.declared.parameters.values()]
+        known = [*(v.symbol for v in self.declared.states.values()), *parameters, self.time]
+        frames = self._expression(f"separation {name!r}: placements", placements, known)
+        parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
+        apart = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
+        PrescribedMotion(apart, frames, self.time, parameters, [ca.DM.zeros(each.shape) for each in parameters])
+        self.declared.apart[name] = apart
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""

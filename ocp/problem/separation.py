@@ -8,11 +8,12 @@ To prove anything between two times it has to be known how the states move the b
 with x the states that move the two, a state of rate x_k' moves no point of them by more than lever_k |x_k'| and turns
 none by more than turn_k |x_k'|. A point that is carried by many axes, each by those before it, has at most
 
-    |p'| <= sum lever_k |x_k'| + speed,
-    |p''| <= sum lever_k |x_k''| + 2 (sum turn_k |x_k'|) (sum lever_k |x_k'|) + acceleration,
+    |p'| <= sum lever_k |x_k'|,
+    |p''| <= sum lever_k |x_k''| + 2 (sum turn_k |x_k'|) (sum lever_k |x_k'|),
 
-p being one body's point less the other's, speed and acceleration those of what moves by time alone. (The factor 2 is
-that of Coriolis: an axis that comes later moves points no farther than by its lever, and is turned by all before it.)
+p being one body's point less the other's. (The factor 2 is that of Coriolis: an axis that comes later moves points no
+farther than by its lever, and is turned by all before it.) How frames move that time alone places is not told: it is
+bounded from their expressions (:mod:`ocp.problem.prescribed`).
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class Separation:
 
     Attributes:
         name: Unique among those of a problem.
-        placements: Of F frames in world: rotation column by column, and position, one below the other, expressions of
-            states, parameters and time. Shape (12 F, 1).
+        placements: Of F frames in world: rotation column by column, and position, one below the other, each an
+            expression of states and parameters, or of time and parameters. Shape (12 F, 1).
         hulls: The bodies, by their names.
         pairs: Of each pair the two bodies, by their places in ``hulls``, and the frame in which one is seen from the
             other, -1 for the world. Shape (n, 3).
@@ -48,9 +49,10 @@ class Separation:
         movers: Names of the states that move them, with their sizes.
         levers, turns: As above, of the states in ``movers`` one after the other. Shape (n, k), in m and rad by the unit
             of the state.
-        speed, acceleration: Of one body seen from the other by time alone, at most. Shape (n,), m/s and m/s^2.
         covers: By the place of a pair, pairs of bodies, shape (m, 2), that hold its two between them: where the nearest
             of these is farther apart than the pair is by itself, it is so far apart. Levers and turns hold for all.
+        assumed: Pairs of bodies that are not looked at, though no proof says that they may be left, and why. They are
+            told wherever the separation is judged.
 
     Raises:
         ProblemError: Other shapes, what is not finite, or negative, a body or frame that there is none of.
@@ -64,9 +66,8 @@ class Separation:
     movers: dict[str, int]
     levers: np.ndarray
     turns: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
     covers: Mapping[int, np.ndarray] = field(default_factory=dict)
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         what = f"separation {checked_text('separation: its name', self.name)!r}"
@@ -82,6 +83,9 @@ class Separation:
                 words = f"{what}: covers: there is no pair {pair!r}, only {n}"
                 raise ProblemError(words, name="covers", value=pair, limit=n)
             covers[int(pair)] = index_rows(what, "covers", both, 2)
+        for other, why in checked_mapping(f"{what}: assumed", self.assumed).items():
+            checked_text(f"{what}: assumed", other)
+            checked_text(f"{what}: assumed", why)
         object.__setattr__(self, "covers", {pair: both for pair, both in covers.items() if len(both)})
         for label, both in (("pairs", pairs[:, :2]), *(("covers", each) for each in covers.values())):
             if both.size and (both.min() < 0 or both.max() >= len(self.hulls) or (both[:, 0] == both[:, 1]).any()):
@@ -99,7 +103,7 @@ class Separation:
             words = f"{what}: a half-space has to be seen from the frame that it rides on, where it stands still"
             raise ProblemError(words, name="pairs")
         object.__setattr__(self, "pairs", pairs)
-        shapes = {"least": (n,), "levers": (n, k), "turns": (n, k), "speed": (n,), "acceleration": (n,)}
+        shapes = {"least": (n,), "levers": (n, k), "turns": (n, k)}
         for label, shape in shapes.items():
             value = table(f"{what}: {label}", getattr(self, label))
             value = np.broadcast_to(value, shape) if value.ndim == 0 else value.reshape(shape) if not n else value
@@ -129,9 +133,10 @@ class Separation:
         """The same of some pairs alone."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
-        parts |= {label: getattr(self, label)[keep] for label in ("speed", "acceleration")}
         covers = {place: self.covers[pair] for place, pair in enumerate(keep) if pair in self.covers}
-        return Separation(self.name, self.placements, self.hulls, movers=self.movers, covers=covers, **parts)
+        return Separation(
+            self.name, self.placements, self.hulls, movers=self.movers, covers=covers, assumed=self.assumed, **parts
+        )
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:

@@ -157,33 +157,6 @@ def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
     assert tight > 0.5  # and the bounds are no idle ones
 
 
-def test_a_moving_obstacle_is_no_faster_than_its_bounds() -> None:
-    box = Box((0.2, 0.1, 0.3), (0.1, 0, 0))
-    spin = 2.0
-
-    def turned(t: Any) -> Any:
-        c, s = ca.cos(spin * t), ca.sin(spin * t)
-        return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-
-    moving = Moving(box, lambda t: ca.vertcat(0.5 * t, 0.1 * ca.sin(3 * t), 0.4), turned)
-    speed, bend = moving.fastest(0.0, 2.0)
-    times = np.linspace(0, 2, 5001)
-    places = np.array(
-        [np.array(moving.frame(t).rotation) @ box.core.T + np.array(moving.frame(t).position) for t in times]
-    )
-    rates = np.gradient(places, times, axis=0)
-    sampled = np.linalg.norm(rates, axis=1).max()
-    assert sampled <= speed * (1 + 1e-6)
-    assert speed <= 1.2 * sampled
-    pushes = np.linalg.norm(np.gradient(rates, times, axis=0)[2:-2], axis=1).max()
-    assert pushes <= bend * (1 + 1e-5)
-    assert bend <= 1.3 * pushes
-    around = Surroundings(FixedBase(armoured_arm()), [moving])
-    speeds, _ = around.fastest(0.0, 2.0)
-    assert_allclose(speeds[[i for i, pair in enumerate(around.labels) if "obstacle 0" in pair]], speed)
-    assert np.all(speeds[[i for i, pair in enumerate(around.labels) if "obstacle 0" not in pair]] == 0)
-
-
 def test_each_obstacle_that_moves_is_where_it_is_then() -> None:
     """Two of them, others between: beside each link as if it stood where it is at that time."""
     machine = machines()["arm"]
@@ -272,16 +245,20 @@ def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
         Moving(**{**good, **given})
 
 
-def test_a_rotation_that_grows_with_time_is_none() -> None:
-    moving = Moving(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0), lambda t: (1 + t) * ca.SX.eye(3))
-    with pytest.raises(ModelError, match=r"rotation .* at 0\.5 s"):
-        moving.fastest(0.0, 1.0)
-
-
-def test_a_motion_without_a_bound() -> None:
-    moving = Moving(Sphere(0.1, (0, 0, 0)), lambda t: (ca.sqrt(t), 0, 0))
-    with pytest.raises(ModelError, match="no bound"):
-        moving.fastest(0.0, 1.0)
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"rotation": lambda t: (1 + t) * ca.SX.eye(3)}, r"rotation .* at 0\.00195312 s"),
+        ({"position": lambda t: (ca.sqrt(0.5 - t), 0, 0)}, r"position .* is not finite, at 0\.501953 s"),
+        ({"position": lambda t: (1 / t, 0, 0)}, r"position .* is not finite, at 0 s"),
+    ],
+)
+def test_a_motion_that_is_none_at_some_time_is_told_with_the_time(given: dict[str, Any], word: str) -> None:
+    moving = Moving(**{"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0), **given})
+    around = Surroundings(FixedBase(armoured_arm()), [moving])
+    with pytest.raises(ModelError, match=word) as caught:
+        around.check_motions(0.0, 1.0)
+    assert caught.value.time is not None
 
 
 def test_a_slide_without_limits() -> None:

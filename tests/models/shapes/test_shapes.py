@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from models import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
-from models.shapes.hull import convex_hull, kept_hull
+from models.shapes.hull import convex_hull
 from tests.models.shapes.shape_oracles import random_frame, random_shape
 
 KINDS = (Sphere, Capsule, Cylinder, Box, Mesh)
@@ -46,52 +45,20 @@ def test_reach_is_the_distance_of_the_farthest_point(kind: type) -> None:
     assert farthest >= 0.95 * shape.reach(point)
 
 
-@pytest.mark.parametrize("broken", ["", "null", "[3]", "[[], [], [], []]", '{"a": 1}', "small", "of others"])
-def test_a_hull_is_kept_and_a_broken_file_is_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_mesh_around_a_hull_is_that_of_its_points() -> None:
     points = np.random.default_rng(3).normal(size=(50, 3))
-    first, again = kept_hull(points), kept_hull(points)
-    (file,) = (tmp_path / "selfmotion").iterdir()
-    vertices, *others = json.loads(file.read_text(encoding="utf-8"))
-    told = {
-        "small": [(0.9 * np.array(vertices)).tolist(), *others],
-        "of others": [vertices, *others[:2], others[2][1:]],
-    }
-    file.write_text(json.dumps(told[broken]) if broken in told else broken, encoding="utf-8")
-    for found in (again, kept_hull(points)):
-        for what in ("vertices", "faces", "normals", "offsets"):
-            np.testing.assert_array_equal(getattr(found, what), getattr(first, what))
-    mesh = Mesh.around(first)
+    mesh = Mesh.around(convex_hull(points))
     np.testing.assert_array_equal(mesh.core, Mesh(points).core)
     turn, shift = random_frame(np.random.default_rng(4)).rotation, (1.0, 2.0, 3.0)
     np.testing.assert_array_equal(mesh.placed(turn, shift).core, Mesh(points).placed(turn, shift).core)
 
 
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
-def test_a_kept_hull_is_read_and_one_a_little_too_small_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: float
-) -> None:
-    """By a share of its size, whatever that is: what is kept of a body of 1 um or 1 km is sound just as well."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    points = size * np.random.default_rng(5).normal(size=(30, 3))
-    known, sought = kept_hull(points), list[int]()
-
-    def seeking(given: Any) -> Any:
-        sought.append(1)
-        return convex_hull(given)
-
-    monkeypatch.setattr("models.shapes.hull.convex_hull", seeking)
-    kept_hull(points)
-    assert not sought
-    (file,) = (tmp_path / "selfmotion").iterdir()
-    vertices, faces, normals, offsets = json.loads(file.read_text(encoding="utf-8"))
-    for share, seeks in ((1e-12, False), (1e-7, True)):
-        file.write_text(json.dumps([vertices, faces, normals, [(1 - share) * x for x in offsets]]), encoding="utf-8")
-        kept_hull(points)
-        assert bool(sought) is seeks
-    np.testing.assert_array_equal(kept_hull(points).offsets, known.offsets)
+def test_the_hull_of_a_finely_meshed_ball_keeps_every_corner_and_holds_all_points() -> None:
+    points = np.random.default_rng(5).normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    hull = convex_hull(points)
+    assert len(hull.vertices) == len(points)
+    assert (points @ hull.normals.T <= hull.offsets).all()
 
 
 def test_the_corners_of_a_box_are_listed_along_z_first_then_y_then_x() -> None:

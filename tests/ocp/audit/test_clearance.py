@@ -155,7 +155,7 @@ def test_bounds_lie_below_a_fine_sampling_and_near_it(seed: int) -> None:
 
 
 def test_what_time_alone_moves() -> None:
-    """A post that crosses the way: seen at the right time, and with the speed that is told, in between."""
+    """A post that crosses the way: seen at the right time, in between."""
     problem = Problem("crossing")
     q = problem.state("q", initial=[0, 0, 0], terminal=[1, 0, 0])
     u = problem.control("u", 3)
@@ -166,7 +166,7 @@ def test_what_time_alone_moves() -> None:
     hulls = {"ball": BALL, "post": Hull(1, np.zeros((1, 3)), 0.1)}
     problem.separate(
         "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], 0.0,
-        levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))}, speed=2.0, acceleration=0.0,
+        levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
     )  # fmt: skip
     found = proof(problem, 3)
     assert found.worst is not None
@@ -297,7 +297,7 @@ def test_covers_stay_with_their_pair() -> None:
     pairs = [[0, 2, -1], [0, 1, -1], [3, 0, -1]]
     apart = Separation(
         "clearance", ca.SX.sym("place", 12), HOLLOW, np.array(pairs), np.zeros(count), {"q": 3},
-        np.ones((count, 3)), np.zeros((count, 3)), np.zeros(count), np.zeros(count),
+        np.ones((count, 3)), np.zeros((count, 3)),
         {1: np.array(OF_BARS[0]), 2: np.zeros((0, 2))},
     )  # fmt: skip
     assert list(apart.covers) == [1]
@@ -330,7 +330,7 @@ def swinging(low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.
     apart = Separation(
         "clearance", place, {"point": Hull(0, np.zeros((1, 3))), "floor": Hull(-1, np.array([[0, -1.0, 0]]), 0.0, UP)},
         np.array([[0, 1, -1]]), np.array([1.0 + asked]), {"slide": 1, "turn": 1},
-        np.array([[1.0, reach]]), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1),
+        np.array([[1.0, reach]]), np.array([[0.0, 1.0]]),
     )  # fmt: skip
 
     def frames(at: np.ndarray) -> Frames:
@@ -404,7 +404,7 @@ def test_the_unit_of_a_state_does_not_matter(unit: float) -> None:
     for asked in (0.5, 0.99, 1.0 + 1e-3):
         apart = Separation(
             "clearance", ca.SX.sym("place", 12), hulls, np.array([[0, 1, -1]]), np.array([asked]), {"height": 1},
-            unit * one, 0 * one, np.zeros(1), np.zeros(1),
+            unit * one, 0 * one,
         )  # fmt: skip
         found = clearance_along(apart, Track(np.array([0.0, 1.0]), 1.0, rate, second, True, frames))
         assert found.settled
@@ -476,8 +476,6 @@ BAD: dict[str, dict[str, Any]] = {
     "frame-of-none": {"pairs": [[0, 1, 3]]},
     "least-nan": {"least": np.nan},
     "least-of-another-size": {"least": [0.0, 1.0]},
-    "speed-negative": {"speed": -1.0},
-    "acceleration-text": {"acceleration": "fast"},
     "covers-of-no-pair": {"covers": {1: [[0, 1]]}},
     "covers-of-a-truth": {"covers": {True: [[0, 1]]}},
     "covers-by-name": {"covers": {"a": [[0, 1]]}},

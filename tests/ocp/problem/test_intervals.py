@@ -1,4 +1,7 @@
-"""Bounds of expressions over intervals: every sample lies inside, and halves of intervals have half the excess."""
+"""Ranges and slopes of expressions over intervals: every sample and every difference quotient lies inside.
+
+Halves of intervals have half the excess.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import ModelError
-from models.shapes.intervals import RULES, bounds
+from ocp import ProblemError
+from ocp.problem.enclosures import Enclosures
+from ocp.problem.intervals import RULES
 
 T = ca.SX.sym("t")
 ONE: dict[str, Callable[[Any], Any]] = {
@@ -62,6 +66,7 @@ TWO: dict[str, Callable[[Any, Any], Any]] = {
     "angle": ca.atan2,
     "hypotenuse": ca.hypot,
     "remainder": ca.fmod,
+    "remainder of the nearest": ca.remainder,
     "sign of another": ca.copysign,
     "less": lambda x, y: x < y,
     "less or equal": lambda x, y: x <= y,
@@ -76,18 +81,30 @@ ends = st.floats(-6, 6).map(lambda x: round(x * 8) / 8) | st.floats(-3, 3)
 intervals = st.tuples(ends, ends).map(sorted)
 
 
+def bounds(values: Any, symbol: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    found = Enclosures(values, symbol)(low, high)
+    return found.low, found.high
+
+
 def assert_inside(values: Any, low: float, high: float, parts: tuple[Any, ...] = ()) -> None:
-    """Of all samples at which the values and their parts are numbers."""
-    lower, upper = bounds(values, T, [low], [high])
+    """Of all samples at which the values and their parts are numbers, and of the slopes between them."""
+    lower, upper, least, most = Enclosures(values, T)([low], [high])
     assert lower.shape == upper.shape == (1, values.shape[0])
     times = np.unique(np.concatenate([np.linspace(low, high, 101), [low, high]]).clip(low, high))
     every = ca.densify(ca.vertcat(values, *parts))
     found = np.array(ca.Function("f", [T], [every])(times[None])).reshape(every.shape[0], -1, order="F")
     sound = ~np.isnan(found[values.shape[0] :]).any(axis=0)
     for entry in range(values.shape[0]):
-        row = found[entry][sound & ~np.isnan(found[entry])]
+        kept = sound & np.isfinite(found[entry])
+        row, when = found[entry][kept], times[kept]
         assert (row >= lower[0, entry]).all(), (lower, row.min())
         assert (row <= upper[0, entry]).all(), (upper, row.max())
+        for stride in (1, 7, 50):
+            steps, rises = when[stride:] - when[:-stride], row[stride:] - row[:-stride]
+            rounding = 1e-13 * (1 + np.abs(row).max(initial=0.0))
+            with np.errstate(over="ignore"):
+                assert (rises >= least[0, entry] * steps - rounding).all(), (least, rises / steps)
+                assert (rises <= most[0, entry] * steps + rounding).all(), (most, rises / steps)
 
 
 @pytest.mark.parametrize("name", ONE)
@@ -195,7 +212,10 @@ def test_the_excess_is_halved_with_the_intervals() -> None:
         (ca.if_else(ca.floor(T) == T, 3, 7), 0.5, 0.75, 7, 7),
         (ca.if_else(ca.floor(T) == ca.ceil(T), 3, 7), 0.5, 0.75, 7, 7),
         (ca.copysign(2, T), 1, 2, 2, 2),
-        (ca.copysign(2, T), -2, -1, -2, 2),
+        (ca.copysign(2, T), -2, -1, -2, -2),
+        (ca.copysign(2, T), -2, 0, -2, 2),
+        (ca.remainder(T, 2), 2.5, 3.5, -1, 1),
+        (ca.remainder(T, 2), 1.5, 2.5, -0.5, 0.5),
         (ca.hypot(T, 3), -4, 1, 3, 5),
         (ca.fmin(T, 1), 0, 2, 0, 1),
         (ca.fmax(T, 1), 0, 2, 1, 2),
@@ -232,7 +252,7 @@ def test_both_kinds_of_symbols_have_the_same_bounds() -> None:
 
 def test_what_has_no_bounds_is_named() -> None:
     assert len(RULES) > 40
-    with pytest.raises(ModelError, match="erf has no bounds") as caught:
+    with pytest.raises(ProblemError, match="operation 'erf' has no bounds") as caught:
         bounds(ca.erf(T), T, 0, 1)
     assert caught.value.name == "erf"
     strange = ca.SX.sym("strange")
@@ -248,6 +268,6 @@ def test_what_has_no_bounds_is_named() -> None:
         (T, T, np.nan, 1, "low"),
         (T, T, 0, np.inf, "high"),
     ):
-        with pytest.raises(ModelError) as caught:
+        with pytest.raises(ProblemError) as caught:
             bounds(values, symbol, low, high)
         assert caught.value.name == name

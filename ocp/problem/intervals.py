@@ -1,4 +1,4 @@
-"""Bounds of an expression of time over whole intervals of it: interval arithmetic over the graph of the expression.
+"""Interval arithmetic: the range of each instruction of an expression over whole intervals of its inputs.
 
 Moore, Kearfott & Cloud, *Introduction to Interval Analysis*, 2009, chapters 2 to 5. Every instruction is done on all
 intervals at once and its result is let out by a few roundings, so the bounds hold for the real value as well as for
@@ -8,17 +8,19 @@ are half as wide.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
-from models.errors import ModelError
-from models.spatial import FULL_TURN, Expression, expression
+from ocp.errors import ProblemError
 
+__all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided", "evaluate", "multiple_of"]
+
+Array: TypeAlias = np.ndarray
+FULL_TURN = 2 * np.pi
 OUTWARD = 4 * float(np.finfo(float).eps)
 """Share of a bound by which every result is let out; the functions of a C library are that good."""
 SMALLEST = 1e-300
@@ -41,69 +43,38 @@ class Interval(NamedTuple):
     part: tuple[Interval, Interval] | None = None
 
 
-def bounds(values: Expression, symbol: Expression, low: ArrayInput, high: ArrayInput) -> tuple[Array, Array]:
-    """Bounds of each entry of a column of expressions of one symbol, over many intervals of the symbol.
-
-    They hold wherever the entry and all that it is made of are numbers: the root of something that dips below zero
-    counts where it is defined. An entry that the intervals do not bound, as 1/x about 0, gets -inf and inf.
+def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
+    """Return the range of each entry of the only output of an SX function, in their order.
 
     Args:
-        values: Expressions of the symbol and of nothing else, SX, or MX that can be expanded. Shape (n, 1).
-        symbol: Shape (1, 1).
-        low, high: Ends of the intervals. Shape (M,).
-
-    Returns:
-        Lower and upper bounds. Shapes (M, n).
-
-    Raises:
-        ModelError: An instruction that is not known, by name; another symbol in the values; ends of different numbers,
-            not finite, or in the wrong order.
+        function: Of scalars; its instructions are those of `RULES`, see `check_instructions`.
+        inputs: The range of each input, over the same M intervals.
     """
-    starts = checked_array(low, ("intervals",), "bounds", "low")
-    ends = checked_array(high, ("intervals",), "bounds", "high")
-    if starts.shape != ends.shape:
-        message = f"bounds: {len(ends)} high ends of {len(starts)} intervals"
-        raise ModelError(message, name="high", value=len(ends), limit=len(starts))
-    if (starts > ends).any():
-        wrong = int(np.flatnonzero(starts > ends)[0])
-        message = f"bounds: interval {wrong} ends at {ends[wrong]} before it starts at {starts[wrong]}"
-        raise ModelError(message, name="high", value=ends[wrong], limit=starts[wrong])
-    function = _instructions(values, symbol)
     slots: dict[int, Interval] = {}
-    found: dict[int, Interval] = {}
+    outputs: dict[int, Interval] = {}
     for k in range(function.n_instructions()):
-        code, inputs = function.instruction_id(k), function.instruction_input(k)
+        code, given = function.instruction_id(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
-            found[function.instruction_output(k)[1]] = slots[inputs[0]]
-            continue
-        if code == ca.OP_INPUT:
-            result = Interval(starts, ends)
-        elif code == ca.OP_CONST:
-            result = _constant(function.instruction_constant(k), starts)
-        elif code in RULES:
-            result = RULES[code](*(slots[slot] for slot in inputs))
+            outputs[function.instruction_output(k)[1]] = slots[given[0]]
         else:
+            slots[function.instruction_output(k)[0]] = (
+                inputs[given[0]]
+                if code == ca.OP_INPUT
+                else constant(function.instruction_constant(k), inputs[0].low)
+                if code == ca.OP_CONST
+                else RULES[code](*(slots[slot] for slot in given))
+            )
+    return [outputs[k] for k in range(len(outputs))]
+
+
+def check_instructions(what: str, function: Any) -> None:
+    """Raise ProblemError that names an instruction of an SX function which no rule bounds."""
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
             name = NAMES.get(code, str(code))
-            raise ModelError(f"bounds: {name} has no bounds", name=name, value=code, limit=sorted(NAMES))
-        slots[function.instruction_output(k)[0]] = result
-    columns = [found[k] for k in range(len(found))]
-    return np.column_stack([entry.low for entry in columns]), np.column_stack([entry.high for entry in columns])
-
-
-def _instructions(values: Expression, symbol: Expression) -> Any:
-    column = expression(values)
-    symbol_ok = isinstance(symbol, ca.SX | ca.MX) and symbol.shape == (1, 1) and symbol.is_valid_input()
-    if not symbol_ok:
-        raise ModelError(f"bounds: symbol {symbol!r} is no scalar symbol", name="symbol", value=symbol)
-    if column.shape[1] != 1 or column.shape[0] == 0:
-        message = f"bounds: values have shape {column.shape}, expected (n, 1)"
-        raise ModelError(message, name="values", value=column.shape, limit=("n", 1))
-    try:
-        function = ca.Function("values", [symbol], [ca.densify(type(symbol)(column))])
-        return function if isinstance(symbol, ca.SX) else function.expand()
-    except (RuntimeError, NotImplementedError, TypeError) as error:
-        message = f"bounds: values are no expressions of the symbol alone: {str(error).splitlines()[-1]}"
-        raise ModelError(message, name="values", value=values) from error
+            words = f"{what}: the operation {name!r} has no bounds; write it with elementary functions"
+            raise ProblemError(words, name=name, value=code)
 
 
 # ---- rules ----------------------------------------------------------------------------------------------------------
@@ -116,7 +87,8 @@ def _out(low: Any, high: Any) -> Interval:
     return Interval(low - spread[0], high + spread[1])
 
 
-def _constant(value: float, like: Array) -> Interval:
+def constant(value: float, like: Array) -> Interval:
+    """Return the range of a number over as many intervals as an array has entries."""
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 
@@ -145,18 +117,19 @@ def _opposite(test: Interval, other: Interval) -> bool:
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
     """One value where the test holds, else the other."""
-    holds, fails = _surely(test)
+    holds, fails = decided(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
     return Interval(low, high)
 
 
-def _surely(test: Interval) -> tuple[Any, Any]:
+def decided(test: Interval) -> tuple[Any, Any]:
+    """Return where a test holds all over the interval, and where it fails all over it. Shape (M,) each."""
     return (test.low > 0) | (test.high < 0), (test.low == 0) & (test.high == 0)
 
 
 def _if_else_zero(test: Interval, value: Interval) -> Interval:
-    found = _either(test, value, _constant(0.0, value.low))
+    found = _either(test, value, constant(0.0, value.low))
     return found._replace(part=(test, value))
 
 
@@ -192,7 +165,7 @@ def _power(x: Interval, y: Interval) -> Interval:
     if fixed and float(y.low[0]).is_integer():
         exponent = int(y.low[0])
         if exponent < 0:
-            return _inverse(_power(x, _constant(-exponent, x.low)))
+            return _inverse(_power(x, constant(-exponent, x.low)))
         if exponent % 2 == 0:
             base = _absolute(x)
             return _clamped(_out(base.low**exponent, base.high**exponent), low=0.0)
@@ -290,22 +263,40 @@ def _most(x: Interval, y: Interval) -> Interval:
 
 def _copysign(x: Interval, y: Interval) -> Interval:
     size = _absolute(x)
-    return _either(_below(y, _constant(0.0, y.low), strict=False), _hull(_negative(size), size), size)
+    other = _negative(size)
+    both = _hull(other, size)  # of a zero the sign is not known
+    return Interval(np.where(y.low > 0, size.low, both.low), np.where(y.high < 0, other.high, both.high))
 
 
 def _hull(x: Interval, y: Interval) -> Interval:
     return Interval(np.minimum(x.low, y.low), np.maximum(x.high, y.high))
 
 
-def _remainder(x: Interval, y: Interval) -> Interval:
-    """fmod: x minus the whole multiple of y towards zero; that multiple is known where the quotients' is."""
+def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
+    """Return the whole multiple of y next to x, a quotient being rounded so, and where it is one all over."""
     quotient = _divide(x, y)
-    multiple = np.trunc(quotient.low)
-    known = multiple == np.trunc(quotient.high)
+    multiple = rounded(quotient.low)
+    known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
+    return np.where(known, multiple, 0.0), known
+
+
+def _modulo(x: Interval, y: Interval) -> Interval:
+    """fmod: x minus the whole multiple of y towards zero; its sign is that of x."""
+    multiple, known = multiple_of(x, y, np.trunc)
     same = _subtract(x, _multiply(Interval(multiple, multiple), y))
     most = np.minimum(_absolute(y).high, _absolute(x).high)
     low, high = np.where(x.low < 0, -most, 0.0), np.where(x.high > 0, most, 0.0)
     return Interval(np.where(known, np.maximum(same.low, low), low), np.where(known, np.minimum(same.high, high), high))
+
+
+def _remainder(x: Interval, y: Interval) -> Interval:
+    """Return x minus the nearest whole multiple of y."""
+    multiple, known = multiple_of(x, y, np.rint)
+    same = _subtract(x, _multiply(Interval(multiple, multiple), y))
+    half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
+    return Interval(
+        np.where(known, np.maximum(same.low, -half), -half), np.where(known, np.minimum(same.high, half), half)
+    )
 
 
 def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
@@ -322,17 +313,17 @@ def _equal(x: Interval, y: Interval) -> Interval:
 
 
 def _not(x: Interval) -> Interval:
-    holds, fails = _surely(x)
+    holds, fails = decided(x)
     return Interval(np.where(fails, 1.0, 0.0), np.where(holds, 0.0, 1.0), negates=x)
 
 
 def _and(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = _surely(x), _surely(y)
+    (first, first_fails), (second, second_fails) = decided(x), decided(y)
     return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
 
 
 def _or(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = _surely(x), _surely(y)
+    (first, first_fails), (second, second_fails) = decided(x), decided(y)
     return Interval(np.where(first | second, 1.0, 0.0), np.where(first_fails & second_fails, 0.0, 1.0))
 
 
@@ -379,7 +370,8 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "FABS": _absolute,
     "FMIN": _least,
     "FMAX": _most,
-    "FMOD": _remainder,
+    "FMOD": _modulo,
+    "REMAINDER": _remainder,
     "COPYSIGN": _copysign,
     "FLOOR": _step(np.floor),
     "CEIL": _step(np.ceil),

@@ -1,0 +1,227 @@
+"""Ranges and slopes of expressions of one symbol over whole intervals of it, valid across kinks and jumps.
+
+This is forward-mode differentiation in interval arithmetic. Each instruction carries its range and an interval of
+slopes that holds every difference quotient (x(s) - x(t)) / (s - t) of two places in the interval. A smooth operation
+passes slopes on by the mean value theorem. At a kink the slopes of both sides are hulled, as in Clarke's generalised
+gradient (Clarke 1983, *Optimization and Nonsmooth Analysis*, section 2.3). Where a jump cannot be ruled out the slopes
+have no bounds and the range alone says how far the value may go. No derivative of a whole expression is ever taken:
+casadi's leaves jumps out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ocp.errors import ProblemError
+from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
+from ocp.problem.values import table
+
+__all__ = ["Enclosure", "Enclosures"]
+
+
+class Enclosure(NamedTuple):
+    """Bounds of n expressions over M intervals; -inf and inf where there are none.
+
+    Attributes:
+        low, high: Of the values. Shape (M, n).
+        least, most: Of the slopes: of all difference quotients within an interval. Shape (M, n).
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+
+
+class Enclosures:
+    """Bounds of a column of expressions of one symbol, over any intervals of the symbol.
+
+    Bounds hold wherever an entry and all that it is made of are numbers: the root of something that dips below zero
+    counts where it is defined.
+
+    Raises:
+        ProblemError: An operation without a rule, by name; another symbol in the values; a shape other than (n, 1).
+    """
+
+    def __init__(self, values: Any, symbol: Any, what: str = "bounds") -> None:
+        if not (isinstance(symbol, ca.SX | ca.MX) and symbol.shape == (1, 1) and symbol.is_valid_input()):
+            raise ProblemError(f"{what}: symbol {symbol!r} is no scalar symbol", name="symbol", value=symbol)
+        try:
+            column = ca.densify(type(symbol)(values))
+            function = ca.Function("values", [symbol], [column])
+            self._function = function if isinstance(symbol, ca.SX) else function.expand()
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            words = f"{what}: values are no expressions of the symbol alone: {str(error).splitlines()[-1]}"
+            raise ProblemError(words, name="values", value=values) from error
+        if column.shape[1] != 1 or column.shape[0] == 0:
+            words = f"{what}: values have shape {column.shape}, expected (n, 1)"
+            raise ProblemError(words, name="values", value=column.shape, limit=("n", 1))
+        check_instructions(what, self._function)
+
+    def __call__(self, low: Any, high: Any) -> Enclosure:
+        """Return the bounds over intervals of the symbol.
+
+        Args:
+            low, high: Ends of the intervals. Shape (M,).
+
+        Raises:
+            ProblemError: Ends of different numbers, not finite, or in the wrong order.
+        """
+        starts, ends = (np.atleast_1d(table(f"bounds: {name}", x)) for name, x in (("low", low), ("high", high)))
+        if starts.shape != ends.shape or starts.ndim != 1:
+            words = f"bounds: {ends.shape} high ends of {starts.shape} intervals"
+            raise ProblemError(words, name="high", value=ends.shape, limit=starts.shape)
+        if not (np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)).all():
+            wrong = int(np.flatnonzero(~(np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)))[0])
+            words = f"bounds: interval {wrong} goes from {starts[wrong]} to {ends[wrong]}"
+            name = "high" if np.isfinite(starts[wrong]) else "low"
+            raise ProblemError(words, name=name, value=float(ends[wrong]), limit=float(starts[wrong]))
+        columns = self._jets(_Jet(Interval(starts, ends), constant(1.0, starts)))
+        return Enclosure(*(np.column_stack([side(jet) for jet in columns]) for side in _SIDES))
+
+    def _jets(self, time: _Jet) -> list[_Jet]:
+        function, slots, outputs = self._function, dict[int, _Jet](), dict[int, _Jet]()
+        still = constant(0.0, time.value.low)
+        with np.errstate(all="ignore"):
+            for k in range(function.n_instructions()):
+                code, given = function.instruction_id(k), function.instruction_input(k)
+                if code == ca.OP_OUTPUT:
+                    outputs[function.instruction_output(k)[1]] = slots[given[0]]
+                    continue
+                if code == ca.OP_INPUT:
+                    found = time
+                elif code == ca.OP_CONST:
+                    found = _Jet(constant(function.instruction_constant(k), still.low), still)
+                else:
+                    rule: Callable[..., _Jet] = _KINKED.get(code, _smooth)
+                    found = rule(code, *(slots[slot] for slot in given))
+                slots[function.instruction_output(k)[0]] = found
+        return [outputs[k] for k in range(len(outputs))]
+
+
+class _Jet(NamedTuple):
+    """The range and the slopes of one instruction, over M intervals."""
+
+    value: Interval
+    slope: Interval
+
+
+_SIDES: tuple[Callable[[_Jet], np.ndarray], ...] = (
+    lambda jet: jet.value.low,
+    lambda jet: jet.value.high,
+    lambda jet: jet.slope.low,
+    lambda jet: jet.slope.high,
+)
+ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
+
+
+# ---- rules ----------------------------------------------------------------------------------------------------------
+
+
+def _where(known: Any, slope: Interval) -> Interval:
+    """Slopes that are known in some intervals, and without bounds in the others."""
+    return Interval(np.where(known, slope.low, -np.inf), np.where(known, slope.high, np.inf))
+
+
+def _smooth(code: int, *jets: _Jet) -> _Jet:
+    """The rule of an operation that is smooth where its range is bounded: the mean value theorem."""
+    value = RULES[code](*(jet.value for jet in jets))
+    powers = code in (ca.OP_POW, ca.OP_CONSTPOW)
+    exponent = _number(jets[1].value) if powers else None
+    slope = constant(0.0, value.low)
+    inputs = [jet.value for jet in jets[: 1 if exponent is not None else None]]
+    for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
+        if jet.slope.low.any() or jet.slope.high.any():
+            slope = ADD(slope, MULTIPLY(partial, jet.slope))
+    return _Jet(value, _where(np.isfinite(value.low) & np.isfinite(value.high), slope))
+
+
+@lru_cache(maxsize=4096)
+def _partials(code: int, count: int, exponent: float | None) -> Any:
+    """Partial derivatives of one operation as an SX function; of a power with a fixed exponent, by its base."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    if count == 1:
+        return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
+    if exponent is not None:
+        return ca.Function("partials", [x], [exponent * ca.constpow(x, exponent - 1)])
+    both = ca.vertcat(x, y)
+    return ca.Function("partials", [x, y], [ca.densify(ca.gradient(ca.SX.binary(code, x, y), both))])
+
+
+def _number(x: Interval) -> float | None:
+    """The number that an interval is, the same everywhere; None where it is none."""
+    first = float(x.low[0])
+    return first if bool((x.low == first).all() and (x.high == first).all()) else None
+
+
+def _steps(code: int, *jets: _Jet) -> _Jet:
+    """The rule of what is constant but for jumps: floor, ceil, sign, tests."""
+    value = RULES[code](*(jet.value for jet in jets))
+    return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
+
+
+def _absolute(code: int, x: _Jet) -> _Jet:
+    rises, falls = x.value.low >= 0, x.value.high <= 0
+    sign = Interval(np.where(rises, 1.0, -1.0), np.where(falls & ~rises, -1.0, 1.0))
+    return _Jet(RULES[code](x.value), MULTIPLY(sign, x.slope))
+
+
+def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
+    """The rule of fmin and fmax: the slopes of the one that is chosen, or of both."""
+    low, high = (x, y) if code == ca.OP_FMIN else (y, x)
+    first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
+    ends = [
+        np.where(first, one, np.where(second, other, both(one, other)))
+        for one, other, both in zip(
+            (x.slope.low, x.slope.high), (y.slope.low, y.slope.high), (np.minimum, np.maximum), strict=True
+        )
+    ]
+    return _Jet(RULES[code](x.value, y.value), Interval(ends[0], ends[1]))
+
+
+def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:
+    holds, fails = decided(test.value)
+    slope = Interval(np.where(holds, x.slope.low, 0.0), np.where(holds, x.slope.high, 0.0))
+    return _Jet(RULES[code](test.value, x.value), _where(holds | fails, slope))
+
+
+def _modulo(code: int, x: _Jet, y: _Jet) -> _Jet:
+    multiple, known = multiple_of(x.value, y.value, np.trunc if code == ca.OP_FMOD else np.rint)
+    slope = SUBTRACT(x.slope, MULTIPLY(Interval(multiple, multiple), y.slope))
+    return _Jet(RULES[code](x.value, y.value), _where(known, slope))
+
+
+def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
+    size = _absolute(ca.OP_FABS, x).slope
+    down = y.value.high < 0
+    slope = Interval(np.where(down, -size.high, size.low), np.where(down, -size.low, size.high))
+    return _Jet(RULES[code](x.value, y.value), _where(down | (y.value.low > 0), slope))
+
+
+def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
+    """The rule of atan2: smooth off the half-line where it jumps by a turn."""
+    found = _smooth(code, y, x)
+    off = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
+    return _Jet(found.value, _where(off, found.slope))
+
+
+_KINKED: dict[int, Callable[..., _Jet]] = {
+    ca.OP_FABS: _absolute,
+    ca.OP_FMIN: _extreme,
+    ca.OP_FMAX: _extreme,
+    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    ca.OP_FMOD: _modulo,
+    ca.OP_REMAINDER: _modulo,
+    ca.OP_COPYSIGN: _copysign,
+    ca.OP_ATAN2: _angle,
+    **{
+        getattr(ca, f"OP_{name}"): _steps
+        for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
+    },
+}
+"""Rules of operations that are not smooth, by the code of casadi's instruction; all others are."""
