@@ -183,8 +183,10 @@ def _planned(plan: PlanLike, path: Any, length: float, samples: int) -> tuple[Ar
         worst = int(off.argmax())
         if asked.any() and not off[worst] <= ON_PATH * length:
             found = f"are {off[worst]:.3g} m off the path" if off[worst] < np.inf else "ask for no position"
-            words = f"the plan's tasks {found} at {t[worst]:.6g} s: they do not run along all of it at one speed; give (distances, joints) instead of the plan"
-            raise ProblemError(words, name="plan", value=float(off[worst]), limit=ON_PATH * length, time=float(t[worst]))
+            words = f"the plan's tasks {found} at {t[worst]:.6g} s: they do not run along all of it at one speed; "
+            words += "give (distances, joints) instead of the plan"
+            told = {"value": float(off[worst]), "limit": ON_PATH * length, "time": float(t[worst])}
+            raise ProblemError(words, name="plan", **told)
     times = np.linspace(0.0, plan.horizon, samples)
     return length * plan.task_share(times), plan.at(times)["joints"]
 

@@ -64,8 +64,9 @@ def in_pieces(machine: FixedBase) -> Any:
 
 
 def least_velocities(machine: FixedBase) -> Any:
-    asked: dict[str, Any] = {"tip_velocity": np.array([-0.2, 0.15]), "rows": (3, 4), "start_joints": START, "horizon": 1.0}
-    return solve(minimum_velocity_problem(machine, **asked), Collocation(5)).cost
+    velocity = np.array([-0.2, 0.15])
+    problem = minimum_velocity_problem(machine, tip_velocity=velocity, rows=(3, 4), start_joints=START, horizon=1.0)
+    return solve(problem, Collocation(5)).cost
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
