@@ -172,7 +172,7 @@ def joint_path(
     return PlannedJoints(machine, own, float(length), error, curves, _forces(machine))
 
 
-def _planned(plan: PlanLike, path: Any, length: float, samples: int) -> tuple[Array, Array]:
+def _planned(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
     """Return distances (M,) and joints (M, n) of a plan, whose tasks are seen to run along the path at one speed."""
     if plan.targets and hasattr(path, "at"):
         t = plan.targets[0].t
