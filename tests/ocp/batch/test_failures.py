@@ -301,4 +301,4 @@ def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(t
 def test_a_batch_is_made_of_results_alone(tmp_path: Path) -> None:
     for wrong in ((1, 2), (None, ()), (tmp_path, [1])):
         with pytest.raises(ProblemError):
-            Batch(*wrong)  # type: ignore[arg-type]
+            Batch(*wrong)
