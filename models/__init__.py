@@ -18,6 +18,7 @@ from models.machines.surroundings import Surroundings
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
+from models.robot.example import example_robot
 from models.robot.kinematics import (
     center_of_mass,
     center_of_mass_jacobian,
@@ -93,6 +94,7 @@ __all__ = [
     "center_of_mass_jacobian",
     "center_of_mass_motion",
     "centers_of_mass",
+    "example_robot",
     "footprint",
     "frame_jacobian",
     "gyro_matrix",

@@ -113,7 +113,7 @@ def remove_left(target: Path) -> None:
         for name in os.listdir(target.parent):
             if part.fullmatch(name):
                 left = target.with_name(name)
-                with suppress(OSError), open(left, "rb") as stream:
+                with suppress(OSError, ProblemError), open_regular(left) as stream:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
                     left.unlink()
 
@@ -150,6 +150,28 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         raise ProblemError(f"{path} cannot be read: {error.strerror or error}", **told) from error
     except Exception as error:  # what zip, zlib and numpy say of broken bytes is of many kinds
         raise ProblemError(f"{path} is not a saved solution: {error}", **told) from error
+
+
+def open_regular(path: str | os.PathLike[str], most: int = MOST_BYTES) -> io.BufferedReader:
+    """Open a file that others may have written, to be read.
+
+    Raises:
+        OSError: It cannot be opened.
+        ProblemError: It is a link, no regular file, or has more than `most` bytes.
+    """
+    if os.path.islink(path):
+        raise ProblemError(f"{path} is a link, which is not followed", name="path", value=str(path))
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe would be waited for
+    try:
+        status = os.fstat(file)
+        check_regular(path, status)
+        if status.st_size > most:
+            words = f"{path} has {status.st_size} bytes, at most {most} are read"
+            raise ProblemError(words, name="path", value=status.st_size, limit=most)
+        return os.fdopen(file, "rb")
+    except BaseException:
+        os.close(file)
+        raise
 
 
 def checked_path(path: Any) -> str | os.PathLike[str]:

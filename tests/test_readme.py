@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
+import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
+from contextlib import suppress
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from scripts.robots import robots
 from scripts.site.executed import blocks
+from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
@@ -60,17 +65,85 @@ def test_the_readme_plans_and_the_tutorials_do_what_they_are_about() -> None:
     assert tutorials == {page.stem for page in (SITE / "tutorials").glob("*.md")}
 
 
-def test_the_readme_plans_for_many_places(tmp_path: Path) -> None:
-    """The script that it shows, for one place instead of a hundred times a hundred."""
-    text = README.read_text(encoding="utf-8")
-    script = re.search(r"`places\.py`.*?^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    assert script is not None
-    assert script[1].count("range(100)") == 2
-    source = script[1].replace("range(100)", "range(1)").replace("ur5.urdf", str(robots.UR5.path))
-    (tmp_path / "places.py").write_text(source, encoding="utf-8")
-    subprocess.run([sys.executable, "places.py"], cwd=tmp_path, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    rows = list(csv.DictReader((tmp_path / "places.csv").read_text(encoding="utf-8").splitlines()))
+HIDE = """
+import importlib.metadata as metadata, json, os, sys
+
+hidden, distributions = json.loads(os.environ["HIDDEN"])
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in hidden:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+there = metadata.MetadataPathFinder.find_distributions
+metadata.MetadataPathFinder.find_distributions = lambda *context: (
+    found for found in there(*context) if found.metadata["Name"] not in distributions
+)
+"""
+"""Of an environment without extras: modules and distributions that the package's own dependencies do not bring."""
+
+
+def core() -> set[str]:
+    """The distributions that `pip install .` brings, by their normal names."""
+    told = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    found, waiting = set[str](), list(told["project"]["dependencies"])
+    while waiting:
+        words = re.match(r"([\w.-]+)([^;]*)(;.*)?", waiting.pop())
+        assert words is not None
+        name = normal(words[1])
+        if name not in found and "extra" not in (words[3] or ""):
+            found.add(name)
+            with suppress(metadata.PackageNotFoundError):  # of another platform
+                waiting += metadata.requires(name) or []
+    return found
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_the_readme_runs_from_first_to_last_without_extras(tmp_path: Path) -> None:
+    """In a folder that is empty, with what `pip install .` installs alone, in processes of their own."""
+    kept = core()
+    owners = metadata.packages_distributions()
+    own = {name for name, brought in owners.items() if {normal(each) for each in brought} & kept} | {"models", "ocp"}
+    installed = [place for place in sys.path if Path(place).name == "site-packages"]
+    hidden = sorted({module.name for module in pkgutil.iter_modules(installed)} - own)
+    lost = [one.metadata["Name"] for one in metadata.distributions() if normal(one.metadata["Name"]) not in kept]
+    assert {"pinocchio", "coal", "yaml", "distributed", "pyarrow", "mcap"} <= set(hidden)
+    (tmp_path / "hiding").mkdir()
+    (tmp_path / "hiding" / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
+    home = tmp_path / "home"
+    home.mkdir()
+    there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "hiding"), str(ROOT)]), "MPLBACKEND": "Agg"}
+    there["HIDDEN"] = json.dumps([hidden, lost])
+    command = [sys.executable, "-c", "import sys; from ocp.app.command import main; sys.exit(main(sys.argv[1:]))"]
+    programs = {"python": [sys.executable], "selfmotion": command}
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        program = [*programs[words[0]], *words[1:]]
+        return subprocess.run(program, cwd=home, env=there, capture_output=True, text=True, check=False)
+
+    for gone in ("import coal", "from importlib.metadata import files; files('example-robot-data')"):
+        told = run("python", "-c", gone)
+        assert "ModuleNotFoundError" in told.stderr or "PackageNotFoundError" in told.stderr, told
+    for step in steps():
+        if step.file:
+            (home / step.file).write_text(step.text, encoding="utf-8")
+        if step.words:
+            told = run(*step.words)
+            assert told.returncode == 0, (step.words, told.stdout, told.stderr)
+    rows = list(csv.DictReader((home / "places.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["status"] for row in rows] == ["done"]
+    made = {path.name for path in home.iterdir()}
+    assert {"plan.csv", "six_axis.urdf", "seam.npz", "seam.html", "report.html", "places"} <= made
+
+
+def test_the_readme_shows_what_its_text_says_it_does() -> None:
+    names = [step.file or " ".join(step.words[:2]) for step in steps()]
+    commands = ["selfmotion plan", "selfmotion check", "selfmotion view", "selfmotion report"]
+    assert names == ["first.py", "seam.toml", *commands, "places.py"]
 
 
 def test_the_readme_is_short() -> None:

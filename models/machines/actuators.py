@@ -200,7 +200,7 @@ def gyros_of(robot: Robot) -> tuple[Gyro, ...]:
     for name, inertia in wheels.items():
         wheel = robot.joint(name)
         gimbal = moving.get(wheel.parent)
-        if gimbal is None or gimbal.kind != "continuous" or not np.isfinite(wheel.velocity):
+        if gimbal is None or gimbal.kind != "continuous" or not 0 < wheel.velocity < np.inf:
             continue
         alone = [joint.name for joint in robot.joints if joint.parent == wheel.parent] == [name]
         axis = np.asarray(wheel.rotation) @ np.asarray(wheel.axis)

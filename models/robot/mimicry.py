@@ -110,7 +110,8 @@ def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[s
     """Limits "lower", "upper", "velocity" and "effort" of the joint vector. Shape (dof,) each.
 
     No joint passes its limits, so that followers narrow the positions and slow the leaders that drive them. Effort is
-    that of the leader's own drive, the one actuator of them all: what loads the followers loads it too.
+    that of the leader's own drive, the one actuator of them all: what loads the followers loads it too. A velocity or
+    an effort of 0 says, as in many URDF files, that the limit is unknown: it is infinite here.
 
     Raises:
         ModelError: Followers that leave a leader no position.
@@ -118,6 +119,8 @@ def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[s
     moving = {joint.name: joint for joint in joints if joint.moves}
     leaders = [joint for joint in moving.values() if joint.mimic is None]
     limits = {what: np.array([getattr(joint, what) for joint in leaders], dtype=float) for what in LIMITS}
+    for what in ("velocity", "effort"):
+        limits[what][limits[what] == 0] = np.inf
     for name, (column, multiplier, offset) in driven.items():
         joint, leader = moving[name], leaders[column]
         if joint is leader:
@@ -125,7 +128,7 @@ def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[s
         lower, upper = sorted(((joint.lower - offset) / multiplier, (joint.upper - offset) / multiplier))
         limits["lower"][column] = max(limits["lower"][column], lower)
         limits["upper"][column] = min(limits["upper"][column], upper)
-        limits["velocity"][column] = min(limits["velocity"][column], joint.velocity / abs(multiplier))
+        limits["velocity"][column] = min(limits["velocity"][column], (joint.velocity or np.inf) / abs(multiplier))
         if limits["lower"][column] > limits["upper"][column]:
             message = (
                 f"joint {name!r} follows {leader.name!r} and stays within its limits {joint.lower:g} .. "

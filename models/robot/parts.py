@@ -199,8 +199,8 @@ class Joint:
         axis: In the joint frame; stored with unit length. Shape (3,).
         lower: Least position, rad or m.
         upper: Greatest position, rad or m.
-        velocity: Greatest speed, rad/s or m/s.
-        effort: Greatest torque or force, N m or N.
+        velocity: Greatest speed, rad/s or m/s; 0, as in many URDF files, where it is unknown and nothing limits it.
+        effort: Greatest torque or force, N m or N; 0 likewise.
         mimic: Which joint it follows, and how; None for a joint of its own.
 
     Raises:

@@ -227,12 +227,12 @@ class Robot:
 
     @property
     def velocity(self) -> Array:
-        """Greatest speeds, likewise. Shape (dof,), rad/s or m/s."""
+        """Greatest speeds, likewise; infinite where a joint's is unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property
     def effort(self) -> Array:
-        """Greatest torques or forces of the joints' own drives. Shape (dof,), N m or N."""
+        """Greatest torques or forces of the joints' own drives, likewise. Shape (dof,), N m or N."""
         return self._limits["effort"].copy()
 
     @cached_property
@@ -303,9 +303,9 @@ def _limits(joint: Joint) -> str:
         parts.append(f"{tie.multiplier:g} x {tie.joint}" + (f" {tie.offset:+g} {unit}" if tie.offset else ""))
     if np.isfinite([joint.lower, joint.upper]).any() and joint.moves:
         parts.append(f"{joint.lower:g} .. {joint.upper:g} {unit}")
-    if np.isfinite(joint.velocity) and joint.moves:
+    if 0 < joint.velocity < np.inf and joint.moves:
         parts.append(f"{joint.velocity:g} {unit}/s")
-    if np.isfinite(joint.effort) and joint.moves:
+    if 0 < joint.effort < np.inf and joint.moves:
         parts.append(f"{joint.effort:g} {joint.effort_unit}")
     return ", ".join(parts)
 

@@ -30,7 +30,7 @@ from ocp.errors import (
     unknown_name,
 )
 from ocp.files import RawTrajectory, Waypoints
-from ocp.tasks.limits import JointBounds
+from ocp.tasks.limits import JointBounds, unknown_limits
 
 __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_trajectory"]
 
@@ -364,11 +364,8 @@ def bounds_of(
         ("torque", robot.effort, torque),
     ):
         limits = own.copy()
-        if (nothing := limits == 0).any():
-            names = [name for name, none in zip(robot.joint_names, nothing, strict=True) if none]
-            if notes is not None:
-                notes.append(f"the robot gives {', '.join(names)} a {what} limit of 0: taken as none")
-            limits[nothing] = np.inf
+        if notes is not None and (names := unknown_limits(robot, what)):
+            notes.append(f"the robot gives {', '.join(names)} a {what} limit of 0: taken as none")
         by_name = told if isinstance(told, Mapping) else {} if told is None else {"": told}
         for name, value in checked_mapping(what, by_name).items():
             if not real(value) > 0:

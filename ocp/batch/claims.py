@@ -17,6 +17,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from ocp.errors import ProblemError
+from ocp.storage import open_regular
+
 __all__ = ["Claims"]
 
 SIGN = 5.0
@@ -86,11 +89,11 @@ class Claims:
             os.utime(self._file)
 
     def _lives(self, owner: str) -> bool:
-        if owner == self._name:
-            return True
+        if owner in ("", ".", "..", self._name):
+            return owner == self._name
         path, sure = self._owners / owner, owner.rpartition(".")[0] == self._here
         try:
-            with open(path, "rb") as stream:
+            with open_regular(path) as stream:
                 sign = os.fstat(stream.fileno()).st_mtime_ns
                 try:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -98,7 +101,7 @@ class Claims:
                     return True
                 except OSError:  # a file system without locks
                     sure = False
-        except FileNotFoundError:
+        except (FileNotFoundError, ProblemError):  # it is gone, or no driver made it
             return False
         if not sure:
             last, since = self._seen.get(owner, (None, 0.0))
@@ -119,7 +122,7 @@ class Claims:
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Alone among those who lock this file; where there are no locks, together with them."""
-    file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+    file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o644)
     try:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -129,10 +132,12 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def owner_of(claim: Path) -> str | None:
+    """The name of who has a task; None where nobody has. A claim that names another place is nobody's: "" ."""
     try:
-        return os.readlink(claim)
+        name = os.readlink(claim)
     except FileNotFoundError:
         return None
+    return name if os.path.basename(name) == name else ""
 
 
 def here() -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from math import isfinite
@@ -19,8 +20,9 @@ import numpy as np
 from ocp.errors import MOST_NUMBERS, ProblemError
 from ocp.planning import Plan
 from ocp.solution import Solution
+from ocp.storage import open_regular
 
-__all__ = ["Parcel", "key_of", "packed", "plain", "text_of", "unpacked"]
+__all__ = ["Parcel", "digest_of", "key_of", "packed", "plain", "text_of", "unpacked"]
 
 DEEPEST = 64
 """Of data within data."""
@@ -149,18 +151,32 @@ def unpacked(parcel: Parcel) -> Any:
         OSError: There is no room for temporary files.
     """
     value = json.loads(json.dumps(parcel.record["value"]))
-    for told, file in zip(parcel.record["files"], parcel.files, strict=True):
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "result.npz"
-            path.write_bytes(file)
-            made = KINDS[told["kind"]].load(path)
-        if not told["at"]:
-            return made
-        place = value
-        for part in told["at"][:-1]:
-            place = place[part]
-        place[told["at"][-1]] = made
+    try:
+        for told, file in zip(parcel.record["files"], parcel.files, strict=True):
+            kind, at = KINDS[told["kind"]], told["at"]
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "result.npz"
+                path.write_bytes(file)
+                made = kind.load(path)
+            if not at:
+                return made
+            place = value
+            for part in at[:-1]:
+                place = place[part]
+            place[at[-1]] = made
+    except (KeyError, IndexError, TypeError) as error:
+        words = f"the result {parcel.record.get('key')} is damaged: its files have no place in it: {error!r}"
+        raise ProblemError(words, name="files", value=parcel.record["files"]) from error
     return value
+
+
+def digest_of(path: str) -> str | None:
+    """The digest of what a file holds; None where there is no file of that name that can be read."""
+    try:
+        with open_regular(os.path.realpath(path)) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, ValueError):
+        return None
 
 
 def file_of(value: Plan | Solution) -> bytes:

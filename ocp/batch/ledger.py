@@ -13,21 +13,23 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from ocp.batch.claims import locked
 from ocp.batch.content import Parcel, key_of, text_of, unpacked
 from ocp.errors import ProblemError
-from ocp.storage import END, checked_path, write_whole
+from ocp.storage import END, checked_path, open_regular, write_whole
 
-__all__ = ["Ledger"]
+__all__ = ["ENDS", "Ledger"]
 
-FORMAT = 1
+FORMAT = 2
 HEAD = "batch.json"
 OWN = {HEAD, "results", "claims", "owners", "lock"}
+ENDS = ("done", "failed", "killed")
 PARTS = {
     "key": str,
     "task": object,
@@ -40,6 +42,7 @@ PARTS = {
     "error": str,
     "message": str,
     "neighbour": str | None,
+    "inputs": dict,
 }
 """Of a record, with their kinds."""
 
@@ -62,8 +65,11 @@ class Ledger:
             ProblemError: There is none, or of another format, or folder is no path.
         """
         path = checked_folder(folder)
+        for link in (path / name for name in sorted(OWN) if (path / name).is_symlink()):
+            words = f"{link} is a link, which may lead out of the folder; link the whole folder instead"
+            raise ProblemError(words, name="folder", value=str(link))
         try:
-            head = json.loads((path / HEAD).read_text(encoding="utf-8"))
+            head = loaded(path / HEAD)
             found = cls(path, str(head["function"]), str(head["version"]))
             if head["format"] != FORMAT:
                 words = f"{path} was written in format {head['format']} of batches, not {FORMAT}; take another folder"
@@ -71,7 +77,7 @@ class Ledger:
         except (FileNotFoundError, NotADirectoryError):
             words = f"{path} is no folder of a batch: there is no {HEAD} in it"
             raise ProblemError(words, name="folder", value=str(path)) from None
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, ProblemError):
                 raise
             words = f"{path / HEAD} is damaged: {error!r}; take another folder"
@@ -86,26 +92,28 @@ class Ledger:
             chosen: Whether the version is a user's word, and not that of the source.
 
         Raises:
-            ProblemError: The folder is another function's, another version's, or nobody's and not empty.
+            ProblemError: The folder is another function's, or holds results of another version, or is nobody's and not
+                empty.
             OSError: It cannot be made.
         """
         path = checked_folder(folder)
-        if not (path / HEAD).exists():
+        if not os.path.lexists(path / HEAD):
             path.mkdir(parents=True, exist_ok=True)
             strange = sorted(set(os.listdir(path)) - OWN)
             if strange:
                 words = f"{path} holds {strange[0]!r} and is no folder of a batch; take a new or an empty one"
                 raise ProblemError(words, name="folder", value=str(path))
             with locked(path / "lock"):
-                if not (path / HEAD).exists():
-                    head = {"format": FORMAT, "function": function, "version": version}
-                    text = json.dumps(head, indent=1).encode()
-                    write_whole(path / HEAD, lambda stream: stream.write(text))
+                if not os.path.lexists(path / HEAD):
+                    cls(path, function, version)._begin()
             (path / "results").mkdir(exist_ok=True)
         found = cls.at(path)
         if found.function != function:
             words = f"{path} holds results of {found.function}, not of {function}; take another folder"
             raise ProblemError(words, name="folder", value=function, limit=found.function)
+        if found.version != version and not found._keeps():
+            found = cls(path, function, version)
+            found._begin()
         if found.version != version:
             words = f"{path} holds results of version {found.version!r} of {function}, this is {version!r}; "
             words += "take another folder" if chosen else "its source has changed: take another folder, or, where the "
@@ -113,34 +121,48 @@ class Ledger:
             raise ProblemError(words, name="version", value=version, limit=found.version)
         return found
 
+    def _begin(self) -> None:
+        text = json.dumps({"format": FORMAT, "function": self.function, "version": self.version}, indent=1).encode()
+        write_whole(self.folder / HEAD, lambda stream: stream.write(text))
+
+    def _keeps(self) -> bool:
+        """Whether a result is there, or a driver that may be about to write one."""
+        drivers = self.folder / "owners"
+        records = (self.read(key) for key in self.recorded())
+        return (drivers.is_dir() and any(drivers.iterdir())) or any(one and one["status"] == "done" for one in records)
+
     # ---- records -----------------------------------------------------------------------------------------------
 
     def read(self, key: str) -> dict[str, Any] | None:
-        """The record of a key; None where there is none, or none that is whole."""
-        place = self._place(key)
+        """The record of a key; None where there is none, or none that is whole; links are not followed."""
         try:
-            record = json.loads(place.read_bytes())
+            place = self._place(key)
+            record: Any = None if place.parent.is_symlink() else loaded(place)
             sound = record.keys() == PARTS.keys() and record["key"] == key == key_of(text_of(record["task"], "task"))
-            if not sound or not all(isinstance(record[name], kind) for name, kind in PARTS.items()):
+            sound = sound and all(isinstance(record[name], kind) for name, kind in PARTS.items())
+            if not sound or record["status"] not in ENDS:
                 return None
             for i, told in enumerate(record["files"]):
-                with open(file_at(place, i), "rb") as stream:
+                with open_regular(file_at(place, i)) as stream:
                     if stream.seek(0, os.SEEK_END) != told["bytes"]:
                         return None
                     stream.seek(-22, os.SEEK_END)  # of a zip archive; it was not written to its end without
                     if stream.read(4) != END:
                         return None
-        except (FileNotFoundError, ValueError, AttributeError, KeyError, TypeError):
+        except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
             return None
         return dict(record)
 
-    def write(self, record: dict[str, Any], files: Iterable[bytes]) -> None:
-        """Keep a record, its files first.
+    def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
+        """Keep a record, its files first, in the place of any link that is there.
 
         Raises:
             OSError: They cannot be written; none of them is there then in part.
         """
         place = self._place(record["key"])
+        for link in (place.parent, place, *(file_at(place, i) for i in range(len(files)))):
+            if link.is_symlink():
+                link.unlink()
         place.parent.mkdir(parents=True, exist_ok=True)
         for i, file in enumerate(files):
             write_whole(file_at(place, i), lambda stream, file=file: stream.write(file), synced=False)  # type: ignore[misc]
@@ -148,9 +170,16 @@ class Ledger:
         write_whole(place, lambda stream: stream.write(text), synced=False)
 
     def parcel(self, record: dict[str, Any]) -> Parcel:
-        """A record with its files."""
-        place = self._place(record["key"])
-        return Parcel(record, tuple(file_at(place, i).read_bytes() for i in range(len(record["files"]))))
+        """A record with its files.
+
+        Raises:
+            OSError: A file is gone. ProblemError: It is a link or larger than what is read.
+        """
+        files = []
+        for i in range(len(record["files"])):
+            with open_regular(file_at(self._place(record["key"]), i)) as stream:
+                files.append(stream.read())
+        return Parcel(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
         """What the function had returned."""
@@ -166,6 +195,18 @@ class Ledger:
 
     def _place(self, key: str) -> Path:
         return self.folder / "results" / key[:2] / f"{key}.json"
+
+
+def loaded(path: Path) -> Any:
+    """The data of a file of JSON, whose numbers are finite."""
+    with open_regular(path) as stream:
+        return json.loads(stream.read(), parse_float=finite, parse_constant=finite)
+
+
+def finite(text: str) -> float:
+    if not isfinite(value := float(text)):
+        raise ValueError(f"{text} is no finite number")
+    return value
 
 
 def file_at(place: Path, number: int) -> Path:

@@ -13,14 +13,15 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 from tqdm import tqdm
 
 from ocp.batch.claims import Claims
 from ocp.batch.cluster import Cluster, checked_cluster
-from ocp.batch.content import Parcel, key_of, text_of
-from ocp.batch.ledger import Ledger
+from ocp.batch.content import Parcel, digest_of, key_of, text_of
+from ocp.batch.ledger import ENDS, Ledger
 from ocp.batch.neighbours import neighbours
 from ocp.batch.processes import Job, Processes, Source
 from ocp.batch.table import Batch, Result, row_of
@@ -32,7 +33,6 @@ __all__ = ["run_batch"]
 MOST_DEATHS = 3
 """Workers that one task may end."""
 MOST_WORKERS = 4096
-ENDS = ("done", "failed", "killed")
 PAUSE = 0.2
 """s between two looks at what another driver is at."""
 
@@ -45,7 +45,8 @@ def run_batch(
     workers: int | None = None,
     cluster: Any = None,
     near: Sequence[str] = (),
-    retry: Collection[str] = (),
+    again: str | Collection[str] = (),
+    failures: Literal["raise", "return"] = "raise",
     version: str | None = None,
 ) -> Batch:
     """Call a function with each of many tasks, and keep each result in a folder as soon as it is there.
@@ -58,7 +59,8 @@ def run_batch(
             run_batch under ``if __name__ == "__main__":``). It returns data (numbers, texts, True, False, None, lists
             and dictionaries by name of these; arrays become lists), or plans and solutions, or these among data. Its
             cost is a plan's own, a dictionary's ``"cost"``, or a single number; its verdict a dictionary's
-            ``"verdict"``, or whether a plan's audit passes. Whatever it raises is the result of that task, ``failed``.
+            ``"verdict"``, or whether a plan's audit passes. Whatever it raises is the result of that task, ``failed``,
+            and the other tasks go on.
         tasks: Data each: parameters by name, a seed, the text of a task's file. Tasks of the same content are one.
         folder: New, empty, or of an earlier call with this function.
         workers: Processes on this machine; one for each core where it is None.
@@ -67,14 +69,20 @@ def run_batch(
             workers of one thread: those of a process take turns.
         near: Names of numbers in the tasks. Then ``function(task, guess)`` is called with the result of a task near by,
             for a warm start, or None (:mod:`ocp.batch.neighbours`): the tasks alone decide of which.
-        retry: Ends that are tried again, of ``"failed"`` and ``"killed"``.
-        version: Of the function, a text; another version's results are not mixed in. None: the function's own source,
-            without comments; what it calls is not looked at.
+        again: Ends that are tried again whatever has changed: ``"failed"``, ``"killed"``, or both. Without it a task
+            that failed is tried again when the source of the function's module has changed, or a file that an argument
+            of :func:`kept` names.
+        failures: What becomes of a batch in which tasks failed: ``"raise"`` a BatchError, so that a script ends with a
+            status other than 0, or ``"return"`` the results, for failures that are answers.
+        version: Of the function, a text; another version's results are not mixed in, failures are no results. None: the
+            function's own source, without comments; what it calls is not looked at.
 
     Returns:
-        A result for each task. On a terminal a line says how many are done and how long the rest will take.
+        A result for each task. On a terminal a line says how many are done, how many failed, and how long the rest will
+        take.
 
     Raises:
+        BatchError: Tasks failed; says how many and why the first did, and carries the results.
         ProblemError: A task is no data, the function cannot be found by a worker, the folder is another function's.
         OSError: The folder cannot be written; what is done is kept.
         SolveError: The scheduler of the cluster is gone; what is done is kept.
@@ -87,14 +95,24 @@ def run_batch(
     texts = texts_of(tasks)
     count = workers_of(workers, cluster)
     names = names_of("near", near)
-    again = names_of("retry", retry)
-    for end in again:
-        checked_choice("retry", end, ENDS[1:])
+    ends = names_of("again", (again,) if isinstance(again, str) else again)
+    for end in ends:
+        checked_choice("again", end, ENDS[1:])
+    checked_choice("failures", failures, ("raise", "return"))
     told = source_version(function) if version is None else checked_text("version", version)
     ledger = Ledger.of(folder, f"{title(source)}:{source.name}", told, version is not None)
     parents = neighbours(tasks_of(texts), names) if names else dict.fromkeys(texts)
     before = {key: record for key in texts if (record := ledger.read(key)) is not None}
-    results = {key: row_of(record, ledger) for key, record in before.items() if record["status"] not in again}
+    source_digest, digests = module_version(function), cache(digest_of)
+
+    def counts(record: dict[str, Any]) -> bool:
+        """Whether a record is what the task would come to."""
+        files = record["inputs"].get("kept")
+        same = record["inputs"].get("source") == source_digest and isinstance(files, dict)
+        same = same and all(digests(file) == digest for file, digest in files.items())
+        return record["status"] == "done" or (same and record["status"] not in ends)
+
+    results = {key: row_of(record, ledger) for key, record in before.items() if counts(record)}
     if len(results) < len(texts):
         try:
             with ExitStack() as opened:
@@ -104,7 +122,7 @@ def run_batch(
                     crew = opened.enter_context(Processes(source, count))
                 else:
                     crew = opened.enter_context(Cluster(cluster, function))
-                Missing(ledger, claims, texts, parents, results, before, bool(names)).do(crew)
+                Missing(ledger, claims, texts, parents, results, before, bool(names), source_digest).do(crew)
         except OSError as error:
             if isinstance(error, ConnectionError):
                 raise
@@ -112,7 +130,10 @@ def run_batch(
                 f"{error.strerror or error}; {len(results)} of {len(texts)} results are kept, run again for the rest"
             )
             raise OSError(error.errno, words, str(ledger.folder)) from error
-    return Batch(ledger, tuple(results[key] for key in texts))
+    batch = Batch(ledger, tuple(results[key] for key in texts))
+    if failures == "raise":
+        batch.check()
+    return batch
 
 
 class Missing:
@@ -127,7 +148,9 @@ class Missing:
         results: dict[str, Result],
         before: dict[str, dict[str, Any]],
         near: bool,
+        source: str,
     ) -> None:
+        self.source, self.failures = source, 0
         self.ledger, self.claims, self.texts, self.parents, self.near = ledger, claims, texts, parents, near
         self.results, self.before = results, {key: before[key] for key in before if key not in results}
         self.after: defaultdict[str, list[str]] = defaultdict(list)  # tasks that wait for a neighbour
@@ -165,6 +188,8 @@ class Missing:
                     self.others.clear()
                 self.claims.sign()
                 bar.update(len(self.results) - bar.n)
+                if self.failures:
+                    bar.set_postfix(failed=self.failures, refresh=False)
 
     def _submit(self, crew: Processes | Cluster) -> None:
         room = crew.room()
@@ -211,6 +236,7 @@ class Missing:
         if known is None or known == self.before.get(key):
             task = tasks_of({key: self.texts[key]})[key]
             known = {"key": key, "task": task, "neighbour": self._neighbour(key), **parcel.record}
+            known["inputs"] = {"source": self.source, **known["inputs"]}
             self.ledger.write(known, parcel.files)
         self.claims.release(key)
         self._take_note(known)
@@ -218,6 +244,7 @@ class Missing:
     def _take_note(self, record: dict[str, Any]) -> None:
         key = record["key"]
         self.results[key] = row_of(record, self.ledger)
+        self.failures += record["status"] != "done"
         self.ready.extend(self.after.pop(key, ()))
 
 
@@ -304,8 +331,13 @@ def title(source: Source) -> str:
     return source.module if source.file is None else os.path.splitext(os.path.basename(source.file))[0]
 
 
-def source_version(function: Function) -> str:
-    """Digits that change with the function's source, not with its comments; "" where there is none to read."""
+def module_version(function: Function) -> str:
+    """Digits that change with the source of the function's module."""
+    return source_version(sys.modules[function.__module__])
+
+
+def source_version(function: Any) -> str:
+    """Digits that change with the source of a function or a module, not its comments; "" where there is none."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):

@@ -7,18 +7,30 @@ import io
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ocp.batch.ledger import Ledger
-from ocp.errors import ProblemError, SolveError, unknown_name
+from ocp.errors import Detailed, ProblemError, SolveError, checked_each, checked_instance, unknown_name
 from ocp.storage import checked_path, write_text, write_whole
 
-__all__ = ["Batch", "Result", "read_batch", "row_of"]
+__all__ = ["Batch", "BatchError", "Result", "read_batch", "row_of"]
 
 COLUMNS = ("key", "status", "cost", "verdict", "seconds", "error", "message")
 Group = str | Callable[[Any], Any]
+
+
+class BatchError(Detailed, RuntimeError):
+    """Tasks of a batch that failed; all others are done, and all results are kept.
+
+    Attributes:
+        batch: The results. value: How many of them failed.
+    """
+
+    def __init__(self, message: str = "", batch: Batch | None = None, **details: Any) -> None:
+        super().__init__(message, **details)
+        self.batch = batch
 
 
 @dataclass(frozen=True)
@@ -92,8 +104,9 @@ class Batch:
         folder: Where they are kept. results: All of them.
     """
 
-    def __init__(self, ledger: Ledger, results: tuple[Result, ...]) -> None:
-        self.folder, self.results = ledger.folder, results
+    def __init__(self, ledger: Ledger, results: Sequence[Result]) -> None:
+        self.folder = checked_instance("Batch: ledger", ledger, Ledger).folder
+        self.results = checked_each("Batch: results", results, Result)
 
     def __len__(self) -> int:
         return len(self.results)
@@ -115,6 +128,22 @@ class Batch:
         reasons = Counter(f"{r.status}: {r.error} {r.message}" for r in self.results if r.status != "done")
         lines += [f"  {count} x {reason}" for reason, count in reasons.most_common(5)]
         return "\n".join(lines)
+
+    @property
+    def summary(self) -> str:
+        """How many tasks are done and failed, why the first one did, and how to try again; one line."""
+        done = self.counts.get("done", 0)
+        told = f"{self.folder.name}: {len(self)} tasks: {done} done, {len(self) - done} failed"
+        first = next((result for result in self.results if result.status != "done"), None)
+        if first is None:
+            return told
+        message = first.message.partition("\n")[0]
+        return f'{told}, first: {first.error or first.status}: {message}; run again with again="failed"'
+
+    def check(self) -> None:
+        """Raise BatchError, with the summary, where a task failed or ended its workers."""
+        if count := len(self) - self.counts.get("done", 0):
+            raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
 
     def best(self, by: Group) -> dict[Any, Result]:
         """The result of least cost in each group, of those that are done and of no bad verdict.

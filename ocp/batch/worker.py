@@ -22,9 +22,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ocp.batch.content import Parcel, packed, text_of, unpacked
+from models.errors import ModelError
+from ocp.batch.content import Parcel, digest_of, packed, text_of, unpacked
 from ocp.direct.native import is_ready
-from ocp.errors import ProblemError
+from ocp.errors import Detailed, ProblemError
 
 __all__ = [
     "REQUEST",
@@ -71,6 +72,7 @@ def attempt(function: Function, task: str, near: bool, guess: Parcel | None) -> 
     with _ONE:
         is_ready()  # or the first results would be another solver's, whose last digits differ
         began = time.perf_counter()
+        _INPUTS.clear()
         try:
             given = (json.loads(task), None if guess is None else unpacked(guess)) if near else (json.loads(task),)
             try:
@@ -78,24 +80,26 @@ def attempt(function: Function, task: str, near: bool, guess: Parcel | None) -> 
             except BaseException as error:  # of any kind: the others go on
                 if isinstance(error, OSError) and error.errno in FULL:
                     raise
-                found = failed("failed", type(error).__name__, told(error))
+                found = failed("failed", type(error).__name__, message_of(error))
             else:
                 found = Parcel({"status": "done", "error": "", "message": "", **found.record}, found.files)
         except OSError as error:
             raise Broken(error.errno, error.strerror or str(error), error.filename) from error
-        return Parcel({**found.record, "seconds": time.perf_counter() - began}, found.files)
+        told = {"seconds": time.perf_counter() - began, "inputs": {"kept": dict(_INPUTS)}}
+        return Parcel({**found.record, **told}, found.files)
 
 
 def failed(status: str, error: str, message: str) -> Parcel:
     """The record of a task without a result."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
+    empty["inputs"] = {"kept": {}}
     return Parcel({"status": status, "error": error, "message": message, **empty})
 
 
-def told(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """Its message; of what is no error of the package, which may be a mistake in the function, with its place."""
     words = str(error).encode("utf-8", "replace").decode()
-    if isinstance(error, ProblemError) or type(error).__module__ == "ocp.errors":
+    if isinstance(error, Detailed | ModelError):
         return words
     steps = [step for step in traceback.extract_tb(error.__traceback__) if step.filename != __file__]
     place = f" ({os.path.basename(steps[-1].filename)}, line {steps[-1].lineno})" if steps else ""
@@ -104,16 +108,19 @@ def told(error: BaseException) -> str:
 
 # ---- what a worker keeps -----------------------------------------------------------------------------------------
 
-_KEPT: OrderedDict[tuple[Any, str], Any] = OrderedDict()
+_KEPT: OrderedDict[tuple[Any, str], tuple[Any, dict[str, str | None]]] = OrderedDict()
+_INPUTS: dict[str, str | None] = {}
+"""Of the task that is at hand: what was kept for it is made of, texts that may name files with the files' digests."""
 
 
 def kept(make: Function, *arguments: Any) -> Any:
     """``make(*arguments)``, made once in each worker and kept: a prepared problem, a robot that is read from a file.
 
-    The last eight are kept. Arguments are data as tasks are, and what is made is the same for the same content.
+    The last eight are kept. Arguments are data as tasks are, and what is made is the same for the same content. Where
+    an argument names a file, a task that fails is tried again when the batch is started with another content of it.
 
     Raises:
-        ProblemError: make is no function, or an argument no data.
+        ProblemError: make is no function, an argument no data, or make raises an error that is none of the package.
     """
     if not callable(make):
         raise ProblemError(f"make must be a function, not {make!r}", name="make", value=make)
@@ -122,11 +129,22 @@ def kept(make: Function, *arguments: Any) -> Any:
     key = (getattr(make, "__qualname__", ""), own), text_of(list(arguments), "arguments")
     with _ONE:
         if key not in _KEPT:
-            _KEPT[key] = make(*arguments)
+            inputs = {argument: digest_of(argument) for argument in arguments if isinstance(argument, str)}
+            _INPUTS.update(inputs)
+            try:
+                _KEPT[key] = make(*arguments), inputs
+            except Exception as error:
+                if isinstance(error, Detailed | ModelError) or getattr(error, "errno", None) in FULL:
+                    raise
+                call = f"{key[0][0]}({', '.join(map(repr, arguments))})"
+                words = f"kept: {call} raised {type(error).__name__}: {message_of(error)}"
+                raise ProblemError(words, name="make", value=key[0][0]) from error
         _KEPT.move_to_end(key)
         while len(_KEPT) > MOST_KEPT:
             _KEPT.popitem(last=False)
-        return _KEPT[key]
+        made, inputs = _KEPT[key]
+        _INPUTS.update(inputs)
+        return made
 
 
 # ---- a process of its own ----------------------------------------------------------------------------------------

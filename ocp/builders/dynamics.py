@@ -348,7 +348,7 @@ def dynamics_problem(
     robot, n = machine.robot, machine.joint_size
     first_rates, last_rates = (rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
     pushers, fired = (checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
-    bounds, keeps = limits.bounds(machine), checked_steady(robot, steady)
+    bounds, keeps = limits.bounds(machine, ("velocity", "torque")), checked_steady(robot, steady)
     sizes = _wheel_sizes(robot, bounds, checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon))
     bounds = bounds._replace(
         velocity=np.where(keeps, np.inf, bounds.velocity),

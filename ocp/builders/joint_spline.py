@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -28,6 +28,8 @@ __all__ = ["PlannedJoints", "joint_path"]
 
 DEGREE = 5
 DERIVATIVES = 3
+ON_PATH = 1e-6
+"""Share of a path's length by which tasks that run along it may be off it."""
 AT_ONCE = 1024
 """Places whose torques are computed side by side."""
 ON_ROWS = {
@@ -60,6 +62,17 @@ class _Torques(NamedTuple):
     inertia: Array
     drag: Array
     rest: Array
+
+
+class PlanLike(Protocol):
+    """What is asked of a plan of tasks: `ocp.Plan` has it."""
+
+    @property
+    def horizon(self) -> float: ...
+    @property
+    def targets(self) -> Sequence[Any]: ...
+    def task_share(self, times: Any) -> Array: ...
+    def at(self, time: Any) -> dict[str, Array]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +129,7 @@ class PlannedJoints:
 
 def joint_path(
     machine: Machine,
-    plan: Solution | tuple[Any, Any],
+    plan: PlanLike | Solution | tuple[Any, Any],
     path: PathLike,
     *,
     samples: int = 400,
@@ -126,14 +139,16 @@ def joint_path(
 
     Args:
         machine: Whose joints they are.
-        plan: A solution with states "joints", the path's distance in proportion to its time, as of a tip that keeps
-            one speed; or (distances (M,), joints (M, n)), the first distance 0 and the last the path's length.
+        plan: What `plan` made of tasks that run along the path at one speed from its begin to its end, in one part or
+            several, its horizon free or not; or a solution with states "joints", the path's distance in proportion to
+            its time; or (distances (M,), joints (M, n)), the first distance 0 and the last the path's length.
         path: What the tool runs along.
-        samples: Of a solution, evenly in time.
+        samples: Of a plan or a solution, evenly in time.
         names: Of the joints; the robot's if None.
 
     Raises:
-        ProblemError: A plan without joints, samples of other shapes, too few, not increasing or not from end to end.
+        ProblemError: A plan without joints, or whose tasks do not run along the path at one speed; samples of other
+            shapes, too few, not increasing or not from end to end.
     """
     checked_count("samples", samples, 2 * DEGREE + 3)
     for part in ("robot", "joint_size"):
@@ -142,6 +157,8 @@ def joint_path(
     length = getattr(path, "length", None)
     if not isinstance(length, float | int) or not length > 0:
         raise ProblemError(f"the path {path!r} has no length", name="path", value=path)
+    if hasattr(plan, "task_share"):
+        plan = _planned(plan, path, float(length), samples)
     s, joints = _samples(plan, float(length), samples, machine.joint_size)
     own = checked_each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
     if len(own) != machine.joint_size:
@@ -153,6 +170,25 @@ def joint_path(
     coarse = _spline(s[half], joints[half])(s)[0]
     error = float(np.abs(coarse - joints).max())
     return PlannedJoints(machine, own, float(length), error, curves, _forces(machine))
+
+
+def _planned(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
+    """Return distances (M,) and joints (M, n) of a plan, whose tasks are seen to run along the path at one speed."""
+    if plan.targets and hasattr(path, "at"):
+        t = plan.targets[0].t
+        along = path.at(np.clip(length * plan.task_share(t), 0.0, length)).position
+        apart = np.array([one.position - along for one in plan.targets])
+        asked = np.isfinite(apart).any(axis=2)
+        off = np.where(asked, np.linalg.norm(np.nan_to_num(apart), axis=2), np.inf).min(axis=0)
+        worst = int(off.argmax())
+        if asked.any() and not off[worst] <= ON_PATH * length:
+            found = f"are {off[worst]:.3g} m off the path" if off[worst] < np.inf else "ask for no position"
+            words = f"the plan's tasks {found} at {t[worst]:.6g} s: they do not run along all of it at one speed; "
+            words += "give (distances, joints) instead of the plan"
+            told = {"value": float(off[worst]), "limit": ON_PATH * length, "time": float(t[worst])}
+            raise ProblemError(words, name="plan", **told)
+    times = np.linspace(0.0, plan.horizon, samples)
+    return length * plan.task_share(times), plan.at(times)["joints"]
 
 
 def _samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:

@@ -201,6 +201,17 @@ class Plan:
         """What was asked, from which the problem can be declared again; None of a problem of one's own."""
         return request_of(self.solution.problem)
 
+    def task_share(self, times: Any) -> Array:
+        """Return the share of the tasks' own time that has passed at times (M,), s.
+
+        It is that of the horizon, unless the horizon was free: the pace of the tasks is planned then.
+
+        Raises:
+            ProblemError: A time outside 0 to the horizon, or not finite.
+        """
+        t = np.atleast_1d(self._checked_times(times))
+        return self._fractions(self.parts[0], t) if CLOCK in self.solution.states else t / self.horizon
+
     @interruptible
     def audit(self, **settings: Any) -> Any:
         """Check the motion independently of what made it; see `ocp.audit.audit.audit`. Done once for each setting.
@@ -295,7 +306,7 @@ class Plan:
         times = np.linspace(0.0, self.horizon, ASKED)
         clock = times
         if CLOCK in self.solution.states:
-            clock = self._fractions(self.parts[0], times) * self.solution.horizon
+            clock = self.task_share(times) * self.solution.horizon
         at = self.at(times)
         base = at["base"] if "base" in at else np.zeros((ASKED, 0))
         return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))

@@ -321,9 +321,9 @@ def checked_asked(
             words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
+    told.bounds(machine, ("velocity", "torque") if limits_drives(told) else ("velocity",))
     if limits_drives(told):
         checked_motors("plan: limits of drives", machine)
-        told.bounds(machine)
         if free:
             words = "a free horizon knows no limits of drives; give it in s, or limit the rates alone"
             raise ProblemError(words, name="horizon", value=horizon)

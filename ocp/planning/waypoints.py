@@ -186,7 +186,7 @@ def plan_waypoints(
     if cost == "time":
         if weights is not None:
             raise ProblemError("the time has no weights; leave them out", name="weights", value=weights)
-        heavy = 1 / told.bounds(machine).velocity
+        heavy = 1 / told.bounds(machine, ("velocity",)).velocity
         if not heavy.any():
             raise ProblemError("no joint has a velocity limit, by which the time is told", name="velocity")
     most = _step(step, n)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from warnings import warn
 
 import numpy as np
 
-from models import Machine, Standing
+from models import Machine, ModelWarning, Robot, Standing
 from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive, floats, real
 
-__all__ = ["JointBounds", "Limits"]
+__all__ = ["JointBounds", "Limits", "unknown_limits"]
 
 
 class JointBounds(NamedTuple):
@@ -34,6 +36,8 @@ class JointBounds(NamedTuple):
 @dataclass(frozen=True)
 class Limits:
     """What joints and ground bear; None means what the robot says, which is nothing of accelerations, jerks and power.
+
+    A robot that says 0 of a velocity or a torque, as many URDF files do, does not know it: no such limit holds.
 
     Attributes:
         velocity, acceleration, jerk, torque: Of each joint, or one number for all; inf for no limit.
@@ -72,16 +76,23 @@ class Limits:
         """Least vertical ground force, N."""
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
-    def bounds(self, machine: Machine) -> JointBounds:
-        """For the joints of a machine.
+    def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
+        """Return the limits of a machine's joints; those that the robot does not know are infinite.
+
+        Args:
+            machine: Whose joints.
+            used: Kinds of limits, "velocity" or "torque", of which a robot is warned of that gives 0 for them.
 
         Raises:
-            ProblemError: Not one number or one for each joint; a robot that gives joints a limit of 0.
+            ProblemError: Not one number or one for each joint.
+
+        Warns:
+            ModelWarning: The robot gives joints 0 for a used limit that is not given here, so that none holds.
         """
         robot, n = machine.robot, machine.joint_size
         free = np.full(n, np.inf)
         given = {"velocity": robot.velocity, "acceleration": free, "jerk": free, "torque": robot.effort, "power": free}
-        for what, own in given.items():
+        for what in given:
             value = getattr(self, what)
             if value is not None:
                 array = _numbers(value)
@@ -89,15 +100,18 @@ class Limits:
                     words = f"limits: {what} must be positive, one number or {n}, not {value!r}"
                     raise ProblemError(words, name=what, value=value, limit=n)
                 given[what] = np.array(np.broadcast_to(array, n))
-            elif not (own > 0).all():
-                names = [name for name, most in zip(robot.joint_names, own, strict=True) if not most > 0]
-                words = (
-                    f"limits: the robot gives the joints {names} a {what} limit of 0; lock them, or say what they "
-                    f"bear: Limits({what}=...), inf for no limit"
-                )
-                raise ProblemError(words, name=names[0], value=0.0)
+            elif what in used and (names := unknown_limits(robot, what)):
+                words = f"the robot gives {', '.join(names)} a {what} limit of 0, which says that it is unknown: none "
+                words += f"holds; give Limits({what}=...), inf for no limit"
+                warn(ModelWarning(words, name=names[0], value=0.0), stacklevel=2)
         lower, upper = (robot.lower, robot.upper) if self.joints else (-free, free)
         return JointBounds(lower, upper, **given)
+
+
+def unknown_limits(robot: Robot, what: str) -> list[str]:
+    """Return the joints for which a robot's description says 0: their limit of "velocity" or "torque" is unknown."""
+    own = {"velocity": "velocity", "torque": "effort"}.get(what)
+    return [joint.name for joint in robot.moving_joints if own and getattr(joint, own) == 0]
 
 
 def _numbers(value: Any) -> Array:

@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.readme import steps
+
 ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = "completion,gallery,mcap,yaml"
 PATIENCE = 1200
@@ -98,6 +100,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="selfmotion-installed-") as folder:
         home = Path(folder)
         wheel = options.wheel.resolve() if options.wheel else built(home)
+        told = read_on(home, wheel)
         venv.create(home / "env", with_pip=True)
         user = User(home / "user", home / "env" / "bin")
         user.home.mkdir()
@@ -105,10 +108,27 @@ def main() -> int:
         user.holds(f"pip install {wheel.name}[{EXTRAS}]", done.returncode == 0, done.stderr)
         if not user.told:
             used(user)
+        user.told += told
     for failure in user.told:
         print(f"FAILED: {failure}", file=sys.stderr)
     print(f"{len(user.told)} failures")
     return 1 if user.told else 0
+
+
+def read_on(folder: Path, wheel: Path) -> list[str]:
+    """Do what the README says, in an environment without extras and a folder that is empty; what did not hold."""
+    venv.create(folder / "core", with_pip=True)
+    user = User(folder / "reader", folder / "core" / "bin")
+    user.home.mkdir()
+    done = user.run("python", "-m", "pip", "install", "--quiet", str(wheel))
+    user.holds(f"pip install {wheel.name}, without extras", done.returncode == 0, done.stderr)
+    for step in steps():
+        if step.file:
+            (user.home / step.file).write_text(step.text, encoding="utf-8")
+        if step.words:
+            done = user.run(*step.words)
+            user.holds(f"README: {' '.join(step.words)}", done.returncode == 0, f"{done.stdout}\n{done.stderr}")
+    return user.told
 
 
 def built(folder: Path) -> Path:

@@ -187,7 +187,7 @@ def standing_problem(
     equations = bind(machine, tasks)
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
     begin, base = checked_configuration(machine, start_joints, None)
-    bounds = limits.bounds(machine)
+    bounds = limits.bounds(machine, ("velocity", "torque"))
     begin = inside_limits(machine, begin, bounds.lower, bounds.upper)
     check_rule(machine, zmp, duration)
     last = 1.0 if along == "parameter" else duration

@@ -226,7 +226,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], ask
 def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
     """Limits of the joints in the order of a stance; those that are given are in the robot's."""
     order = steps.order(stance)
-    own = limits.bounds(stance)
+    own = limits.bounds(stance, ("velocity", "torque"))
     found = {}
     for what, value in own._asdict().items():
         given = getattr(limits, what, None) if what not in ("lower", "upper") else None

@@ -85,6 +85,18 @@ def arm(stiffness: float) -> Any:
     return prepare(problem, Collocation(intervals=4, degree=3))
 
 
+def read(path: str) -> str:
+    """A file's text, which has to begin with a digit."""
+    with open(path, encoding="utf-8") as stream:
+        text = stream.read()
+    return f"{int(text[0])}"
+
+
+def of_file(task: Any) -> float:
+    """A number of a file, plus another."""
+    return float(kept(read, task["file"])) + float(task["x"])
+
+
 def spring(task: Any) -> dict[str, Any]:
     """A solution, of a problem that is prepared once in each worker."""
     made = kept(arm, task["stiffness"])

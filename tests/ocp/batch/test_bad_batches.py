@@ -12,10 +12,12 @@ from typing import Any
 import pytest
 
 from ocp.batch import Batch, kept, read_batch, run_batch
+from ocp.batch.ledger import Ledger
 from tests.bad_values import (
     CALLABLE,
     COUNT,
     INF,
+    INSTANCE,
     NAN,
     NOTHING,
     SYMBOL,
@@ -113,7 +115,8 @@ CASES = [
             "workers": COUNT | {"both": "2", "too many": 10**6},
             "cluster": CLUSTER,
             "near": NAMES | {"unknown": ["nobody"], "no number": ["z"], "one of two": ["x", "nobody"]},
-            "retry": NAMES | {"unknown": ["nobody"], "done": ["done"]},
+            "again": NAMES | {"unknown": ["nobody"], "done": ["done"], "word": "done"},
+            "failures": TEXT | {"unknown": "ignore"},
             "version": TEXT | {"other": "2"},
         },
     ),
@@ -122,7 +125,13 @@ CASES = [
         "kept",
         lambda make, argument: kept(make, argument),
         {"make": list, "argument": [1]},
-        {"make": CALLABLE, "argument": DATA},
+        {"make": CALLABLE | {"raises": int}, "argument": DATA},
+    ),
+    Case(
+        "Batch",
+        Batch,
+        {"ledger": Ledger(Path("b"), "f", "1"), "results": ()},
+        {"ledger": INSTANCE, "results": NAMES | {"one": read_batch}},
     ),
     method(batch, "best", {"by": "z"}, by=NOTHING | {"number": 3, "unknown": "nobody", "list": ["x"], "no text": "y"}),
     method(batch, "write_csv", {"path": "a.csv"}, path=PATH),

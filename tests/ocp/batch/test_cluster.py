@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from distributed import Client
@@ -24,11 +25,12 @@ def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
     with cluster(2) as (address, processes):
         far = run_batch(functions.warm, tasks, tmp_path / "far", cluster=address, near=["mass"])
         with Client(address, set_as_default=False) as client:
-            ends = run_batch(functions.endings, ["problem", "nan", "good"], tmp_path / "ends", cluster=client)
+            shown: Any = {"cluster": client, "failures": "return"}
+            ends = run_batch(functions.endings, ["problem", "nan", "good"], tmp_path / "ends", **shown)
             assert client.status == "running"
             log = tmp_path / "deadly"
             killed = [{"x": i, "kill": i == 1, "log": str(log)} for i in range(3)]
-            dead = run_batch(functions.deadly, killed, tmp_path / "dead", cluster=client)
+            dead = run_batch(functions.deadly, killed, tmp_path / "dead", **shown)
         check_killed_cluster(tmp_path / "b", 30, 0.1, address, processes)
     for one, two in zip(own, far, strict=True):
         assert (one.key, one.cost, one.neighbour) == (two.key, two.cost, two.neighbour)

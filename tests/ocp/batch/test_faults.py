@@ -156,8 +156,16 @@ def check_read_only(tasks: list[Any], folder: Path, monkeypatch: pytest.MonkeyPa
     def refused(*_: Any, **__: Any) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    for name in ("mkdir", "symlink", "replace", "unlink", "utime", "open"):
+    opened = os.open
+
+    def only_read(path: Any, flags: int, *others: Any, **options: Any) -> int:
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            refused()
+        return opened(path, flags, *others, **options)
+
+    for name in ("mkdir", "symlink", "replace", "unlink", "utime"):
         monkeypatch.setattr(os, name, refused)
+    monkeypatch.setattr(os, "open", only_read)
     assert len(run_batch(functions.square, tasks, folder)) == len(tasks)
     monkeypatch.undo()
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from ocp import ProblemError, SolveError
-from ocp.batch import kept, read_batch, run_batch
+from ocp.batch import BatchError, kept, read_batch, run_batch
 from ocp.batch.ledger import Ledger
 from ocp.batch.run import source_version
 from ocp.direct.native import is_ready
@@ -137,7 +137,7 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
         "inf": ("ProblemError", "the result[1] is inf"),
         "inside": ("ProblemError", "the result['a']['b'][1] is nan"),
     }
-    batch = run_batch(functions.endings, [*told, "good", "child", "fork"], tmp_path / "b", workers=2)
+    batch = run_batch(functions.endings, [*told, "good", "child", "fork"], tmp_path / "b", workers=2, failures="return")
     assert batch.counts == {"failed": len(told), "done": 2, "killed": 1}
     assert "it ended with status 3" in batch[-1].message
     until(lambda: not runs(int(batch[-2].value)))
@@ -153,9 +153,14 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
     assert "9 failed, 2 done, 1 killed" in str(batch)
     assert "1 x failed: ProblemError the arm is too short" in str(batch)
     before = stored(tmp_path / "b")
-    run_batch(functions.endings, list(told), tmp_path / "b", workers=1)
+    words = '9 tasks: 0 done, 9 failed, first: ProblemError: the arm is too short; run again with again="failed"'
+    with pytest.raises(BatchError, match=words) as again:
+        run_batch(functions.endings, list(told), tmp_path / "b", workers=1)
     assert stored(tmp_path / "b") == before
-    run_batch(functions.endings, list(told), tmp_path / "b", workers=1, retry=["failed"])
+    assert (again.value.name, again.value.value) == ("b", 9)
+    assert again.value.batch is not None
+    assert again.value.batch.counts == {"failed": 9}
+    run_batch(functions.endings, list(told), tmp_path / "b", workers=1, again="failed", failures="return")
     after = stored(tmp_path / "b")
     assert sum(after[name][0] != before[name][0] for name in before) == len(told)
 
@@ -163,11 +168,12 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
 def test_a_task_that_always_ends_its_worker_is_set_aside_and_the_others_are_done(tmp_path: Path) -> None:
     log = tmp_path / "log"
     tasks = [{"x": i, "kill": i == 2, "log": str(log)} for i in range(6)]
-    batch = run_batch(functions.deadly, tasks, tmp_path / "b", workers=2)
+    batch = run_batch(functions.deadly, tasks, tmp_path / "b", workers=2, failures="return")
     assert batch.counts == {"done": 5, "killed": 1}
     assert log.read_text() == 3 * "killed\n"
     assert batch[2].message == "it ended 3 workers: " + "; ".join(3 * ["it was ended by SIGKILL"])
-    run_batch(functions.deadly, tasks, tmp_path / "b", workers=2)
+    with pytest.raises(BatchError, match="5 done, 1 failed, first: killed: it ended 3 workers"):
+        run_batch(functions.deadly, tasks, tmp_path / "b", workers=2)
     assert log.read_text() == 3 * "killed\n"
 
 
@@ -235,7 +241,7 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
 
 def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused(tmp_path: Path) -> None:
     Ledger.of(tmp_path / "b", "tests.ocp.batch.functions:square", source_version(functions.square), False)
-    run_batch(functions.square, [], tmp_path / "b")
+    run_batch(functions.square, X[:1], tmp_path / "b")
     with pytest.raises(ProblemError, match=r"holds results of .*square, not of .*same") as caught:
         run_batch(functions.same, X, tmp_path / "b")
     assert caught.value.name == "folder"

@@ -29,7 +29,7 @@ def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
         else:
             found = packed(value)
             record, files = {"status": "done", "error": "", "message": "", "seconds": 0.25, **found.record}, found.files
-        own = {"key": key_of(text_of(task, "task")), "task": task, "neighbour": None}
+        own = {"key": key_of(text_of(task, "task")), "task": task, "neighbour": None, "inputs": {}}
         ledger.write({**own, **record}, files)
     return read_batch(folder)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path as File
 from typing import Any
 
 import casadi as ca
@@ -10,7 +12,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Joint, Link, Path, Robot, SmoothPath, smooth
 from models.robot.dynamics import inverse_dynamics
-from ocp import Collocation, ProblemError, joint_path, minimum_velocity_problem, solve
+from ocp import Collocation, Plan, ProblemError, TipTask, joint_path, minimum_velocity_problem, plan, solve
 from ocp.builders.joint_spline import PlannedJoints
 from ocp.schedule import JointLimits, LineLimits, schedule
 from tests.ocp.problems import Array
@@ -90,14 +92,63 @@ def test_a_schedule_keeps_the_torques_and_uses_them(jerk: float) -> None:
         schedule(PATH, LineLimits(1.0, 8.0, jerk, joints=JointLimits(torque=[5.0, 5.0])), joints=joints)
 
 
-def test_a_plan_at_constant_speed_is_scheduled() -> None:
-    path = smooth(Path.through([(0.4, 0.0, 0.2), (0.5, 0.0, 0.35)]), 0.05)
-    horizon = 2.0
+LINE = smooth(Path.through([(0.4, 0.0, 0.2), (0.5, 0.0, 0.35)]), 0.05)
+SPEED = LINE.length / 2.0
+
+
+def planned(tasks: TipTask | Sequence[TipTask], path: SmoothPath = LINE, **options: Any) -> Plan:
+    return plan(arm(), tasks, start=angles(np.zeros(1), path)[0], clearance=None, **options)
+
+
+def halves() -> list[TipTask]:
+    """The line in two tasks, one after the other."""
+    middle = (0.45, 0.0, 0.275)
+    ends = [(0.4, 0.0, 0.2), middle], [middle, (0.5, 0.0, 0.35)]
+    lines = [smooth(Path.through(pair), 0.05) for pair in ends]
+    return [TipTask.along(line, SPEED, rows=(3, 5), begin=begin) for line, begin in zip(lines, (0.0, 1.0), strict=True)]
+
+
+@pytest.mark.parametrize("kind", ["one task", "parts", "free horizon", "corner", "loaded"])
+def test_a_plan_of_tasks_along_a_path_is_scheduled(kind: str, tmp_path: File) -> None:
+    path = PATH if kind == "corner" else LINE
+    task = TipTask.along(path, SPEED, rows=(3, 5))
+    result = planned(
+        halves() if kind == "parts" else task, path, **({"horizon": "free"} if kind == "free horizon" else {})
+    )
+    if kind == "loaded":
+        result.save(tmp_path / "plan.npz")
+        result = Plan.load(tmp_path / "plan.npz")
+    assert len(result.parts) == (2 if kind == "parts" else 1)
+    joints = joint_path(arm(), result, path)
+    s = np.linspace(0, path.length, 50)
+    assert joints.at(s).position == pytest.approx(angles(s, path), abs=1e-6)
+    timed = schedule(path, LineLimits(0.5, 4.0, 100.0, joints=JointLimits(1.0, 5.0, 100.0)), joints=joints)
+    assert timed.duration < result.horizon
+    assert largest(timed, joints).max() <= 1.001
+
+
+def test_a_plan_whose_tasks_do_not_run_along_the_path_is_refused() -> None:
+    slow = schedule(LINE, LineLimits(SPEED, 0.2, 2.0))
+    later = TipTask.along(LINE, SPEED, rows=(3, 5), begin=0.5)
+    held = TipTask(position=(0.4, 0.0, 0.2), rows=(3, 5), duration=0.5)
+    for tasks, path, words in (
+        (TipTask.along(LINE, SPEED, rows=(3, 5)), PATH, r"m off the path at 2 s"),
+        (TipTask.along(LINE, slow, rows=(3, 5)), LINE, r"m off the path at"),
+        ([held, later], LINE, r"m off the path at"),
+        (later, LINE, "ask for no position at 0 s"),
+    ):
+        with pytest.raises(ProblemError, match=words) as caught:
+            joint_path(arm(), planned(tasks), path)
+        assert caught.value.name == "plan"
+
+
+def test_a_solution_at_constant_speed_is_scheduled() -> None:
+    path, horizon = LINE, 2.0
     velocity = (np.array([0.5, 0.35]) - [0.4, 0.2]) / horizon
     start = angles(np.zeros(1), path)[0]
     problem = minimum_velocity_problem(arm(), tip_velocity=velocity, rows=(3, 5), start_joints=start, horizon=horizon)
-    plan = solve(problem, Collocation(intervals=20, degree=4))
-    joints = joint_path(arm(), plan, path)
+    solution = solve(problem, Collocation(intervals=20, degree=4))
+    joints = joint_path(arm(), solution, path)
     s = np.linspace(0, path.length, 30)
     assert joints.at(s).position == pytest.approx(angles(s, path), abs=1e-6)
     timed = schedule(path, LineLimits(0.5, 4.0, 100.0, joints=JointLimits(1.0, 5.0, 100.0)), joints=joints)

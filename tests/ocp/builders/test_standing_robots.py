@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio
 import pytest
 
-from models import Robot, Standing, Wrench, rectangle, simplified, standing_example, with_load
+from models import ModelWarning, Robot, Standing, Wrench, rectangle, simplified, standing_example, with_load
 from models.machines.standing_motion import StandingMotion
 from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
 from ocp.builders.standing import Anywhere, Limits, Pinned, standing_problem
@@ -210,8 +210,6 @@ def test_a_start_at_a_limit_to_rounding_is_taken(anymal: Peered, anymal_solution
 @pytest.mark.parametrize(
     ("name", "limits", "message"),
     [
-        ("j2s6s200_joint_3", {"velocity": 0.0}, r"joints \['j2s6s200_joint_3'\] a velocity limit of 0; lock them"),
-        ("j2s6s200_joint_3", {"effort": 0.0}, r"joints \['j2s6s200_joint_3'\] a torque limit of 0"),
         ("j2s6s200_joint_3", {"lower": 1.744, "upper": 1.744}, "'j2s6s200_joint_3' cannot move .* lock it there"),
         ("j2s6s200_joint_3", {"lower": 1.8}, "'j2s6s200_joint_3' starts at 1.744, outside its limits 1.8"),
     ],
@@ -220,6 +218,16 @@ def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: 
     with pytest.raises(ProblemError, match=message) as caught:
         pushing.problem(changed(anymal.machine, name, **limits))
     assert (caught.value.name or "unnamed") in str(caught.value)
+
+
+@pytest.mark.parametrize(("what", "told"), [("velocity", "velocity"), ("effort", "torque")])
+def test_a_limit_of_0_is_unknown_and_none_holds(anymal: Peered, what: str, told: str) -> None:
+    name = "j2s6s200_joint_3"
+    with pytest.warns(ModelWarning, match=f"gives {name} a {told} limit of 0, which says that it is unknown") as caught:
+        unknown = pushing.problem(changed(anymal.machine, name, **{what: 0.0}))
+    assert caught[0].message.name == name  # type: ignore[union-attr]
+    free = pushing.problem(changed(anymal.machine, name, **{what: np.inf}))
+    assert str(unknown) == str(free)
 
 
 def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> None:
