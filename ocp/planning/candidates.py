@@ -324,7 +324,7 @@ class Maker:
         if clear is None or not clear.margins or self.asked.start is not None:
             return self.start
         moves = clear.surroundings.levers.joints[sorted(clear.margins)].any(axis=0)
-        return np.where(moves, np.nan, self.start)
+        return np.where(moves & ~self.asked.held, np.nan, self.start)
 
     def local_touches(self, start: Array) -> list[Touch]:
         """The bodies that come too near in the local motion from a posture, the worst first."""

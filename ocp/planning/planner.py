@@ -105,9 +105,10 @@ def plan(
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
-            that none falls below, for poses that leave at most two directions free, see `ocp.planning.search`; on a
-            floating one of all that a search over exact states finds, without a bound, see `ocp.planning.cells`, which
-            also goes on where local motions come to a singularity.
+            that none falls below, for poses that leave at most two directions free, see `ocp.planning.search`. Joints
+            that move no task's frame, as a gripper's, stand still then, as in `start` or in the middle of their limits.
+            On a floating one of all that a search over exact states finds, without a bound, see `ocp.planning.cells`,
+            which also goes on where local motions come to a singularity.
         seed: Of inverse kinematics.
         obstacles: Shapes in world, or `Moving` ones, that the machine's bodies stay clear of.
         clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
@@ -358,6 +359,7 @@ def checked_asked(
         cyclic,
         int(seed),
         float(time_cost) if free else None,
+        holds_idle=search == "global",
     )
 
 

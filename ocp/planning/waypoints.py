@@ -24,9 +24,9 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.clearance import clearance_of
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
-from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, postures_of
+from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest, postures_of
 from ocp.local.touching import Touch, distances_along, touches
-from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import KINDS, dead_end
 from ocp.planning.planner import clear_of
 from ocp.planning.reconfigurations import fewest_pieces
@@ -215,14 +215,17 @@ class _Ways:
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
-        equations = bind(machine, self._task(0))
+        free = bind(machine, self._task(0))
+        equations = Held(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
+        at = at_rest(self.lower, self.upper)
         targets = np.zeros((len(places), 18))
         targets[:, :3] = places
         targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)
+        targets = np.column_stack([targets, np.tile(at[free.idle], (len(places), 1))])
         self.sets = SelfMotions(self.space, equations, targets)
         self._known = dict[int, Array]()
         if not 0 <= self.sets.size <= FREE:
-            words = f"{machine.robot.name}: {machine.joint_size} joints for the {equations.size} rows of a pose"
+            words = f"{machine.robot.name}: {int((~free.idle).sum())} joints for the {free.size} rows of a pose"
             words += f"; hold joints until at most {FREE} are left over"
             raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
 
