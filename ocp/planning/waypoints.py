@@ -30,7 +30,7 @@ from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import KINDS, dead_end
 from ocp.planning.planner import clear_of
 from ocp.planning.reconfigurations import fewest_pieces
-from ocp.planning.search import FREE, Search
+from ocp.planning.search import FREE, Search, checked_bound
 from ocp.planning.sections import RADII, Sections, values_of
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
@@ -277,8 +277,8 @@ class _Ways:
             reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways))
             raise SolveError(f"{NONE_FOUND}: {reasons}", name="waypoints")
         listed = tuple((cost, why or ("" if k == 0 else "dearer")) for k, (cost, why, _) in enumerate(ways))
-        bound = bound if bound <= length else 0.0
-        return WaypointPlan(self.machine, joints, length, bound, listed, self._between(joints))
+        least = checked_bound(bound, length) or 0.0
+        return WaypointPlan(self.machine, joints, length, least, listed, self._between(joints))
 
     def _begun(self, make: Callable[[NDArray[np.intp]], Searched], every: int) -> tuple[Searched, NDArray[np.intp]]:
         """A search of one of so many waypoints, of fewer where that were more postures than memory is for."""
@@ -309,7 +309,8 @@ class _Ways:
                 if not why:
                     length = self._length(joints, after)
                     ways, between = ((length, ""),), self._between(joints, after)
-                    return WaypointPlan(self.machine, joints, length, min(bound, length), ways, between, after)
+                    least = checked_bound(bound, length) or 0.0
+                    return WaypointPlan(self.machine, joints, length, least, ways, between, after)
                 if len(more) == len(chosen):
                     raise SolveError(f"no way in {len(pieces)} pieces keeps all limits: {why}", name="waypoints")
             chosen = more
