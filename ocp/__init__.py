@@ -22,7 +22,7 @@ from ocp.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.confirmation import certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import AuditError, ProblemError, RefinementWarning, SolveError, StorageWarning
+from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
 from ocp.indirect.method import Indirect
 from ocp.local.accelerations import resolve_accelerations
 from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
@@ -56,6 +56,7 @@ __all__ = [
     "Anywhere",
     "Audit",
     "AuditError",
+    "BoundWarning",
     "Candidate",
     "Certificate",
     "Clear",

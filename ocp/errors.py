@@ -19,6 +19,7 @@ __all__ = [
     "MOST_NUMBERS",
     "NOT_NUMBERS",
     "AuditError",
+    "BoundWarning",
     "Detailed",
     "Interrupted",
     "ProblemError",
@@ -39,6 +40,7 @@ __all__ = [
     "checked_time_limit",
     "floats",
     "real",
+    "told_apart",
     "unknown_name",
 ]
 
@@ -111,6 +113,10 @@ class RefinementWarning(Detailed, UserWarning):
 
 class StorageWarning(Detailed, UserWarning):
     """A part that a file cannot hold as data, such as a problem that calls a function of Python's."""
+
+
+class BoundWarning(Detailed, UserWarning):
+    """A motion that costs less, ``value``, than the lower bound of all, ``limit``: a fault of this package."""
 
 
 @contextmanager
@@ -213,6 +219,12 @@ def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
     kept: float = value
     return kept
+
+
+def told_apart(*numbers: float) -> list[str]:
+    """Numbers for a message, in six digits, or in as many more as tell those apart that differ."""
+    told = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
+    return next((each for each in told if len({*each}) == len({repr(number) for number in numbers})), told[-1])
 
 
 def checked_text(what: str, value: Any) -> str:

@@ -55,6 +55,7 @@ HEAD = {
     "seconds": dict,
     "start": str,
     "regularised": bool,
+    "tightening_cost": float,
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 MOST_LINES = 15  # of a solution that is printed
@@ -157,6 +158,8 @@ class Solution:
             controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
             jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
             was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
+        tightening_cost: Of the cost what the bounds drawn in take, beside the plan of the same mesh that keeps them at
+            the points of the grid alone: an estimate of how much too much it costs, not a bound.
         start: Where the solver started from when it found this: ``guess``, ``zeros``, ``roll-out`` (of the dynamics,
             with the controls of the guess), ``elastic plan`` (that misses the constraints least) or ``downhill``
             (beside a stationary plan that is no minimum).
@@ -187,6 +190,7 @@ class Solution:
     problem_lost: str = field(default="", compare=False, repr=False)
     refinement: Refinement | None = None
     drawn_in: np.ndarray | None = None
+    tightening_cost: float = 0.0
     start: str = "guess"
     regularised: bool = False
 
@@ -206,6 +210,8 @@ class Solution:
             f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
             f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
         ]
+        if self.tightening_cost:
+            lines[0] += f"; about {self.tightening_cost:.2g} of the cost are for limits held between the nodes"
         pools = {**self.states, **self.controls}
         width = max(map(len, pools), default=0)
         for name, values in list(pools.items())[: MOST_LINES - 2]:
@@ -355,6 +361,7 @@ class Solution:
             problem_lost=f"phase {name!r} of {self.name!r} is audited with the whole",
             refinement=None,
             drawn_in=None,
+            tightening_cost=0.0,
         )
 
     def _sampled(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:

@@ -108,7 +108,10 @@ class Surroundings:
         object.__setattr__(self, "obstacles", found)
         near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
         object.__setattr__(self, "clearance", near)
-        robot = self.machine.robot
+        robot = getattr(self.machine, "robot", None)
+        if not isinstance(robot, Robot):
+            message = f"surroundings: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
+            raise ModelError(message, name="machine", value=self.machine)
         own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered)
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         links, around = self._told()

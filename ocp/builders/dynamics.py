@@ -51,6 +51,7 @@ from ocp.tasks.checks import (
     checked_configuration,
     checked_horizon,
     checked_tasks,
+    inside_limits,
     rates_at_rest,
 )
 from ocp.tasks.equations import TaskEquations, bind
@@ -346,9 +347,9 @@ def dynamics_problem(
         checked_instance("dynamics_problem: friction", friction, JointFriction)
     checked_choice("control", control, ("acceleration", "jerk"))
     robot, n = machine.robot, machine.joint_size
-    first_rates, last_rates = (rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
     pushers, fired = (checked_thrusters(machine, given) for given in (thrusters, () if firing is None else firing))
     bounds, keeps = limits.bounds(machine, ("velocity", "torque")), checked_steady(robot, steady)
+    first_rates, last_rates = (rates_at(what, given, n) for what, given in (("start", start), ("end", end)))
     sizes = _wheel_sizes(robot, bounds, checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon))
     bounds = bounds._replace(
         velocity=np.where(keeps, np.inf, bounds.velocity),
@@ -358,8 +359,15 @@ def dynamics_problem(
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
         words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
-    first = _ends("start_joints", start_joints, bounds.lower, bounds.upper)
-    last = _ends("end_joints", end_joints, bounds.lower, bounds.upper)
+    hint = "keep them, or leave that end free by nan"
+    first, last = (
+        inside_limits(what, robot.joint_names, _ends(what, given, n), bounds.lower, bounds.upper, hint)
+        for what, given in (("start_joints", start_joints), ("end_joints", end_joints))
+    )
+    first_rates, last_rates = (
+        inside_limits(f"{what} velocities", robot.joint_names, given, -bounds.velocity, bounds.velocity, hint)
+        for what, given in (("start", first_rates), ("end", last_rates))
+    )
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
     known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
     joined = start_joints is None or _is_free(start_base)
@@ -486,13 +494,12 @@ def _is_free(given: Any) -> bool:
         return False
 
 
-def _ends(what: str, given: Any, lower: Array, upper: Array) -> Array:
-    """Joints at an end, nan where free. Shape (n,).
+def _ends(what: str, given: Any, n: int) -> Array:
+    """Joints or their velocities at an end, nan where free. Shape (n,).
 
     Raises:
-        ProblemError: Other sizes, infinite, or outside the limits.
+        ProblemError: Other sizes, or infinite.
     """
-    n = len(lower)
     if given is None:
         return np.full(n, np.nan)
     try:
@@ -502,9 +509,6 @@ def _ends(what: str, given: Any, lower: Array, upper: Array) -> Array:
     if found.shape != (n,) or np.isinf(found).any():
         words = f"{what}: {n} numbers, nan where free, are expected, not {found.tolist()}"
         raise ProblemError(words, name=what, value=found, limit=n)
-    for k in np.flatnonzero((found < lower) | (found > upper)):
-        words = f"{what}: joint {k} is at {found[k]:g}, its limits are [{lower[k]:g}, {upper[k]:g}]"
-        raise ProblemError(words, name=what, value=float(found[k]), limit=(float(lower[k]), float(upper[k])))
     return found
 
 
@@ -542,10 +546,9 @@ def rates_at(what: str, given: Any, n: int) -> Array:
     """
     if isinstance(given, str):
         return np.full(n, 0.0 if checked_choice(what, given, ("rest", "free")) == "rest" else np.nan)
-    endless = np.full(n, np.inf)
     if given is None:
         raise ProblemError(f"{what} must be 'rest', 'free' or velocities, not None", name=what, value=given)
-    return _ends(what, given, -endless, endless)
+    return _ends(what, given, n)
 
 
 def told_or(told: Array, found: Any) -> Any:
@@ -571,8 +574,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, given: Any) 
     """Hold the configuration of the base at the end, its attitude by three equations."""
     if not machine.base_size:
         raise ProblemError("a fixed base has no end_base", name="end_base", value=given)
-    endless = np.full(machine.base_size, np.inf)
-    goal = _ends("end_base", given, -endless, endless)
+    goal = _ends("end_base", given, machine.base_size)
     gaps = base[: machine.base_size] - goal
     rows = np.flatnonzero(~np.isnan(goal)).tolist()
     if machine.base_size == 7 and set(rows) & {3, 4, 5, 6}:

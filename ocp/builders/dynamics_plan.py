@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Unpack
 
 import numpy as np
@@ -65,9 +66,10 @@ def plan_dynamics(
 
     Its limits hold between the nodes, too, to 1e-5 of their units.
 
-    The first plan that passes its audit is returned; where none does, one that holds everything and is not decided to
-    be a minimum. Least time alone, `Effort(torque=0, time=1)`, leaves open what joints do that need not hurry, so that
-    no plan is decided to be the best: a small weight of accelerations or torques beside it says it.
+    The first plan that passes its audit is returned; where none does, the cheapest that holds everything: it is not
+    decided to be a minimum, or costs too much, by about its `tightening_cost`. Least time alone,
+    `Effort(torque=0, time=1)`, leaves open what joints do that need not hurry, so that no plan is decided to be the
+    best: a small weight of accelerations or torques beside it says it.
 
     Args:
         machine, start_joints, clear, asked: As for `dynamics_problem`.
@@ -78,8 +80,8 @@ def plan_dynamics(
         options: Of IPOPT. tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
 
     Raises:
-        SolveError: No plan holds its limits and passes; says what became of each attempt, and names the joint, the
-            time and the limit where one is in the way.
+        SolveError: No plan holds its limits; says what became of each attempt, and names the joint, the time and the
+            limit where one is in the way.
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
     if isinstance(horizon, Sequence) and not isinstance(horizon, str):
@@ -164,7 +166,8 @@ def _first_that_holds(
         SolveError: As it does; at once where a plan is sound but for bodies that touch.
     """
     reasons: list[str] = []
-    why, last, open_, begin = SolveError(), None, None, guess
+    why, last, begin = SolveError(), None, guess
+    feasible, dear = list[Solution](), list[tuple[Collocation, Solution]]()
     for _ in range(MESHES):
         for what, plan in _attempts(problem, mesh, settings, guess):
             name = f"{mesh.intervals} intervals{what}"
@@ -173,6 +176,7 @@ def _first_that_holds(
                 why, last = plan, plan.solution or last
                 if plan.solution is not None and plan.solution.success:
                     guess = plan.solution
+                    dear.append((mesh, guess))
                 continue
             audit = plan.audit(tolerances=tolerances)
             if audit.passed:
@@ -180,18 +184,28 @@ def _first_that_holds(
             if touching := touching_error(audit, plan):
                 raise touching
             guess = last = plan
+            feasible += [plan] if audit.feasible else []
             if audit.failures:
                 worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
                 details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
                 why = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", plan, name=worst.name, **details)
                 reasons.append(f"{name}: {why}")
-            else:
-                open_ = open_ or plan
         if guess is None or guess is begin:
             break
         mesh = _finer(mesh, guess, why)
-    if open_ is not None:
-        return open_
+    held = list[Solution]()
+    while dear and not held:  # what no mesh makes cheap is held at its cost, on the last one where that can be
+        finest = dear[-1][0]
+        for plan in [plan for own, plan in dear if own is finest]:
+            own = finest.with_mesh(plan.control_interpolant.breaks)
+            with suppress(SolveError):
+                plan = tighten(problem, own, tolerance=HELD, options={**NEAR, **settings}, guess=plan)
+                audit = plan.audit(tolerances=tolerances)
+                held += [plan] if audit.feasible else []
+                reasons.append(f"{finest.intervals} intervals, at whatever cost: {audit.sentence}")
+        dear = [each for each in dear if each[0] is not finest]
+    if feasible or held:
+        return min(feasible + held, key=lambda plan: plan.cost)
     words = "no plan holds its limits and passes its audit:\n" + "\n".join(reasons)
     details = {"name": why.name, "value": why.value, "limit": why.limit, "time": why.time}
     raise SolveError(words, last, why.conflicts, **details)

@@ -46,6 +46,7 @@ from ocp.tasks.checks import (
     checked_tasks,
     checked_weights,
     dependent_rows,
+    inside_limits,
 )
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.tip_task import TipTask, Velocity, one_of
@@ -156,11 +157,7 @@ def minimum_velocity_problem(
         check_closed(equations, duration)
     robot, unbounded = machine.robot, np.full(machine.joint_size, np.inf)
     lower, upper, speed = (robot.lower, robot.upper, robot.velocity) if limits else (-unbounded, unbounded, unbounded)
-    for name, value, low, high in zip(robot.joint_names, start, lower, upper, strict=True):
-        if not low <= value <= high:
-            message = f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}"
-            hint = "start inside or pass limits=False"
-            raise ProblemError(f"{message}; {hint}", name=name, value=float(value), limit=(low, high))
+    start = inside_limits("start_joints", robot.joint_names, start, lower, upper, "start inside or pass limits=False")
     local = _local_motion(equations, start, place, duration, heavy, guess_damping)
     problem = Problem(f"minimum velocity, {formulation.replace('_', ' ')}", symbols=symbols)
     base: Any = np.zeros(0)

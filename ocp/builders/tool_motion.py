@@ -154,6 +154,7 @@ def tool_motion_problem(
     time_cost: float | None = None,
     driven: bool = False,
     clear: Clear | None = None,
+    held: Array | None = None,
 ) -> ToolMotion:
     """Do tasks while the integral of half the weighted squared joint rates is least.
 
@@ -177,6 +178,7 @@ def tool_motion_problem(
             constraints "torques" and "power" are added, and the tasks are held by their accelerations. Velocities go
             on from stretch to stretch, and are free at both ends as the rates are. Accelerations (jerks) have the
             weight SMOOTH squared times the horizon squared (to the fourth) in the cost: without, they would jump.
+        held: Which joints stand still. Shape (joint_size,), bool.
 
     Raises:
         ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last; a task
@@ -188,6 +190,7 @@ def tool_motion_problem(
             raise ProblemError(words, name="horizon")
         return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost, clear)
     horizon = stretches[-1].end
+    bounds = bounds if held is None else bounds._replace(velocity=np.where(held, 0.0, bounds.velocity))
     for stretch in stretches:
         if stretch.equations is not None:
             check_speed(stretch.equations, bounds.velocity, stretch.begin, stretch.end)

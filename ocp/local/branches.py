@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
 from ocp.local.closed_forms import ClosedForm, closed_forms
+from ocp.local.inverse_kinematics import at_rest
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.tip_task import ANGULAR, LINEAR
 
@@ -29,7 +30,7 @@ class Branches:
 
     def __init__(self, equations: TaskEquations, forms: tuple[ClosedForm, ...], lower: Array, upper: Array) -> None:
         self.forms, self.lower, self.upper = forms, lower, upper
-        self._task = equations.bound[0].task
+        self._task, self._idle = equations.bound[0].task, equations.idle
         self.open = not set(self._task.chosen) & set(ANGULAR)
 
     def postures(self, targets: Array, count: int, number: int = 0) -> Array:
@@ -50,7 +51,9 @@ class Branches:
             span = np.where(form.turns[list(form.held)], np.pi, SLIDE)
             low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
             found.append(form.postures(places, rotations, low + shares[:, : len(form.held)] * (high - low))[1])
-        return self._within(np.concatenate(found))
+        joints = np.concatenate(found)
+        joints[:, self._idle] = at_rest(self.lower, self.upper)[self._idle]
+        return self._within(joints)
 
     def _poses(self, form: ClosedForm, targets: Array, shares: Array) -> tuple[Array, Array]:
         """Poses of the tip that do the task, with its open angle at shares of a turn. Shapes (M, 3), (M, 3, 3)."""

@@ -125,7 +125,8 @@ class ClosedForm:
             held: Positions of the joints that are held. Shape (M, len(held)).
 
         Returns:
-            The pose of each posture, shape (K,), and joint positions, angles between -pi and pi, (K, n).
+            The pose of each posture, shape (K,), and joint positions, angles between -pi and pi, (K, n); joints that do
+            not lead to the tip are at 0.
         """
         count, n = len(places), len(self.ways)
         joints = np.zeros((count, n))
@@ -163,16 +164,16 @@ class ClosedForm:
 def closed_forms(machine: Machine) -> tuple[ClosedForm, ...]:
     """The closed forms of a machine's arm, found from its axes; none where it has none, or where its base moves.
 
-    Of arms with more joints than six one for each choice of joints to hold that leaves one.
+    Of arms with more joints than six one for each choice of joints to hold that leaves one. Joints that do not lead to
+    the tip do not matter.
     """
-    robot, n = machine.robot, machine.joint_size
-    if machine.base_size or robot.tip is None or any(joint.mimic is not None for joint in robot.joints):
+    robot = machine.robot
+    path = () if robot.tip is None else [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
+    n = len(path)
+    if machine.base_size or n > MOST or any(joint.mimic is not None for joint in path):
         return ()
-    names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
-    if len(names) != n or n > MOST:
-        return ()
-    order = tuple(robot.joint_names.index(name) for name in names)
-    at = ca.DM(n, 1)
+    order = tuple(robot.joint_names.index(joint.name) for joint in path)
+    at = ca.DM(machine.joint_size, 1)
     pose, jacobian = machine.tip_pose((), at), np.array(ca.DM(machine.tip_jacobian((), at)))
     place, rotation = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))
     turning, moving = jacobian[:3].T, jacobian[3:].T

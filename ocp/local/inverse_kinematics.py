@@ -234,7 +234,7 @@ class _Search:
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
         found = [Posture(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
-        return _distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
+        return distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
 
     @property
     def _turns(self) -> NDArray[np.bool_]:
@@ -314,6 +314,13 @@ def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: An
     return np.asarray(np.clip(both, lower, upper))
 
 
+def at_rest(lower: Array, upper: Array) -> Array:
+    """Where joints stand of which nothing is asked: in the middle of their limits, else within them next to 0."""
+    with np.errstate(invalid="ignore"):
+        middle = (lower + upper) / 2
+    return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
+
+
 def gauss_newton(
     function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int, told: Sequence[Any] = ()
 ) -> tuple[Array, Array]:
@@ -354,7 +361,7 @@ def gauss_newton(
     return q, np.abs(residual).max(axis=1)
 
 
-def _distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float) -> list[Posture]:
+def distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float = APART) -> list[Posture]:
     """Of those nearer than `apart`, full turns not counted, the best."""
     kept: list[Posture] = []
     for posture in found:

@@ -37,7 +37,7 @@ from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
 
-__all__ = ["TOUCHES", "Maker", "coarse_motions", "fine_motions"]
+__all__ = ["TOUCHES", "Maker", "closer_motions", "coarse_motions", "fine_motions"]
 
 COARSE, FINE = 2, 7
 """Degrees of collocation: smooth pieces are met to rounding by one interval of the high one."""
@@ -69,6 +69,8 @@ MOST = 400
 """Intervals of a mesh."""
 EVERY = 8
 """Motions that are audited, the cheapest first, where all are asked for: an audit of a large machine takes seconds."""
+GAIN = 0.01
+"""Share of the cost that a motion has to promise to spare, to be solved as it is."""
 FAR = 10.0
 """A local motion so many times as dear as the cheapest plan is not worth a solve."""
 SOLVER = {"max_iter": 150}
@@ -284,13 +286,41 @@ def _held_starts(maker: Maker, starts: Sequence[Array]) -> list[Candidate]:
     ways = [(one, way) for one, way in ways if max(misfits_of(way)) <= OUT_OF_REACH]
     ways.sort(key=lambda way: sum(part.cost[0] for part in way[1]))
     for start, way in ways[:FAILURES]:
-        held = Maker(replace(asked, start=start), start, start)
-        told.append(held.solved(start, held.motion.guess(way, 0)))
+        told.append(_held_start(maker, start, way))
         if not told[-1].why:
-            near = asked.clear.holding([touch.pair for touch in maker.local_touches(start)])
-            slid = maker.solved(start, told[-1].solution, clear=near)
-            return [*told[:-1], slid if not slid.why and slid.cost <= told[-1].cost else told[-1]]
+            break
     return told
+
+
+def closer_motions(maker: Maker, followed: list[Followed], told: list[Candidate], enough: float) -> list[Candidate]:
+    """What becomes on the fine mesh of motions as they are, their starts held, the cheapest first.
+
+    A start that is free, and a coarse mesh, may lead away from a motion that is nearly the cheapest. Ends with one that
+    costs no more than is `enough`; motions that promise to be hardly cheaper than what is `told` are left out.
+    """
+    more, least = list[Candidate](), min((one.cost for one in told if not one.why), default=np.inf)
+    costs = np.sum([part.cost for part in followed], axis=0)
+    for number in np.argsort(costs, kind="stable").tolist():
+        if least <= enough or costs[number] >= (1 - GAIN) * least:
+            break
+        way = [part.of(slice(number, number + 1)) for part in followed]
+        more.append(_held_start(maker, followed[0].joints[number, 0], way))
+        least = least if more[-1].why else min(least, more[-1].cost)
+    return more
+
+
+def _held_start(maker: Maker, start: Array, way: list[Followed]) -> Candidate:
+    """What becomes of a local motion from a posture that is held; from what passes the start slides again."""
+    held = maker if maker.asked.start is not None else Maker(replace(maker.asked, start=start), start, start)
+    found = held.solved(start, held.motion.guess(way, 0))
+    if found.why or held is maker:
+        return found
+    clear = maker.asked.clear
+    if clear is not None:
+        maker.followed[tuple(start)] = way
+        clear = clear.holding([touch.pair for touch in maker.local_touches(start)])
+    slid = maker.solved(start, found.solution, clear=clear)
+    return slid if not slid.why and slid.cost <= found.cost else found
 
 
 class Maker:
@@ -324,7 +354,7 @@ class Maker:
         if clear is None or not clear.margins or self.asked.start is not None:
             return self.start
         moves = clear.surroundings.levers.joints[sorted(clear.margins)].any(axis=0)
-        return np.where(moves, np.nan, self.start)
+        return np.where(moves & ~self.asked.held, np.nan, self.start)
 
     def local_touches(self, start: Array) -> list[Touch]:
         """The bodies that come too near in the local motion from a posture, the worst first."""

@@ -205,24 +205,35 @@ class _Edges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Held(TaskEquations):
-    """Equations of tasks and a last row: one joint is to be where the last of the targets says.
+    """Equations of tasks and last rows: some joints are to be where the last of the targets say.
 
     Attributes:
-        joint: Its number.
+        held: Numbers of these joints.
     """
 
-    joint: int
+    held: tuple[int, ...]
 
     @property
     def size(self) -> int:
-        return super().size + 1
+        return super().size + len(self.held)
+
+    def _rows(self, joints: Any, targets: Any) -> Any:
+        return targets[targets.numel() - len(self.held) :] - joints[list(self.held)]
 
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
-        return ca.vertcat(super().error(base, joints, targets[:-1]), targets[-1] - joints[self.joint])
+        return ca.vertcat(super().error(base, joints, targets), self._rows(joints, targets))
+
+    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
+        return ca.vertcat(super().misfit(base, joints, targets), self._rows(joints, targets))
 
     def jacobian(self, base: Any, joints: Any) -> Any:
-        row = ca.DM.eye(self.machine.joint_size)[self.joint, :]
-        return ca.vertcat(super().jacobian(base, joints), row)
+        rows = ca.DM.eye(self.machine.joint_size)[list(self.held), :]
+        return ca.vertcat(super().jacobian(base, joints), rows)
+
+    @property
+    def _symbols(self) -> tuple[Any, Any, Any]:
+        base, joints, targets = super()._symbols
+        return base, joints, ca.SX.sym("targets", targets.numel() + len(self.held))
 
 
 class SelfMotions:

@@ -394,7 +394,8 @@ class _Giving:
             if not own:
                 continue
             q, wanted = ca.SX.sym("q", n), ca.SX.sym("wanted", sets.targets.shape[1])
-            error, gives = sets.equations.error(ca.SX(0, 1), q, wanted), sets.equations.turning == turning
+            error, rows_turn = sets.equations.error(ca.SX(0, 1), q, wanted), sets.equations.turning
+            gives = np.append(rows_turn == turning, np.zeros(sets.equations.size - len(rows_turn), dtype=bool))
             ends = np.cumsum([0, *(part.task.size for part in sets.equations.bound)]).tolist()
             parts = [a + np.flatnonzero(gives[a:b]) for a, b in pairwise(ends)]
             each = ca.vertcat(*(ca.sumsqr(error[part.tolist()]) for part in parts if part.size))

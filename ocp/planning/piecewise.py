@@ -26,7 +26,7 @@ from ocp.local.touching import distances_along
 from ocp.methods import solve
 from ocp.planning.motion import Candidate, Part, Plan
 from ocp.planning.planner import checked_asked, clear_of, planned
-from ocp.planning.postures import Asked, followed_from, postures_at_the_start
+from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled
 from ocp.planning.task_search import TaskSearch
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -172,6 +172,8 @@ def plan_in_pieces(
         raise ProblemError(words, name="obstacles", value=obstacles)
     asked = replace(asked, clear=clear)
     postures = postures_at_the_start(asked)
+    if asked.start is None:
+        postures = settled(asked, postures)[1]
     searched = TaskSearch(asked, followed_from(asked, postures))
     barred: list[tuple[float, float]] = []
     known: dict[tuple[float, float], Plan] = {}

@@ -32,7 +32,7 @@ from ocp.errors import (
 )
 from ocp.local.following import Followed
 from ocp.local.inverse_kinematics import LARGEST_SEED
-from ocp.planning.candidates import TOUCHES, Maker, coarse_motions, fine_motions
+from ocp.planning.candidates import TOUCHES, Maker, closer_motions, coarse_motions, fine_motions
 from ocp.planning.cells import CellSearch, follows
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.driven import driven_plan, limits_drives, without_drives
@@ -46,9 +46,10 @@ from ocp.planning.postures import (
     settled,
     touches_at_the_start,
 )
+from ocp.planning.search import checked_bound
 from ocp.planning.standing import plan_to_stand
 from ocp.planning.task_search import TaskSearch
-from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights
+from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, inside_limits
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
@@ -57,8 +58,8 @@ __all__ = ["SearchKind", "checked_asked", "clear_of", "plan", "planned"]
 
 SearchKind: TypeAlias = Literal["start", "postures", "global"]
 
-ROUNDED = 1e-9
-"""Share of its cost by which a plan may be cheaper than a bound of all."""
+ENOUGH = 1.05
+"""Of a plan that costs so many times the bound, the search's own motions are solved as they are, beside it."""
 TRIED = 8
 """Postures that are taken one after the other, the best conditioned first, before all of them are compared; and ways of
 each search through cells, the cheapest first. There are hundreds of these, and each takes seconds."""
@@ -105,9 +106,10 @@ def plan(
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
-            that none falls below, for poses that leave at most two directions free, see `ocp.planning.search`; on a
-            floating one of all that a search over exact states finds, without a bound, see `ocp.planning.cells`, which
-            also goes on where local motions come to a singularity.
+            that none falls below, for poses that leave at most two directions free, see `ocp.planning.search`. Joints
+            that move no task's frame, as a gripper's, stand still then, as in `start` or in the middle of their limits.
+            On a floating one of all that a search over exact states finds, without a bound, see `ocp.planning.cells`,
+            which also goes on where local motions come to a singularity.
         seed: Of inverse kinematics.
         obstacles: Shapes in world, or `Moving` ones, that the machine's bodies stay clear of.
         clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
@@ -151,9 +153,9 @@ def planned(asked: Asked, search: SearchKind, limits: Limits | None) -> Plan:
         ProblemError, SolveError: As `plan`.
     """
     maker, made = _planned(asked, search)
-    if limits is None or not limits_drives(limits):
-        return made
-    return driven_plan(asked, maker.start, maker.reference, made, limits)
+    if limits is not None and limits_drives(limits):
+        made = driven_plan(asked, maker.start, maker.reference, made, limits)
+    return made if made.bound is None else replace(made, bound=checked_bound(made.bound, made.cost))
 
 
 def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
@@ -197,8 +199,9 @@ def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
             found = searched.followed(every)
             if found[0].cost.size:
                 told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
+                told += closer_motions(maker, found, told, ENOUGH * searched.bound)
             if any(not one.why for one in told):
-                return maker, _bounded(maker.plan(told), searched.bound)
+                return maker, replace(maker.plan(told), bound=searched.bound)
         while searched.looked_closer():
             if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
                 raise end
@@ -213,7 +216,7 @@ def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
         if searched is not None and (end := searched.dead_end()) is not None:
             raise end from error
         raise
-    return maker, made if searched is None else _bounded(made, searched.bound)
+    return maker, made if searched is None else replace(made, bound=searched.bound)
 
 
 def _through_cells(maker: Maker, followed: list[Followed], postures: Array, every: bool) -> list[Candidate]:
@@ -250,11 +253,6 @@ def _through_cells(maker: Maker, followed: list[Followed], postures: Array, ever
                 return told
     why = f"not tried, for the {TRIED} cheapest of its search fail"
     return told + [Candidate(one, np.nan, why) for ways in found for one in ways[0].joints[TRIED:, 0]]
-
-
-def _bounded(made: Plan, bound: float) -> Plan:
-    """A plan with a bound of the cost of any motion; without, where the plan itself shows that it is none."""
-    return replace(made, bound=bound) if bound <= made.cost * (1 + ROUNDED) else made
 
 
 def clear_of(
@@ -344,7 +342,9 @@ def checked_asked(
             checked_tasks(stretch.equations, place, middle, duration, start=first)
     del equations
     if joints is not None:
-        _check_inside(machine, joints, told)
+        bounds = told.bounds(machine)
+        names, hint = machine.robot.joint_names, "start inside them"
+        joints = inside_limits("start", names, joints, bounds.lower, bounds.upper, hint)
     heavy = checked_weights(weights, machine.joint_size)
     return Asked(
         machine,
@@ -358,12 +358,5 @@ def checked_asked(
         cyclic,
         int(seed),
         float(time_cost) if free else None,
+        holds_idle=search == "global",
     )
-
-
-def _check_inside(machine: Machine, joints: Array, limits: Limits) -> None:
-    bounds = limits.bounds(machine)
-    for name, value, low, high in zip(machine.robot.joint_names, joints, bounds.lower, bounds.upper, strict=True):
-        if not low <= value <= high:
-            words = f"start: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}; start inside them"
-            raise ProblemError(words, name=name, value=float(value), limit=(float(low), float(high)))

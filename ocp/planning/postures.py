@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
@@ -14,7 +15,7 @@ from ocp.builders.clearance import Clear
 from ocp.builders.tool_motion import Stretch
 from ocp.errors import ProblemError
 from ocp.local.following import Followed, follow
-from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.local.inverse_kinematics import Unreachable, at_rest, distinct, inverse_kinematics, starts_of
 from ocp.local.touching import Touch, distances_along
 from ocp.tasks.checks import ignorable_joints
 from ocp.tasks.equations import bind
@@ -47,6 +48,7 @@ class Asked:
         start: Joints at the start, or None. base: Base there. weights: Of the joint rates.
         limits: Of the joints.
         clear: What the motion has to stay clear of, or None.
+        holds_idle: Whether joints that move no task's frame stand still: what else they may do is not searched.
     """
 
     machine: Machine
@@ -61,6 +63,17 @@ class Asked:
     seed: int
     time_cost: float | None
     clear: Clear | None = None
+    holds_idle: bool = False
+
+    @cached_property
+    def idle(self) -> NDArray[np.bool_]:
+        """Which joints move the frame of no task, at any time. Shape (n,)."""
+        return bind(self.machine, self.tasks).idle
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Which joints stand still. Shape (n,)."""
+        return self.idle & self.holds_idle
 
     @cached_property
     def bounds(self) -> JointBounds:
@@ -81,6 +94,9 @@ def postures_at_the_start(asked: Asked) -> Array:
         found = inverse_kinematics(asked.machine, first, **options)
     except Unreachable as error:
         raise placed(asked, error, 0.0) from error
+    resting, slides = at_rest(asked.bounds.lower, asked.bounds.upper), asked.machine.robot.moving_joints
+    found = [replace(posture, joints=np.where(asked.idle, resting, posture.joints)) for posture in found]
+    found = distinct(found, np.array([joint.kind != "prismatic" for joint in slides]))
     joints = np.array([posture.joints for posture in found])
     touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
     return joints[np.argsort(touching, kind="stable")]
@@ -126,24 +142,24 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
 
     An ignorable coordinate, by whose value nothing that is asked changes but the joint itself (the last joint of an arm
     whose roll is free turns about the tool's axis), has the middle of its range: with it free, every motion would be
-    one of a family of the same cost. Where every posture touches something with that, it has the value that it has in
-    the one with whose values the most are clear.
+    one of a family of the same cost. So has a joint that moves no tip, a gripper's finger. Where every posture touches
+    something with that, they have the values of a posture, or random ones, with which the most are clear.
     """
     bounds = asked.bounds
     start = np.full(asked.machine.joint_size, np.nan)
-    with np.errstate(invalid="ignore"):
-        middle = (bounds.lower + bounds.upper) / 2
     ignorable = np.ones(asked.machine.joint_size, dtype=bool)
     for stretch in asked.stretches:
         if stretch.equations is not None:
             ignorable &= ignorable_joints(stretch.equations, asked.base)
-    start[ignorable] = np.where(np.isfinite(middle), middle, postures[0])[ignorable]
+    ended = np.isfinite(bounds.upper - bounds.lower)
+    start[ignorable] = np.where(ended, at_rest(bounds.lower, bounds.upper), postures[0])[ignorable]
 
     def clear(values: Array) -> int:
         return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
 
     if ignorable.any() and not clear(start):
-        start[ignorable] = max((start, *postures), key=clear)[ignorable]
+        others = starts_of(asked.machine, bounds.lower, bounds.upper, STARTS, None, asked.seed)
+        start[ignorable] = max((start, *postures, *others), key=clear)[ignorable]
     return start, np.where(ignorable, start, postures)
 
 

@@ -120,6 +120,7 @@ def declared_motion(
         "weights": asked.weights,
         "time_cost": asked.time_cost,
         "driven": limits is not None,
+        "held": asked.held if limits is None else None,
         "clear": clear,
     }
     bounds = (limits or asked.limits).bounds(asked.machine)

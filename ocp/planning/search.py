@@ -17,12 +17,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models import Surroundings
 from models.arrays import Array
+from ocp.errors import BoundWarning
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import distances_along
 from ocp.planning.charts import Charts, Instant, JointSpace, Parts, point
@@ -30,7 +32,7 @@ from ocp.planning.steps import StepCost, Values, least_in_box
 from ocp.planning.tight import DEAR, drawn_tight
 from ocp.planning.value import FARTHEST, Graph
 
-__all__ = ["FREE", "MOST", "Search"]
+__all__ = ["FREE", "MOST", "Search", "checked_bound"]
 
 FREE = 2
 """Directions that a task may leave free: of more there are too many postures."""
@@ -54,8 +56,23 @@ WHOLE = 1e-9
 """rad or m: limits are kept up to this."""
 INWARDS = (0.0, 0.25, 0.5, 1.0)
 """Shares of the way to the middle of a chart at which a posture is tried that keeps the limits."""
+ROUNDED = 1e-9
+"""Share of its cost by which a motion may be cheaper than a bound of all."""
 SEATS = 5
 """Instants at which the cheapest motions through all charts are compared."""
+
+
+def checked_bound(bound: float, cost: float) -> float | None:
+    """The bound of the cost of all motions; None where one costs less, which a bound excludes.
+
+    Warns:
+        BoundWarning: That it does.
+    """
+    if bound <= cost * (1 + ROUNDED):
+        return bound
+    words = f"a motion costs {cost:.9g}, less than the bound {bound:.9g} of all motions, which is left out: report this"
+    warn(BoundWarning(words, name="bound", value=cost, limit=bound), stacklevel=2)
+    return None
 
 
 class Search:

@@ -61,7 +61,8 @@ class Sections(Search):
         whole, count = self.instants[0].sets, len(self.instants)
         numbers, each = [instant.number for instant in self.instants], len(self._values)
         targets = np.tile(whole.targets[numbers], (each, 1))
-        held = Held(whole.equations.machine, whole.equations.bound, self._joint)
+        others = whole.equations.held if isinstance(whole.equations, Held) else ()
+        held = Held(whole.equations.machine, whole.equations.bound, (*others, self._joint))
         self._curves = SelfMotions(self.space, held, np.column_stack([targets, np.repeat(self._values, count)]))
         found = [seeds(k) for k in range(count)]
         own = np.repeat(np.arange(count), [len(some) for some in found])

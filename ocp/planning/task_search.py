@@ -13,7 +13,7 @@ from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
 from ocp.local.inverse_kinematics import Unreachable, postures_of
-from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import DeadEnd, dead_end
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.planning.reconfigurations import farthest, fewest_pieces
@@ -69,6 +69,8 @@ class TaskSearch:
         best = int(np.where(follows | ~follows.any(), cost, np.inf).argmin())
         self.space = JointSpace(machine, bounds.lower, bounds.upper, asked.weights)
         self.bound = 0.0
+        self._held = tuple(np.flatnonzero(asked.idle).tolist())
+        self._at = followed[0].joints[best, 0, list(self._held)]
         times = list[Array]()
         for stretch, part in zip(asked.stretches, followed, strict=True):
             if (equations := stretch.equations) is None:
@@ -76,7 +78,7 @@ class TaskSearch:
             if not equations.posed.all():
                 words = "search='global' needs poses, and a task gives velocities; say where its tip is: position=..."
                 raise ProblemError(words, name="search", value="global", time=stretch.begin)
-            size = machine.joint_size - equations.size
+            size = machine.joint_size - equations.size - len(self._held)
             if size > FREE:
                 words = (
                     f"search='global': the tasks leave {size} directions free from {stretch.begin:g} s on, "
@@ -103,14 +105,19 @@ class TaskSearch:
         """Cover the postures at the times of each stretch that has tasks."""
         asked, instants = self.asked, list[Instant]()
         for equations, own in zip(self._equations, times, strict=True):
-            targets = np.array(equations.target_function().map(len(own))(own[None, :])).T
-            sets = SelfMotions(self.space, equations, targets)
+            sets = self._sets(equations, own)
             instants += [Instant(sets, number) for number in range(len(own))]
         self._instants, self._parts, self.times = instants, times, np.concatenate(times)
         clear = None if asked.clear is None else asked.clear.surroundings
         limits = asked.bounds.velocity * np.diff(self.times)[:, None]
         told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "surroundings": clear}
         self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
+
+    def _sets(self, equations: TaskEquations, times: Array) -> SelfMotions:
+        """The postures at some times; joints that move no tip stay where they are at the start."""
+        targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
+        held = Held(equations.machine, equations.bound, self._held)
+        return SelfMotions(self.space, held, np.column_stack([targets, np.tile(self._at, (len(times), 1))]))
 
     @property
     def _equations(self) -> list[TaskEquations]:
@@ -205,8 +212,7 @@ class TaskSearch:
             rows = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in paths])
             rows = rows.reshape(count, n, len(times)).transpose(0, 2, 1)
             if stretch.equations is not None:
-                targets = np.array(stretch.equations.target_function().map(len(times))(times[None, :])).T
-                on = SelfMotions(self.space, stretch.equations, targets)
+                on = self._sets(stretch.equations, times)
                 rows = on.corrected(np.tile(np.arange(len(times)), count), rows.reshape(-1, n))[0].reshape(rows.shape)
             rows = np.clip(rows, asked.bounds.lower, asked.bounds.upper)
             rates = np.diff(rows, axis=1) / np.diff(times)[:, None]

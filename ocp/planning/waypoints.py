@@ -24,13 +24,13 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.clearance import clearance_of
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
-from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, postures_of
+from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest, postures_of
 from ocp.local.touching import Touch, distances_along, touches
-from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
 from ocp.planning.dead_end import KINDS, dead_end
 from ocp.planning.planner import clear_of
 from ocp.planning.reconfigurations import fewest_pieces
-from ocp.planning.search import FREE, Search
+from ocp.planning.search import FREE, Search, checked_bound
 from ocp.planning.sections import RADII, Sections, values_of
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
@@ -215,14 +215,17 @@ class _Ways:
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
-        equations = bind(machine, self._task(0))
+        free = bind(machine, self._task(0))
+        equations = Held(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
+        at = at_rest(self.lower, self.upper)
         targets = np.zeros((len(places), 18))
         targets[:, :3] = places
         targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)
+        targets = np.column_stack([targets, np.tile(at[free.idle], (len(places), 1))])
         self.sets = SelfMotions(self.space, equations, targets)
         self._known = dict[int, Array]()
         if not 0 <= self.sets.size <= FREE:
-            words = f"{machine.robot.name}: {machine.joint_size} joints for the {equations.size} rows of a pose"
+            words = f"{machine.robot.name}: {int((~free.idle).sum())} joints for the {free.size} rows of a pose"
             words += f"; hold joints until at most {FREE} are left over"
             raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
 
@@ -274,8 +277,8 @@ class _Ways:
             reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways))
             raise SolveError(f"{NONE_FOUND}: {reasons}", name="waypoints")
         listed = tuple((cost, why or ("" if k == 0 else "dearer")) for k, (cost, why, _) in enumerate(ways))
-        bound = bound if bound <= length else 0.0
-        return WaypointPlan(self.machine, joints, length, bound, listed, self._between(joints))
+        least = checked_bound(bound, length) or 0.0
+        return WaypointPlan(self.machine, joints, length, least, listed, self._between(joints))
 
     def _begun(self, make: Callable[[NDArray[np.intp]], Searched], every: int) -> tuple[Searched, NDArray[np.intp]]:
         """A search of one of so many waypoints, of fewer where that were more postures than memory is for."""
@@ -306,7 +309,8 @@ class _Ways:
                 if not why:
                     length = self._length(joints, after)
                     ways, between = ((length, ""),), self._between(joints, after)
-                    return WaypointPlan(self.machine, joints, length, min(bound, length), ways, between, after)
+                    least = checked_bound(bound, length) or 0.0
+                    return WaypointPlan(self.machine, joints, length, least, ways, between, after)
                 if len(more) == len(chosen):
                     raise SolveError(f"no way in {len(pieces)} pieces keeps all limits: {why}", name="waypoints")
             chosen = more

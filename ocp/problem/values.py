@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, told_apart
 
 __all__ = [
     "check_finite",
@@ -85,7 +85,8 @@ def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         given: dict[str, Any] = {"value": float(low), "limit": float(high)}
         if low > high:
-            raise ProblemError(f"{what}: lower bound {low:g} is above upper bound {high:g} (entry {i})", **given)
+            least, most = told_apart(float(low), float(high))
+            raise ProblemError(f"{what}: lower bound {least} is above upper bound {most} (entry {i})", **given)
         if low == np.inf or high == -np.inf:
             raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})", **given)
 
@@ -97,7 +98,8 @@ def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndar
         if np.isinf(number):
             raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free", **given)
         if number < low or number > high:
-            words = f"{what} value {number:g} is outside the bounds [{low:g}, {high:g}] (entry {i})"
+            told, least, most = told_apart(float(number), float(low), float(high))
+            words = f"{what} value {told} is outside the bounds [{least}, {most}] (entry {i})"
             raise ProblemError(words, **given)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, real, told_apart
 from ocp.tasks.equations import TaskEquations
 from ocp.tasks.geometry import Bound, is_holonomic, target_size
 from ocp.tasks.tip_task import ANGULAR, TipTask
@@ -28,6 +28,7 @@ __all__ = [
     "checked_weights",
     "dependent_rows",
     "ignorable_joints",
+    "inside_limits",
     "rates_at_rest",
 ]
 
@@ -36,6 +37,8 @@ CLOSURE_SAMPLES = 2001
 CLOSED = 1e-6
 """Largest gap of a closed path, m and rad."""
 IGNORABLE, IGNORABLE_SAMPLES = 1e-9, 4
+ROUNDING = 1e-9
+"""rad or m, of a joint with a limit below 1, else of its limit: how far beyond it rounding may have it."""
 STILL = 1e-6
 """Largest velocity asked for where the joints are to rest, m/s and rad/s."""
 
@@ -71,6 +74,21 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
         words = f"start_base has the quaternion {place[3:].tolist()}, which is not of unit length"
         raise ProblemError(words, name="start_base", value=place[3:])
     return angles, place
+
+
+def inside_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
+    """Joints at an end, nan where they are free, moved onto the limits that rounding has them beyond. Shape (n,).
+
+    Raises:
+        ProblemError: A joint farther outside its limits; ends with a hint what to do.
+    """
+    for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
+        if value < low - ROUNDING * max(1.0, abs(low)) or value > high + ROUNDING * max(1.0, abs(high)):
+            at, least, most = told_apart(value, low, high)
+            verb = "ends" if what.startswith("end") else "starts"
+            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {most}; {hint}"
+            raise ProblemError(words, name=name, value=value, limit=(low, high))
+    return np.clip(joints, lower, upper)
 
 
 def checked_weights(weights: Any, size: int) -> Array:

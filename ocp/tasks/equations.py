@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FreeFloating, Machine, ModelError, Robot, center_of_mass
+from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing, center_of_mass
 from models.arrays import Array
 from models.machines.machine import with_tip
 from models.robot.indices import manipulability_of
@@ -69,6 +69,19 @@ class TaskEquations:
     def posed(self) -> NDArray[np.bool_]:
         """Which rows are of poses. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
+
+    @cached_property
+    def idle(self) -> NDArray[np.bool_]:
+        """Which joints move neither the frame of a task nor its reference, as the tree says. Shape (joint_size,).
+
+        None of a machine whose base floats or that has to keep its balance: there every joint counts.
+        """
+        drives = self.machine.robot.drives
+        alone = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
+        idle = np.full(self.machine.joint_size, alone)
+        for robot in (tip.robot for part in self.bound for tip in (part.tip, part.reference) if tip is not None):
+            idle[[drives[joint.name].column for joint in robot.path_to(robot.tip_link) if joint.moves]] = False
+        return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
         """Units of the rows, "rad/s, m/s" of `residual`: rad of turning and m of places, with what they are taken per.

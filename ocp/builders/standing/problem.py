@@ -42,7 +42,7 @@ from models.robot.dynamics import Wrench
 from models.robot.indices import joint_limit_index
 from models.robot.robot import Robot
 from ocp.builders.clearance import Clear
-from ocp.builders.standing.start import check_freedom, check_loads, check_slope, inside_limits, local_guess, task_demand
+from ocp.builders.standing.start import check_freedom, check_loads, check_slope, local_guess, start_inside, task_demand
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
 from ocp.problem.problem import Problem, remembers_request
@@ -188,7 +188,7 @@ def standing_problem(
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
     begin, base = checked_configuration(machine, start_joints, None)
     bounds = limits.bounds(machine, ("velocity", "torque"))
-    begin = inside_limits(machine, begin, bounds.lower, bounds.upper)
+    begin = start_inside(machine, begin, bounds.lower, bounds.upper)
     check_rule(machine, zmp, duration)
     last = 1.0 if along == "parameter" else duration
     checked_tasks(equations, base, begin, last)

@@ -19,15 +19,13 @@ from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
+from ocp.tasks.checks import inside_limits
 from ocp.tasks.equations import TaskEquations, on_symbols
 from ocp.tasks.limits import JointBounds
 from ocp.tasks.tip_task import timed
 from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
-__all__ = ["check_freedom", "check_loads", "check_slope", "inside_limits", "local_guess", "task_demand"]
-
-ROUNDING = 1e-8
-"""How far beyond a limit a start may be, rad or m: what rounding and inverse kinematics leave."""
+__all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
 
 MISSED = 1e-6
 """Share of a limit by which it has to be missed to count as missed."""
@@ -40,20 +38,17 @@ GUESS_STEPS = 400
 RACING = 100.0  # rad/s or m/s, of a local motion near a singularity
 
 
-def inside_limits(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
+def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
     """The start, moved onto the limits where rounding has it beyond them. Shape (n,).
 
     Raises:
         ProblemError: A joint that starts outside its limits or has no room between them.
     """
     for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
-        if not low - ROUNDING <= value <= high + ROUNDING:
-            message = f"start_joints: {name!r} starts at {value:g}, outside its limits {low:g} .. {high:g}"
-            raise ProblemError(message, name=name, value=float(value), limit=(low, high))
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    return np.clip(joints, lower, upper)
+    return inside_limits("start_joints", machine.robot.joint_names, joints, lower, upper, "start inside them")
 
 
 def check_freedom(machine: Standing, size: int, zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:

@@ -30,7 +30,7 @@ from models.robot.indices import joint_limit_index
 from ocp.builders.standing.postures import PLACED, check_placed, first_guess, hold
 from ocp.builders.standing.problem import FreeTime
 from ocp.builders.standing.stances import StancePhase, Steps, Swing
-from ocp.builders.standing.start import inside_limits
+from ocp.builders.standing.start import start_inside
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
 from ocp.problem.phases import Phases
@@ -132,7 +132,7 @@ def steps_problem(
     begin = checked_numbers(start_joints, steps.robot.dof, "start_joints", "one entry for each joint")
     asked = _Asked(balance, float(margin), float(clearance), weights, limits)
     first = steps.stances[0]
-    own = inside_limits(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)
+    own = start_inside(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)
     _check_start(first, own, asked)
     begin = steps.in_order(first, own[None])[0]
     guesses = first_guess(steps, begin, LIFTED * clearance)

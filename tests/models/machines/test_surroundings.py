@@ -272,6 +272,13 @@ def test_a_slide_without_limits() -> None:
         _ = Surroundings(FixedBase(long), OBSTACLES[:1]).levers
 
 
+@pytest.mark.parametrize("wrong", [{}, (), None, "arm", 1.0, FixedBase, Robot((Link("alone"),))], ids=repr)
+def test_what_is_no_machine_has_no_surroundings(wrong: Any) -> None:
+    with pytest.raises(ModelError, match="surroundings: machine must be a FixedBase") as caught:
+        Surroundings(wrong)
+    assert caught.value.name == "machine"
+
+
 @pytest.mark.parametrize(("name", "rounding"), [("arm", 0.0), ("arm", 0.01), ("slider", 0.01), ("space", 0.01)])
 def test_gradients_of_distances_are_their_derivatives(name: str, rounding: float) -> None:
     """By joints, slides, followers, a base that floats, beside what stands and what turns; pairs in any order."""

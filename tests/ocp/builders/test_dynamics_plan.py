@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -127,6 +128,27 @@ def test_a_path_that_is_free_is_faster_than_toppra_along_the_straight_one(fastes
     s = np.linspace(0, 1, 2001)
     assert made.duration == pytest.approx(least_time_along(s, START + s[:, None] * (END - START)), rel=1e-2)
     assert fastest.horizon < 0.97 * made.duration
+
+
+@pytest.mark.parametrize(("mesh", "most"), [((2, 2), np.inf), ((1, 3), 2.5)])
+def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
+    mesh: tuple[int, int], most: float, tmp_path: Path
+) -> None:
+    """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
+    asked: dict[str, Any] = {"end_joints": END, "limits": Limits(torque=MOST, velocity=most)}
+    effort = Effort(torque=1e-4, time=1.0)
+    best = plan_dynamics(MACHINE, START, SOON, effort=effort, **asked)
+    method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
+    plan = plan_dynamics(MACHINE, START, SOON, effort=effort, method=method, **asked)
+    audit = plan.audit()
+    assert audit.feasible
+    assert not audit.passed
+    assert fine(plan).max() <= 1 + 1e-5
+    assert 0.5 * plan.tightening_cost <= plan.cost - best.cost <= 1.5 * plan.tightening_cost
+    assert f"about {plan.tightening_cost:.2g} of the cost" in str(plan)
+    plan.save(tmp_path / "plan.npz")
+    assert Solution.load(tmp_path / "plan.npz").tightening_cost == plan.tightening_cost
+    assert best.tightening_cost < 1e-3 * best.cost
 
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:

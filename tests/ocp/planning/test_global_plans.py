@@ -9,10 +9,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp import Candidate, Plan, ProblemError, TipTask, Unreachable, plan
+from models import FixedBase, planar_chain
+from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
 from ocp.planning import planner
 from ocp.planning.candidates import Maker, fine_motions
-from ocp.planning.search import Search
+from ocp.planning.search import Search, checked_bound
 from ocp.planning.task_search import instants_of
 from tests.ocp.planning.test_charts import moved, planar
 from tests.ocp.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -74,12 +75,63 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
     motions = Search.motions
     monkeypatch.setattr(Search, "motions", followed)
     monkeypatch.setattr(planner, "fine_motions", failing)
+    monkeypatch.setattr(planner, "closer_motions", lambda *told: [])
     found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
     assert asked == [False, True]
     assert failed
     assert found.audit().passed
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
+
+
+def winding(lengths: list[float], start: list[float], ways: list[list[float]], seconds: float) -> Any:
+    """A planar arm whose tip goes along a line, to one side of it and then to the other, and its task."""
+    machine = FixedBase(planar_chain(lengths, np.ones(len(lengths))))
+    first = np.array(ca.DM(machine.tip_pose((), np.array(start)).position)).ravel()[:2]
+
+    def place(t: Any) -> Any:
+        share = t / seconds
+        return ca.DM(first) + share * ca.DM(ways[0]) + ca.sin(2 * np.pi * share) * ca.DM(ways[1])
+
+    return machine, TipTask(position=place, rows=[3, 4], duration=seconds)
+
+
+def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it() -> None:
+    """Near its reach the arm whips round at last; with a free start a coarse mesh finds nothing but a dearer class."""
+    ways = [[-0.6585, 0.3798], [-0.3619, 0.0052]]
+    machine, task = winding([0.4428, 0.4788, 0.5695], [2.4578, -2.2448, 2.2583], ways, 3.4005)
+    found = plan(machine, task, search="global", clearance=None)
+    assert found.audit().passed
+    assert found.bound is not None
+    assert found.bound <= found.cost <= 1.05 * found.bound
+    held = plan(machine, task, start=found.at(0.0)["joints"], clearance=None)
+    assert found.cost <= held.cost * (1 + 1e-6)
+
+
+def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In use a warning, in these tests, where warnings are errors, a failure."""
+
+    def best(search: Search, most: float) -> tuple[np.ndarray | None, float]:
+        path, bound = right(search, most)
+        return path, 2 * bound
+
+    right = Search.best
+    machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
+    task = moved(machine, start, "place")
+    cost = plan(machine, task, search="global", clearance=None).cost
+    monkeypatch.setattr(Search, "best", best)
+    with pytest.raises(BoundWarning):
+        plan(machine, task, search="global", clearance=None)
+    with pytest.warns(BoundWarning, match="less than the bound") as caught:
+        found = plan(machine, task, search="global", clearance=None)
+    assert found.cost == pytest.approx(cost)
+    assert found.bound is None
+    warning = caught[0].message
+    assert isinstance(warning, BoundWarning)
+    assert warning.value == found.cost < warning.limit
+    with pytest.warns(BoundWarning):
+        assert checked_bound(1.0, 0.9) is None
+    assert checked_bound(1.0, 1.0 - 1e-12) == 1.0
 
 
 def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:

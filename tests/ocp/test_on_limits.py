@@ -1,0 +1,86 @@
+"""Values on a limit, and beyond it by rounding: taken as on it by whoever takes joints at an end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import FixedBase, Joint, Robot, planar_chain
+from models.arrays import Array
+from ocp import Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan, plan_dynamics
+from ocp.errors import told_apart
+
+LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
+
+
+def limited() -> FixedBase:
+    arm = planar_chain([0.5, 0.4], [1.0, 1.0])
+    bounds = zip(arm.joints, LOW, HIGH, strict=True)
+    joints = [Joint(j.name, j.kind, j.parent, j.child, j.translation, lower=a, upper=b) for j, a, b in bounds]
+    return FixedBase(Robot(arm.links, tuple(joints), tip_translation=arm.tip_translation))
+
+
+MACHINE = limited()
+
+
+def leaving(joints: Array) -> TipTask:
+    first = np.array(ca.DM(MACHINE.tip_pose((), joints).position)).ravel()[:2]
+    on = np.array(ca.DM(MACHINE.tip_pose((), np.array([0.3, 0.9])).position)).ravel()[:2]
+    return TipTask(position=lambda t: ca.DM(first) + (t / 2) ** 2 * ca.DM(on - first), rows=[3, 4], duration=1.0)
+
+
+def planned(joints: Array) -> float:
+    return float(plan(MACHINE, leaving(joints), start=joints, clearance=None).at(0.0)["joints"][0])
+
+
+def moved(joints: Array) -> float:
+    return float(plan_dynamics(MACHINE, joints, 1.0, end_joints=[0.3, 0.9]).at(0.0)["joints"][0])
+
+
+def arrived(joints: Array) -> float:
+    return float(plan_dynamics(MACHINE, [0.3, 0.9], 1.0, end_joints=joints).at(1.0)["joints"][0])
+
+
+def declared(joints: Array) -> float:
+    problem = minimum_velocity_problem(MACHINE, start_joints=joints, horizon=1.0, task=leaving(joints))
+    return float(np.array(ca.DM(problem.declared.states["joints"].initial)).ravel()[0])
+
+
+@pytest.mark.parametrize("entry", [planned, moved, arrived, declared])
+def test_a_joint_beyond_its_limit_by_rounding_is_on_it(entry: Callable[[Array], float]) -> None:
+    assert entry(np.array([np.nextafter(LOW[0], -1), 0.8])) >= LOW[0] - 1e-9
+    with pytest.raises(ProblemError, match=r"-0\.0175001, outside its limits -0\.0175 \.\. 3\.7525") as caught:
+        entry(np.array([LOW[0] - 1e-7, 0.8]))
+    assert caught.value.name == "joint1"
+    assert caught.value.limit == (LOW[0], HIGH[0])
+
+
+def test_velocities_beyond_their_limit_by_rounding_are_on_it() -> None:
+    asked: dict[str, Any] = {"end_joints": [1.5, 0.9], "limits": Limits(velocity=1.1)}
+    fast = plan_dynamics(MACHINE, [0.3, 0.9], 2.0, start=[np.nextafter(1.1, 2), 0.0], **asked)
+    assert fast.at(0.0)["velocities"][0] == pytest.approx(1.1, abs=1e-9)
+    with pytest.raises(ProblemError, match=r"'joint1' starts at 1\.1000001, outside its limits -1\.1 \.\. 1\.1;"):
+        plan_dynamics(MACHINE, [0.3, 0.9], 2.0, start=[1.1000001, 0.0], **asked)
+
+
+def test_a_declared_value_just_beyond_a_bound_is_told_with_the_digits_that_differ() -> None:
+    with pytest.raises(ProblemError, match=r"1\.0000000001 is outside the bounds \[0, 1\]"):
+        Problem("p").state("x", initial=1 + 1e-10, lower=0.0, upper=1.0)
+
+
+@given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=4))
+def test_numbers_that_differ_look_different(numbers: list[float]) -> None:
+    told = told_apart(*numbers)
+    for one, text in zip(numbers, told, strict=True):
+        for other, beside in zip(numbers, told, strict=True):
+            assert (text == beside) == (repr(one) == repr(other))
+
+
+def test_six_digits_are_enough_for_what_differs_there() -> None:
+    assert told_apart(-0.0175, 3.75251234) == ["-0.0175", "3.75251"]
