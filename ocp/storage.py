@@ -16,6 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from models.input_files import UnfitFile, open_regular
 from ocp.errors import ProblemError
 
 __all__ = ["MOST_BYTES", "read_arrays", "write_arrays", "write_text"]
@@ -132,8 +133,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     told: dict[str, Any] = {"name": "path", "value": str(checked_path(path))}
     try:
-        check_regular(path, os.stat(os.fspath(path)))  # a pipe would be waited for
-        with open(path, "rb") as stream:
+        with open_regular(path, MOST_BYTES) as stream:
             check_contents(path, stream, os.fstat(stream.fileno()).st_size)
             with zipfile.ZipFile(stream) as archive:
                 members = archive.infolist()
@@ -146,6 +146,8 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                 return {name_of(member): array_of(archive, member) for member in members}
     except (FileNotFoundError, ProblemError):
         raise
+    except UnfitFile as error:
+        raise ProblemError(f"{path} is not a saved solution: {error.strerror}", **told, limit=error.limit) from error
     except OSError as error:
         raise ProblemError(f"{path} cannot be read: {error.strerror or error}", **told) from error
     except Exception as error:  # what zip, zlib and numpy say of broken bytes is of many kinds
@@ -166,10 +168,7 @@ def check_regular(path: Any, status: os.stat_result) -> None:
 
 
 def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
-    """Raise where an archive or its table of contents is too large, or it does not end as one that was saved."""
-    if size > MOST_BYTES:
-        words = f"{path} is not a saved solution: {size:.3g} bytes, {MOST_BYTES:.3g} at most"
-        raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+    """Raise where an archive's table of contents is too large, or it does not end as one that was saved."""
     stream.seek(max(0, size - 42))
     tail = stream.read(42)
     if tail[-22:-18] != END or tail.startswith(LONG):
