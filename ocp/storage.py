@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import stat
+import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -114,7 +115,7 @@ def remove_left(target: Path) -> None:
         for name in os.listdir(target.parent):
             if part.fullmatch(name):
                 left = target.with_name(name)
-                with suppress(OSError), open(left, "rb") as stream:
+                with suppress(OSError), open_regular(left, sys.maxsize) as stream:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
                     left.unlink()
 

@@ -33,7 +33,7 @@ FLOORS = {
     ],
     "ocp": [
         ["errors", "curves", "console"],
-        ["storage", "libraries"],
+        ["storage", "libraries", "tables"],
         ["problem", "schedule", "tasks"],
         ["solution"],
         ["direct", "audit", "local"],

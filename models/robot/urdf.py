@@ -175,7 +175,8 @@ def written_urdf(
     if tip is not None:
         ElementTree.SubElement(robot, "tip", link=tip)
     ElementTree.indent(robot)
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+    head = '<?xml version="1.0" encoding="utf-8"?>\n<!-- written by selfmotion -->\n'
+    return head + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
 def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:

@@ -17,10 +17,11 @@ from ocp.files.trees import DEEPEST, checked_depth
 
 __all__ = ["Entries", "read_entries"]
 
-LARGEST_TOML = 2**22
+LARGEST_TOML = 2**20
 """Bytes."""
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
+BETWEEN = re.compile(r"[,=\[\]{}#]")
 AT_LINE = re.compile(r"\(at line (\d+)")
 NEARLY = 0.5
 """How alike two names are of which the one is taken for the other, 1 if they are equal."""
@@ -207,6 +208,9 @@ def read_entries(file: FileName) -> Entries:
         ProblemError: A file that cannot be read, or is no TOML, by line.
     """
     texts = read_lines(file, largest=LARGEST_TOML)
+    for number, text in enumerate(texts, 1):
+        if any(part.count(".") > DEEPEST for part in BETWEEN.split(text)):  # the parser's time grows by the square
+            raise wrong_line(file, number, text, f"a name has more than {DEEPEST} parts", DEEPEST)
     try:
         values = checked_depth(tomllib.loads("\n".join(texts)))
     except tomllib.TOMLDecodeError as error:
@@ -227,7 +231,7 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
     for number, text in enumerate(texts, 1):
         line = text.strip()
         if (head := TABLE.match(line)) and "=" not in head[2]:
-            names = tuple(part.strip().strip("\"'") for part in head[2].split(".")[:DEEPEST])
+            names = tuple(part.strip().strip("\"'") for part in head[2].split("."))
             table = ()
             for k, name in enumerate(names):
                 table = (*table, name)
@@ -239,7 +243,7 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
             found.setdefault(table, number)
         elif told := KEY.match(line):
             place = table
-            for part in told[1].split(".")[:DEEPEST]:
+            for part in told[1].split("."):
                 place = (*place, part.strip().strip("\"'"))
                 found.setdefault(place, number)
     return found

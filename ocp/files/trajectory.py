@@ -25,6 +25,7 @@ from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, 
 from ocp.files.lines import FileName, read_lines, wrong_line
 from ocp.files.mcap import read_joint_messages
 from ocp.files.trees import parts_of, read_tree
+from ocp.tables import table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
 
@@ -217,6 +218,9 @@ def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
     """Column and unit of the time; those of each joint's values by name and kind; notes."""
+    if own := table_joints(head):  # whatever their names seem to mean
+        columns = [(name, kind) for kind in KINDS[:3] for name in own]
+        return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
     time: tuple[int, float] | None = None
     found: dict[tuple[str, str], tuple[int, float]] = {}
     notes = []

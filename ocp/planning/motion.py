@@ -25,6 +25,7 @@ from ocp.planning.machines import machine_of, written_machine
 from ocp.schedule.trajectory import JointTrajectory
 from ocp.solution import Solution
 from ocp.storage import read_arrays, write_arrays, write_text
+from ocp.tables import table_head
 from ocp.tasks.targets import Target, targets_along
 from ocp.tasks.tip_task import TipTask
 
@@ -334,7 +335,7 @@ class Plan:
         columns = self.table(period)
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(table_head(self.names))
         writer.writerows([repr(value) for value in row] for row in np.column_stack([*columns.values()]).tolist())
         write_text(path, stream.getvalue())
 
