@@ -27,6 +27,7 @@ TWO_TURNS, ENDLESS = 4 * np.pi, 1e4
 """rad: angles between the two look like degrees; beyond the second they are written for no limit at all."""
 LONGEST_PART = 50.0
 """m: longer parts look like millimetres."""
+LONGEST_NAME = 500
 LONGEST_SHOWN = 12  # entries of a vector in a message
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
@@ -286,10 +287,16 @@ def checked_each(values: Any, kind: type[_Kind], owner: str, what: str) -> tuple
 
 
 def checked_name(value: Any, owner: str, what: str) -> str:
-    """`value` itself; ModelError naming `owner` and `what` unless it is a string that is not empty."""
+    """`value` itself; ModelError naming `owner` and `what` unless it is a string that is not empty.
+
+    Nor may it hold control characters and others that are not printed, which terminals, tables and shells act on.
+    """
     if not isinstance(value, str) or not value:
         message = f"{owner}: {what} must be a name, a string that is not empty, not {value!r}"
         raise ModelError(message, name=what, value=value)
+    if len(value) > LONGEST_NAME or not value.isprintable():
+        message = f"{owner}: {what} must be at most {LONGEST_NAME} printable characters, not {value[:LONGEST_NAME]!r}"
+        raise ModelError(message, name=what, value=value, limit=LONGEST_NAME)
     return value
 
 

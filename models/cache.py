@@ -1,18 +1,24 @@
 """What is dear to compute and depends on nothing but its input, kept in files between runs.
 
-The folder is $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. Values lie there as KEY.json, shared libraries as
-KEY.DIGEST.so, whose digest tells whether they are whole. A file that cannot be read, is broken or cannot be written is
-no error: then the work is done again.
+The folder is $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. Values lie there as KEY.json, behind a digest of the
+key, which names the code that made them, and of themselves; shared libraries as KEY.DIGEST.so. A file that cannot be
+read, is broken or cannot be written is no error: then the work is done again.
+
+A digest says that a file is whole, not who wrote it. So nothing is kept in a folder, nor taken from a file, that
+somebody else owns or may write. What has been checked in such a folder cannot be changed before it is used.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import functools
 import hashlib
 import json
+import logging
 import os
 import re
+import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +28,8 @@ from tempfile import NamedTemporaryFile
 from typing import IO, Any
 
 import numpy as np
+
+from models.input_files import read_regular
 
 MOST_BYTES = 2**20  # of a value: ours have a few hundred
 MOST_KEPT = 2**28  # bytes of all libraries: the least recently used are removed
@@ -70,10 +78,50 @@ def folder() -> Path:
     return place / "selfmotion"
 
 
+def own_folder(make: bool = False) -> Path:
+    """Return the folder; `make` it for this user alone where there is none.
+
+    Raises:
+        OSError: There is none, or others than this user and the system's owner may change what lies in it: the folder
+            belongs to somebody else, is a link or may be written by others, or a folder above may be.
+        RuntimeError: There is no home.
+    """
+    place = folder()
+    if make:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    why = _unsafe(place)
+    if why:
+        _notice(f"nothing is kept between runs in {place}: {why}")
+        raise PermissionError(errno.EPERM, why, str(place))
+    return place
+
+
+def _unsafe(place: Path) -> str:
+    """Why files in a folder may be changed by others; "" where they may not."""
+    status, me = place.lstat(), os.geteuid()
+    if not stat.S_ISDIR(status.st_mode):
+        return "it is a link or no folder; name another one, XDG_CACHE_HOME"
+    if status.st_uid != me:
+        return f"it belongs to the user {status.st_uid}; name a folder of your own, XDG_CACHE_HOME"
+    if status.st_mode & 0o022:
+        return f"others may write it; empty it, then chmod 700 {place}"
+    for above in {*place.parents, *place.resolve().parents}:
+        status = above.lstat()
+        writable = status.st_mode & (stat.S_ISVTX | 0o002) == 0o002 and not stat.S_ISLNK(status.st_mode)
+        if writable or status.st_uid not in (me, 0, os.stat("/").st_uid):
+            return f"others may change {above}; name a folder elsewhere, XDG_CACHE_HOME"
+    return ""
+
+
+@functools.cache
+def _notice(words: str) -> None:
+    logging.getLogger("models").warning(words)
+
+
 def files() -> list[Path]:
     """All that is kept, and parts that were left by who was killed."""
     try:
-        return sorted(file for file in folder().iterdir() if file.is_file() and file.suffix in KINDS)
+        return sorted(file for file in own_folder().iterdir() if file.is_file() and file.suffix in KINDS)
     except UNREADABLE:
         return []
 
@@ -84,10 +132,8 @@ def files() -> list[Path]:
 def kept(key: str) -> Any:
     """What was kept under a key: lists, dictionaries, texts, numbers; None where there is nothing or nothing whole."""
     try:
-        file = folder() / f"{key}.json"
-        if file.stat().st_size > MOST_BYTES:
-            return None
-        return json.loads(file.read_text(encoding="utf-8"))
+        digest, _, content = read_regular(own_folder() / f"{key}.json", MOST_BYTES, own=True).partition(b"\n")
+        return json.loads(content) if digest == _digest(key, content) else None
     except UNREADABLE:
         return None
 
@@ -95,7 +141,12 @@ def kept(key: str) -> Any:
 def keep(key: str, value: Any) -> None:
     """Keep a value of JSON under a key; a file there is replaced as a whole."""
     with suppress(*UNREADABLE):
-        _write(f"{key}.json", json.dumps(value).encode())
+        content = json.dumps(value).encode()
+        _write(f"{key}.json", _digest(key, content) + b"\n" + content)
+
+
+def _digest(key: str, content: bytes) -> bytes:
+    return hashlib.sha256(key.encode() + b"\n" + content).hexdigest().encode()
 
 
 # ---- libraries ---------------------------------------------------------------------------------------------------
@@ -104,18 +155,16 @@ def keep(key: str, value: Any) -> None:
 def kept_library(key: str) -> Path | None:
     """The shared library that was kept under a key, now the most recently used; None where there is none.
 
-    One that is damaged, or belongs to somebody else, is none; damaged ones are removed.
+    One that is damaged, or that somebody else owns or may write, is none; damaged ones are removed.
     """
     with suppress(*UNREADABLE):
-        place = folder()
+        place = own_folder()
         for name in os.listdir(place):
             if not (name.startswith(key) and name.endswith(".so")):
                 continue
             file = place / name
             with suppress(*UNREADABLE):
-                if file.stat().st_uid not in (0, os.geteuid()):
-                    continue  # it would be run
-                if file.name == _name(key, file.read_bytes()):
+                if file.name == _name(key, read_regular(file, MOST_KEPT, own=True)):
                     with suppress(OSError):
                         os.utime(file)
                     return file
@@ -140,7 +189,7 @@ def alone(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
     """
     lock = None
     with suppress(*UNREADABLE):
-        lock = _locked(folder() / f"{key}.lock", ask)
+        lock = _locked(own_folder(make=True) / f"{key}.lock", ask)
     try:
         yield
     finally:
@@ -152,7 +201,6 @@ def alone(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
 
 def _locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
     """A file that is made, if need be, and locked."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     while True:
         stream = open(file, "ab")  # noqa: SIM115
         try:
@@ -198,8 +246,7 @@ def _make_room(newest: Path) -> None:
 
 def _write(name: str, content: bytes) -> Path:
     """Write a file of the folder whole or not at all."""
-    place = folder()
-    place.mkdir(parents=True, exist_ok=True)
+    place = own_folder(make=True)
     part = None
     try:
         with NamedTemporaryFile("wb", dir=place, suffix=".part", delete=False) as file:

@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import stat
+import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,6 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from models.input_files import UnfitFile, open_regular
 from ocp.errors import ProblemError
 
 __all__ = ["MOST_BYTES", "read_arrays", "write_arrays", "write_text"]
@@ -113,7 +115,7 @@ def remove_left(target: Path) -> None:
         for name in os.listdir(target.parent):
             if part.fullmatch(name):
                 left = target.with_name(name)
-                with suppress(OSError, ProblemError), open_regular(left) as stream:
+                with suppress(OSError), open_regular(left, sys.maxsize) as stream:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
                     left.unlink()
 
@@ -132,8 +134,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     told: dict[str, Any] = {"name": "path", "value": str(checked_path(path))}
     try:
-        check_regular(path, os.stat(os.fspath(path)))  # a pipe would be waited for
-        with open(path, "rb") as stream:
+        with open_regular(path, MOST_BYTES) as stream:
             check_contents(path, stream, os.fstat(stream.fileno()).st_size)
             with zipfile.ZipFile(stream) as archive:
                 members = archive.infolist()
@@ -146,32 +147,25 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                 return {name_of(member): array_of(archive, member) for member in members}
     except (FileNotFoundError, ProblemError):
         raise
+    except UnfitFile as error:
+        raise ProblemError(f"{path} is not a saved solution: {error.strerror}", **told, limit=error.limit) from error
     except OSError as error:
         raise ProblemError(f"{path} cannot be read: {error.strerror or error}", **told) from error
     except Exception as error:  # what zip, zlib and numpy say of broken bytes is of many kinds
         raise ProblemError(f"{path} is not a saved solution: {error}", **told) from error
 
 
-def open_regular(path: str | os.PathLike[str], most: int = MOST_BYTES) -> io.BufferedReader:
-    """Open a file that others may have written, to be read.
+def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
+    """Open a file of a folder that others may write: a regular one, of at most ``MOST_BYTES``, that is no link.
 
     Raises:
         OSError: It cannot be opened.
-        ProblemError: It is a link, no regular file, or has more than `most` bytes.
+        ProblemError: It is another one.
     """
-    if os.path.islink(path):
-        raise ProblemError(f"{path} is a link, which is not followed", name="path", value=str(path))
-    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe would be waited for
     try:
-        status = os.fstat(file)
-        check_regular(path, status)
-        if status.st_size > most:
-            words = f"{path} has {status.st_size} bytes, at most {most} are read"
-            raise ProblemError(words, name="path", value=status.st_size, limit=most)
-        return os.fdopen(file, "rb")
-    except BaseException:
-        os.close(file)
-        raise
+        return open_regular(path, MOST_BYTES, links=False)
+    except UnfitFile as error:
+        raise ProblemError(f"{path}: {error.strerror}", name="path", value=str(path), limit=error.limit) from error
 
 
 def checked_path(path: Any) -> str | os.PathLike[str]:
@@ -188,10 +182,7 @@ def check_regular(path: Any, status: os.stat_result) -> None:
 
 
 def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
-    """Raise where an archive or its table of contents is too large, or it does not end as one that was saved."""
-    if size > MOST_BYTES:
-        words = f"{path} is not a saved solution: {size:.3g} bytes, {MOST_BYTES:.3g} at most"
-        raise ProblemError(words, name="path", value=size, limit=MOST_BYTES)
+    """Raise where an archive's table of contents is too large, or it does not end as one that was saved."""
     stream.seek(max(0, size - 42))
     tail = stream.read(42)
     if tail[-22:-18] != END or tail.startswith(LONG):

@@ -22,7 +22,8 @@ Rule: TypeAlias = Callable[["House"], list[str]]
 
 FLOORS = {
     "models": [
-        ["errors", "cache"],
+        ["errors", "input_files"],
+        ["cache"],
         ["arrays"],
         ["spatial"],
         ["robot", "paths"],
@@ -32,7 +33,7 @@ FLOORS = {
     ],
     "ocp": [
         ["errors", "curves", "console"],
-        ["storage", "libraries"],
+        ["storage", "libraries", "tables"],
         ["problem", "schedule", "tasks"],
         ["solution"],
         ["direct", "audit", "local"],
@@ -54,8 +55,8 @@ LAZY = {
     ("ocp.planning.motion", "ocp.app.plots"),
 }
 """Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
-SEEN_BY_ALL = {"models.cache"}
-"""What all of ocp may import of models: it knows no machine."""
+SEEN_BY_ALL = {"models.cache", "models.input_files"}
+"""What all of ocp may import of models: they know no machine."""
 FOREIGN = {"models": {"casadi", "numpy", "scipy"}}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from models.arrays import (
     checked_each,
     checked_instance,
     checked_mapping,
+    checked_name,
     checked_rotation,
     checked_text,
     warn_of_millimetres,
@@ -66,7 +68,7 @@ class Robot:
             checked_each(self.links, Link, "robot", "links"),
             checked_each(self.joints, Joint, "robot", "joints"),
         )
-        checked_text(self.name, "robot", "name")
+        checked_name(self.name if self.name != "" else "robot", "robot", "name")
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = held(joints, {})
@@ -172,8 +174,9 @@ class Robot:
         if file is not None:
             if not isinstance(file, str | os.PathLike):
                 raise ModelError(f"to_urdf: file must be a path, not {file!r}", name="file", value=file)
-            part = Path(file).with_name(Path(file).name + ".part")
-            part.write_text(text, encoding="utf-8")
+            part = Path(file).with_name(f"{Path(file).name}.{secrets.token_hex(4)}.part")
+            with part.open("x", encoding="utf-8") as stream:  # a new file, where a link may lie in wait
+                stream.write(text)
             part.replace(file)
         return text
 

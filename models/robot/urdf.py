@@ -24,12 +24,15 @@ import numpy as np
 
 from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
+from models.input_files import parse_xml, read_regular
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
 _Shape = TypeVar("_Shape", bound=CollisionShape)
 
+MOST_BYTES = 2**23
+"""Of a file: the largest public ones have 1 MB."""
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
 BLANK = "\ufeff \t\r\n"
@@ -172,7 +175,8 @@ def written_urdf(
     if tip is not None:
         ElementTree.SubElement(robot, "tip", link=tip)
     ElementTree.indent(robot)
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+    head = '<?xml version="1.0" encoding="utf-8"?>\n<!-- written by selfmotion -->\n'
+    return head + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
 def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:
@@ -213,8 +217,9 @@ def _text(numbers: Any) -> str:
 def parsed(source: Source) -> ElementTree.Element:
     """The <robot> element of a URDF text or file, namespaces removed; ModelError where there is none to read."""
     text, above = "", 0
+    data: str | bytes = b""
     if isinstance(source, str):
-        text = source.lstrip(BLANK)
+        data = text = source.lstrip(BLANK)
         above = source[: len(source) - len(text)].count("\n")
     try:
         if isinstance(source, str) and not text:
@@ -222,17 +227,17 @@ def parsed(source: Source) -> ElementTree.Element:
             raise ModelError(message, name="source", value=source)
         if text.startswith("<"):
             where = "the given text"
-            tree = ElementTree.fromstring(text)
         else:
             where = f"file {os.fspath(source)!r}" if isinstance(source, str | os.PathLike) else repr(source)
             if not isinstance(source, str | os.PathLike):
                 message = f"a URDF source is a text or a path, not {type(source).__name__}"
                 raise ModelError(message, name="source", value=source)
-            tree = ElementTree.fromstring(Path(source).read_bytes())
+            data = read_regular(source, MOST_BYTES)
+        tree = parse_xml(data)
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).split(": line")[0]
-        hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in (text or _contents(source)) else ""
+        hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in str(data) else ""
         message = f"{where} is not well-formed XML: {reason}, line {line + above}, column {column}{hint}"
         raise ModelError(message, name=where, value=(line + above, column)) from error
     except OSError as error:
@@ -254,10 +259,6 @@ def parsed(source: Source) -> ElementTree.Element:
         message = f"{where} is not URDF: its root element is <{tree.tag}>, not <robot>"
         raise ModelError(message, name=where, value=tree.tag, limit="robot")
     return tree
-
-
-def _contents(source: Source) -> str:
-    return Path(source).read_bytes().decode(errors="replace")
 
 
 def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[Link, ...]:

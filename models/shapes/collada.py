@@ -6,6 +6,8 @@ Parts are found by the ids that others call them by. <unit> is applied, so that 
 
 from __future__ import annotations
 
+import re
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,24 +16,23 @@ import numpy as np
 
 from models.arrays import Array
 from models.errors import ModelError
-from models.shapes.triangles import MOST_BYTES, MOST_FACES, Faces, Triangles, bare, numbers, together, wrong
+from models.input_files import parse_xml
+from models.shapes.triangles import MOST_FACES, Faces, Triangles, bare, numbers, together, wrong
 
 __all__ = ["read_collada"]
 
 DEEPEST = 64
 """Of nodes within nodes in a scene."""
+WORDS = re.compile(r"\S.{0,65535}\S*", re.DOTALL)
+"""Some of the words of a long text, which are read one part after the other."""
 INSTANCE = 64
 """Triangles that a borrowed node counts for: one that borrows others, which borrow others, ends in time."""
 
 
 def read_collada(file: Path, data: bytes) -> Triangles:
     """All instances of geometries in the scene; of all geometries where there is no scene."""
-    if len(data) > MOST_BYTES["text"]:
-        raise wrong(file, f"it has {len(data)} bytes of text", len(data), MOST_BYTES["text"])
-    if b"<!ENTITY" in data or b"<!DOCTYPE" in data:
-        raise wrong(file, "it declares a document type or entities, which are not read")
     try:
-        tree = ElementTree.fromstring(data)
+        tree = parse_xml(data)
     except ElementTree.ParseError as error:
         raise wrong(file, f"it is not well-formed XML: {error}", error.position) from error
     except (ValueError, LookupError) as error:
@@ -75,10 +76,13 @@ class _Collada:
         return wrong(self.file, f"<{element.tag}>{f' {name!r}' if name else ''}: {what}", value, limit)
 
     def _values(self, text: str | None, count: int | None, element: ElementTree.Element) -> Array:
-        values = numbers(self.file, (text or "").split(), lambda: f"<{element.tag}> {element.get('id') or ''}".strip())
+        values = array("d")
+        for part in WORDS.finditer(text or ""):
+            where = f"<{element.tag}> {element.get('id') or ''}".strip()
+            values.extend(numbers(self.file, part[0].split(), lambda where=where: where))  # type: ignore[misc]
         if count is not None and len(values) != count:
             raise self._wrong(element, f"{len(values)} numbers, not {count}", len(values))
-        return values
+        return np.array(values)
 
     def _indices(self, text: str | None, element: ElementTree.Element) -> Faces:
         values = self._values(text, None, element)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -18,8 +19,9 @@ import numpy as np
 
 from models.arrays import Array, checked_text
 from models.errors import ModelError
+from models.input_files import UnfitFile, read_regular
 from models.shapes.collada import read_collada
-from models.shapes.triangles import MOST_BYTES, MOST_FACES, Faces, Triangles, bare, numbers, text_of, wrong
+from models.shapes.triangles import MOST_BYTES, MOST_FACES, Faces, Triangles, bare, lines_of, numbers, wrong
 
 STL_HEAD, STL_FACE = 84, 50  # bytes
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -117,14 +119,13 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
         message = f"mesh {str(file)!r}: only the endings {', '.join(READERS)} are read; convert the file to one of them"
         raise ModelError(message, name=str(file), value=file.suffix, limit=tuple(READERS))
     try:
-        if file.stat().st_size > MOST_BYTES["binary"]:
-            raise wrong(file, f"it has {file.stat().st_size} bytes", file.stat().st_size, MOST_BYTES["binary"])
-        data = file.read_bytes()
+        data = read_regular(file, MOST_BYTES["binary" if file.suffix.lower() == ".stl" else "text"])
     except (OSError, ValueError) as error:
-        if isinstance(error, ModelError):
-            raise
+        size, most = (error.value, error.limit) if isinstance(error, UnfitFile) else (path, None)
         reason = getattr(error, "strerror", None) or error
-        raise ModelError(f"mesh {str(file)!r} cannot be read: {reason}", name=str(file), value=path) from error
+        raise ModelError(
+            f"mesh {str(file)!r} cannot be read: {reason}", name=str(file), value=size, limit=most
+        ) from error
     vertices, faces, colors = reader(file, data)
     if not len(faces):
         raise wrong(file, "it has no triangle", 0, 1)
@@ -154,9 +155,9 @@ def _read_stl(file: Path, data: bytes) -> Triangles:
 
 
 def _read_stl_text(file: Path, data: bytes) -> Triangles:
-    words: list[str] = []
+    places = array("d")
     corners, last = 0, 0
-    for number, line in enumerate(text_of(file, data).splitlines(), start=1):
+    for number, line in lines_of(file, data):
         entries = line.split()
         if not entries:
             continue
@@ -164,18 +165,17 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
         if word == "vertex":
             if len(entries) != 4:
                 raise wrong(file, f"line {number}: a vertex of {len(entries) - 1} numbers", line.strip())
-            numbers(file, entries[1:], lambda number=number: f"line {number}")  # type: ignore[misc]
-            words += entries[1:]
+            places.extend(numbers(file, entries[1:], lambda number=number: f"line {number}"))  # type: ignore[misc]
             corners, last = corners + 1, number
         elif word == "endfacet":
             if corners != 3:
                 raise wrong(file, f"line {number}: a facet of {corners} corners", corners, 3)
             corners = 0
-            if len(words) > 9 * MOST_FACES:
-                raise wrong(file, f"line {number}: too many triangles", len(words) // 9, MOST_FACES)
+            if len(places) > 9 * MOST_FACES:
+                raise wrong(file, f"line {number}: too many triangles", len(places) // 9, MOST_FACES)
     if corners:
         raise wrong(file, f"line {last}: the file ends within a facet", corners)
-    return _joined(np.array(words, dtype=float).reshape(-1, 3))
+    return _joined(np.array(places).reshape(-1, 3))
 
 
 def _joined(corners: Array) -> Triangles:
@@ -188,11 +188,10 @@ def _joined(corners: Array) -> Triangles:
 
 
 def _read_obj(file: Path, data: bytes) -> Triangles:
-    vertices: list[Array] = []
-    faces: list[tuple[int, int, int]] = []
-    paints, paint = list[int](), 0
+    vertices, count = array("d"), 0
+    faces, paints, paint = array("q"), array("q"), 0
     library: dict[str, tuple[int, Array]] = {"": (0, np.full(4, np.nan))}
-    for number, line in enumerate(text_of(file, data).replace("\\\n", " ").splitlines(), start=1):
+    for number, line in lines_of(file, data.replace(b"\\\n", b" ")):
         entries = line.partition("#")[0].split()
         if entries and entries[0] == "mtllib":
             for name, color in _library(file, line.split(None, 1)[1].strip() if len(entries) > 1 else ""):
@@ -205,31 +204,31 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
         if entries[0] == "v":
             if len(entries) < 4:
                 raise wrong(file, f"{place}: a vertex of {len(entries) - 1} numbers", line.strip())
-            vertices.append(numbers(file, entries[1:4], lambda place=place: place))  # type: ignore[misc]
+            vertices.extend(numbers(file, entries[1:4], lambda place=place: place))  # type: ignore[misc]
+            count += 1
             continue
         if len(entries) < 4:
             raise wrong(file, f"{place}: a face of {len(entries) - 1} corners", line.strip(), 3)
-        corners = [_corner(file, entry, len(vertices), place) for entry in entries[1:]]
-        faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
-        paints += [paint] * (len(faces) - len(paints))
-        if len(faces) > MOST_FACES:
-            raise wrong(file, f"{place}: too many triangles", len(faces), MOST_FACES)
+        corners = [_corner(file, entry, count, place) for entry in entries[1:]]
+        for one, other in pairwise(corners[1:]):
+            faces.extend((corners[0], one, other))
+            paints.append(paint)
+        if len(paints) > MOST_FACES:
+            raise wrong(file, f"{place}: too many triangles", len(paints), MOST_FACES)
     found = np.array(faces, dtype=np.intp).reshape(-1, 3)
-    if found.size and found.max() >= len(vertices):
-        raise wrong(file, f"a face names vertex {int(found.max()) + 1} of {len(vertices)}", int(found.max()) + 1)
+    if found.size and found.max() >= count:
+        raise wrong(file, f"a face names vertex {int(found.max()) + 1} of {count}", int(found.max()) + 1)
     colors = np.array([color for _, color in library.values()])[np.array(paints, dtype=int)]
     return Triangles(np.array(vertices, dtype=float).reshape(-1, 3), found, colors)
 
 
 def _library(file: Path, name: str) -> Iterator[tuple[str, Array]]:
     """Names and diffuse colours of a library of materials beside an OBJ file; nothing where it cannot be read."""
-    path = file.parent / name
     try:
-        if not name or not _is_file(path) or path.stat().st_size > MOST_BYTES["text"]:
-            return
-        lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
+        data = read_regular(file.parent / name, MOST_BYTES["text"])
     except (OSError, ValueError):
         return
+    lines = data.decode("utf-8", errors="replace").splitlines()
     material = ""
     for line in lines:
         word, _, rest = line.strip().partition(" ")
@@ -250,7 +249,7 @@ def _corner(file: Path, entry: str, count: int, place: str) -> int:
     except ValueError:
         raise wrong(file, f"{place}: {entry!r} is no corner of a face", entry) from None
     index = count + index if index < 0 else index - 1
-    if index < 0:
+    if not 0 <= index < 2**31:
         raise wrong(file, f"{place}: {entry!r} names no vertex of {count}", entry, (1, count))
     return index
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -55,17 +56,17 @@ def wrong(file: Path, what: str, value: object = None, limit: object = None) -> 
     return ModelError(f"mesh {str(file)!r}: {what}{bound}", name=str(file), value=value, limit=limit)
 
 
-def text_of(file: Path, data: bytes) -> str:
-    """The contents of a text, of at most MOST_BYTES."""
+def lines_of(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
+    """Numbers from 1 and texts of the lines of a text of at most MOST_BYTES, one after the other."""
     if len(data) > MOST_BYTES["text"]:
         raise wrong(file, f"it has {len(data)} bytes of text", len(data), MOST_BYTES["text"])
-    return data.decode("utf-8", errors="replace")
+    return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
 
 
-def numbers(file: Path, words: Sequence[str], where: Callable[[], str]) -> Array:
+def numbers(file: Path, words: Sequence[str], where: Callable[[], str]) -> list[float]:
     """Words as numbers; ModelError, with the place, for one that is none."""
     try:
-        return np.array(words, dtype=float)
+        return [float(word) for word in words]
     except ValueError:
         strange = next((word for word in words if not _is_number(word)), "")
         raise wrong(file, f"{where()}: {strange!r} is no number", strange) from None

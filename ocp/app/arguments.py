@@ -14,12 +14,13 @@ import numpy as np
 from models import FixedBase, FreeFloating, Robot, cache, locked, rectangle, with_load
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
-from ocp.app.planned import WRITERS, check_period, export, run_task
+from ocp.app.planned import EXPORTED, check_period, export, run_task
 from ocp.app.progress import Progress
 from ocp.app.verdict import SHARE, bounds_of, check_trajectory
 from ocp.errors import ProblemError
 from ocp.files import read_trajectory, read_waypoints
 from ocp.files.obstacles import read_obstacles
+from ocp.files.outputs import SUFFIXES, checked_output
 from ocp.files.task_file import read_task
 from ocp.planning import Plan
 from ocp.storage import write_text
@@ -118,25 +119,31 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     robot_options(check)
     check_options(check)
     _file(check, "--report", "write one HTML file, too: pictures, curves with limits, every row")
+    _force(check)
     plan = _command(commands, "plan", "plan what a task file asks for", PLAN, PLAN_EXAMPLES, run_plan)
     plan.set_defaults(
         called={"missing='skip'": '[surroundings] meshes = "skip"', "folders=[": "[surroundings] folders = ["}
     )
     _file(plan, "task", "TOML file")
     _file(plan, "--output", "the plan (.npz), whatever the task file says", short="-o")
+    _file(plan, "--output-folder", "where the task's outputs lie, or below (default: the task file's folder)")
+    _force(plan)
     other = _command(commands, "export", "write a plan in another format", EXPORT, EXPORT_EXAMPLES, run_export)
     _file(other, "plan", "file of a plan (.npz)")
-    _file(other, "file", f"to write: {', '.join(WRITERS)}")
+    _file(other, "file", f"to write: {', '.join(SUFFIXES[kind][0] for kind in EXPORTED)}")
+    _force(other)
     other.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
     report = _command(commands, "report", "one HTML file about a plan", REPORT, REPORT_EXAMPLES, run_report)
     _file(report, "plan", "file of a plan (.npz)")
     _file(report, "file", "HTML file to write")
+    _force(report)
     report.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
     report.add_argument("--title", help="of the report; the plan's file if not told")
     view = _command(commands, "view", "play motions in a browser", VIEW, VIEW_EXAMPLES, run_view)
     _file(view, "plan", "file of a plan, or of a solution with --robot (.npz)")
     _file(view, "beside", "plans, or trajectories of the same robot, to hold against it", nargs="*", default=[])
     _file(view, "--page", "write one HTML file, and serve nothing")
+    _force(view)
     view.add_argument("--title", help="of the page; the plan's file if not told")
     view.add_argument("--name", action="append", default=[], help="of a motion; repeatable, in the order of the files")
     view.add_argument("--port", type=int, default=8080, help="to serve on, or the next that is free (default: 8080)")
@@ -177,6 +184,10 @@ def _file(parser: Any, name: str, words: str, short: str = "", **more: Any) -> N
         more.setdefault("metavar", "FILE")
     action = parser.add_argument(*([short] if short else []), name, type=Path, help=words, **more)
     action.complete = {"bash": "_shtab_compgen_files", "zsh": "_files"}  # for shtab
+
+
+def _force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--force", action="store_true", help="overwrite files that selfmotion did not write, too")
 
 
 def robot_options(parser: argparse.ArgumentParser) -> None:
@@ -238,6 +249,8 @@ def check_options(parser: argparse.ArgumentParser) -> None:
 
 def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `check`."""
+    if options.report is not None:
+        checked_output("report", options.report, force=options.force)
     progress("reading the robot")
     robot = read_robot(options)
     place, turn = mount_of(options)
@@ -283,23 +296,23 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         report = report_of_check(
             found, machine, bounds_of(robot, **limits), of_shapes(obstacles), tuple(options.folder)
         )
-        write_text(options.report, report.html())
+        write_text(checked_output("report", options.report, force=options.force), report.html())
     return (0 if found.passed else 1), str(found), found.to_dict()
 
 
 def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `plan`."""
     progress("reading the task")
-    task = read_task(options.task)
+    task = read_task(options.task, options.output_folder)
     progress("planning")
-    return run_task(task, options.output, progress)
+    return run_task(task, options.output, progress, options.force)
 
 
 def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `export`."""
     made = Plan.load(options.plan)
     progress("writing")
-    export(made, options.file, options.period)
+    export(made, options.file, options.period, options.force)
     return 0, f"written: {options.file}", {"written": str(options.file)}
 
 
@@ -307,11 +320,12 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
     """The command `report`."""
     from ocp.app.report import report_of_plan
 
+    file = checked_output("report", options.file, force=options.force)
     made = Plan.load(options.plan)
     check_period(made, options.period)
     progress("audit")
     report = report_of_plan(made, options.period, options.title or str(options.plan))
-    write_text(options.file, report.html())
+    write_text(file, report.html())
     told = {"written": str(options.file), "passed": report.passed, "verdict": report.verdict}
     return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", told
 
@@ -321,6 +335,8 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
     from ocp.app.player import page
     from ocp.app.serving import Served
 
+    if options.page is not None:
+        checked_output("report", options.page, force=options.force)
     progress("reading the motions")
     shown = motions_of(options)
     progress("drawing")
@@ -333,7 +349,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
     told = {"passed": first.passed, "verdict": first.verdict, "duration": float(first.t[-1]), "missing": missing}
     status = 1 if first.passed is False else 0
     if options.page is not None:
-        write_text(options.page, text)
+        write_text(checked_output("report", options.page, force=options.force), text)
         told |= {"written": str(options.page), "bytes": len(text.encode())}
         return status, f"{first.verdict}\nwritten: {options.page}".strip(), told
     with Served(text, options.port) as served:

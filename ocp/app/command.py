@@ -18,13 +18,14 @@ from typing import Any
 from models import ModelError, ModelWarning
 from ocp.app.arguments import Words, subcommands
 from ocp.app.progress import Progress
-from ocp.errors import AuditError, ProblemError, SolveError
+from ocp.errors import AuditError, ProblemError, SolveError, checked_each
 
 __all__ = ["main", "parser"]
 
 ABOUT = """Plan the motion of robot arms with more freedom than their task needs, and check anybody's motion."""
 PART = re.compile(r"\.[0-9a-f]{8}\.part$")
 """Of a file's name while it is written."""
+CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 EXAMPLES = """examples:
   selfmotion check robot.urdf motion.csv --acceleration 15 --obstacles cell.toml
   selfmotion plan seam.toml -o seam.npz
@@ -53,7 +54,14 @@ def _version() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status."""
+    """Run the command; the exit status.
+
+    Raises:
+        ProblemError: The arguments are no list of texts.
+    """
+    if isinstance(arguments, str):
+        raise ProblemError(f"arguments must be a list of texts, not {arguments!r}", name="arguments", value=arguments)
+    arguments = None if arguments is None else checked_each("arguments", arguments, str)
     options = parser().parse_args(arguments)
     try:
         return _run(options)
@@ -67,9 +75,9 @@ def _run(options: argparse.Namespace) -> int:
     try:
         with warnings.catch_warnings(), Progress(f"selfmotion {options.command}", options.quiet) as progress:
             warnings.simplefilter("default", ModelWarning)
-            warnings.showwarning = lambda message, *_, **__: progress.say(f"warning: {message}")
+            warnings.showwarning = lambda message, *_, **__: progress.say(_printable(f"warning: {message}"))
             status, text, told = asked(options, progress)
-        print(json.dumps(_plain(told), indent=1, allow_nan=False) if options.json else text, flush=True)
+        print(json.dumps(_plain(told), indent=1, allow_nan=False) if options.json else _printable(text), flush=True)
         return status
     except KeyboardInterrupt:
         print(f"selfmotion {options.command}: stopped", file=sys.stderr)
@@ -89,11 +97,16 @@ def _refused(options: argparse.Namespace, error: Exception, status: int) -> int:
         words = f"{PART.sub('', str(error.filename))}: {error.strerror}"
     for argument, option in options.called.items():
         words = words.replace(argument, option)
-    print(f"selfmotion {options.command}: {words}", file=sys.stderr)
+    print(f"selfmotion {options.command}: {_printable(words)}", file=sys.stderr)
     if options.json:
         found = {name: getattr(error, name, None) for name in ("name", "value", "limit", "time")}
         print(json.dumps(_plain({"error": words, **found}), indent=1, allow_nan=False), flush=True)
     return status
+
+
+def _printable(text: str) -> str:
+    """Return a text without the control characters of files that it quotes, on which a terminal would act."""
+    return CONTROLS.sub(lambda sign: repr(sign[0])[1:-1], text)
 
 
 def _plain(value: Any) -> Any:

@@ -33,6 +33,7 @@ PIXELS, LINE = (960, 680), 0.003
 WIDTH = 7.4
 """Of a picture, inches."""
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
+STYLE |= {"text.parse_math": False}  # a dollar in a joint's name is a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Of what a plan is compared with, so that nothing is known by its colour alone."""
 

@@ -4,38 +4,60 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from glob import escape
 from pathlib import Path
 from typing import Any
 
 from models import FixedBase
 from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
 from ocp.files import write_mcap
+from ocp.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.files.task_file import Task
 from ocp.planning import Plan, PlanInPieces, plan, plan_in_pieces
 from ocp.storage import write_text
 
-__all__ = ["WRITERS", "check_period", "export", "run_task"]
+__all__ = ["EXPORTED", "check_period", "export", "run_task"]
 
 
-def run_task(task: Task, output: Path | None, progress: Callable[[str], None]) -> tuple[int, str, Any]:
+def run_task(
+    task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
+) -> tuple[int, str, Any]:
     """Plan, audit, write: exit status, text, and what JSON shows.
 
+    Args:
+        output: Of the plan, wherever it is; None: as the task says. force: Whether files are overwritten that
+            selfmotion did not write.
+
     Raises:
-        ProblemError: What is asked does not fit, or is out of reach.
+        ProblemError: What is asked does not fit, or is out of reach; an output may not be written.
         SolveError: There is no motion that passes its audit; says why.
     """
     outputs = task.outputs if output is None else task.outputs | {"plan": output}
+    anywhere = () if output is None else ("plan",)
+
+    def checked(kind: str, file: Path) -> Path:
+        return checked_output(kind, file, None if kind in anywhere else task.output_folder, force)
+
+    def write(made: Plan, files: dict[str, Path]) -> None:
+        for kind, place in {kind: checked(kind, file) for kind, file in files.items()}.items():
+            progress(f"writing {place.name}")
+            WRITERS[kind](made, place, task.period, task.file)
+
+    for kind, file in outputs.items():  # before anybody waits for the plan
+        numbered = file.parent.glob(f"{escape(file.stem)}-*{escape(file.suffix)}") if task.in_pieces else ()
+        for taken in (file, *numbered):
+            checked(kind, taken)
     if task.in_pieces:
         found = plan_in_pieces(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
         if found.reconfigurations:
-            return _in_pieces(task, found, outputs, progress)
+            return _in_pieces(task, found, outputs, progress, write)
         made = found.pieces[0]
     else:
         made = plan(task.machine, task.task, **task.options)
     check_period(made, task.period)
     progress("audit")
     audit = made.audit()
-    _write(made, outputs, task, progress)
+    write(made, outputs)
     lines = [str(made), f"The plan {audit.sentence}.", *_written(list(outputs.values()))]
     told = {
         "passed": audit.passed,
@@ -65,7 +87,11 @@ def run_task(task: Task, output: Path | None, progress: Callable[[str], None]) -
 
 
 def _in_pieces(
-    task: Task, found: PlanInPieces, outputs: dict[str, Path], progress: Callable[[str], None]
+    task: Task,
+    found: PlanInPieces,
+    outputs: dict[str, Path],
+    progress: Callable[[str], None],
+    write: Callable[[Plan, dict[str, Path]], None],
 ) -> tuple[int, str, Any]:
     """As `run_task`: pieces and the ways between them, their files numbered in the order in which they are run."""
     order: list[Plan | None] = [found.pieces[0]]
@@ -81,7 +107,7 @@ def _in_pieces(
         passed &= audit.passed
         lines.append(f"Motion {number} {audit.sentence}.")
         own = {kind: file.with_stem(f"{file.stem}-{number}") for kind, file in outputs.items()}
-        _write(made, own, task, progress)
+        write(made, own)
         files += own.values()
     told = {
         "passed": passed,
@@ -102,37 +128,26 @@ def _in_pieces(
     return (0 if passed else 1), "\n".join(lines + _written(files)), told
 
 
-def _write(made: Plan, outputs: dict[str, Path], task: Task, progress: Callable[[str], None]) -> None:
-    """A plan as files of some kinds."""
-    for kind, file in outputs.items():
-        progress(f"writing {file.name}")
-        if kind == "report":
-            from ocp.app.report import report_of_plan
-
-            write_text(file, report_of_plan(made, task.period, f"{task.file}").html())
-        elif kind == "plan":
-            made.save(file)
-        else:
-            WRITERS[f".{kind}"](made, file, task.period)
-
-
 def _written(files: list[Path]) -> list[str]:
     nothing = "nothing is written: give -o FILE.npz, or [output] in the task file"
     return [f"written: {file}" for file in files] or [nothing]
 
 
-def export(made: Plan, file: Path, period: float) -> None:
+def export(made: Plan, file: Path, period: float, force: bool = False) -> None:
     """Write a plan by the end of the file's name.
 
     Raises:
-        ProblemError: A name with another end, a period that is not positive.
+        ProblemError: A name with another end, a period that is not positive, a file that selfmotion did not write,
+            unless `force`.
     """
-    writer = WRITERS.get(file.suffix.lower())
-    if writer is None:
-        words = f"{file}: a plan is written as {', '.join(WRITERS)}; end the name with one of these"
-        raise ProblemError(words, name="file", value=str(file), limit=tuple(WRITERS))
+    kind = next((kind for kind in EXPORTED if file.suffix.lower() in SUFFIXES[kind]), None)
+    if kind is None:
+        known = tuple(SUFFIXES[kind][0] for kind in EXPORTED)
+        words = f"{file}: a plan is written as {', '.join(known)}; end the name with one of these"
+        raise ProblemError(words, name="file", value=str(file), limit=known)
+    place = checked_output(kind, file, force=force)
     check_period(made, period)
-    writer(made, file, period)
+    WRITERS[kind](made, place, period, "")
 
 
 def check_period(made: Plan, period: float) -> None:
@@ -149,13 +164,23 @@ def _yaml(made: Plan, file: Path, period: float) -> None:
     except ImportError as error:
         words = "YAML is written by the package pyyaml: pip install 'selfmotion[yaml]'"
         raise ProblemError(words, name="yaml") from error
-    write_text(file, yaml.safe_dump(made.to_ros(period), sort_keys=False))
+    write_text(file, f"# {MARK}\n{yaml.safe_dump(made.to_ros(period), sort_keys=False)}")
 
 
-WRITERS: dict[str, Callable[[Plan, Path, float], Any]] = {
-    ".csv": lambda made, file, period: made.write_csv(file, period),
-    ".json": lambda made, file, period: write_text(file, json.dumps(made.to_ros(period)) + "\n"),
-    ".yaml": _yaml,
-    ".mcap": write_mcap,
-    ".urdf": lambda made, file, period: made.machine.robot.to_urdf(file),
+def _report(made: Plan, file: Path, period: float, title: str) -> None:
+    from ocp.app.report import report_of_plan  # draws, which takes a while to import
+
+    write_text(file, report_of_plan(made, period, title).html())
+
+
+WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
+    "plan": lambda made, file, period, title: made.save(file),
+    "csv": lambda made, file, period, title: made.write_csv(file, period),
+    "json": lambda made, file, period, title: write_text(file, json.dumps(made.to_ros(period)) + "\n"),
+    "yaml": lambda made, file, period, title: _yaml(made, file, period),
+    "mcap": lambda made, file, period, title: write_mcap(made, file, period),
+    "urdf": lambda made, file, period, title: write_text(file, made.machine.robot.to_urdf()),
+    "report": _report,
 }
+"""What writes each kind of output: a plan, a file, the period of samples in s, and a title."""
+EXPORTED = ("csv", "json", "yaml", "mcap", "urdf")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import re
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -139,9 +140,7 @@ def _filled(title: str, first: Shown, data: str) -> str:
     script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
     style = source.joinpath("page.css").read_text(encoding="utf-8")
     given = {"TITLE": escape(title), "STYLE": style, "SCRIPT": script, "DATA": data, "VERDICT": escape(first.verdict)}
-    for mark, value in given.items():
-        text = text.replace(f"@{mark}@", value)
-    return text
+    return re.sub(f"@({'|'.join(given)})@", lambda mark: given[mark[1]], text)
 
 
 def _alike(one: Robot, other: Robot) -> bool:

@@ -25,6 +25,8 @@ from ocp.tasks.limits import JointBounds
 
 __all__ = ["Report", "report_of_check", "report_of_plan"]
 
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Of the page: no script runs, and nothing is asked from anywhere."""
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -96,7 +98,9 @@ class Report:
             parts.append("<h2>Notes</h2><ul>" + "".join(f"<li>{escape(note)}</li>" for note in self.notes) + "</ul>")
         body = "\n".join(parts)
         return (
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<!doctype html>\n<html lang="en"><head><meta name="generator" content="selfmotion">'
+            '<meta charset="utf-8">'
+            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{escape(self.title)}</title><style>{STYLE}</style></head><body>\n"
             f"<h1>{escape(self.title)}</h1>\n{body}\n"

@@ -1,4 +1,7 @@
-"""A page served on this machine alone, until Ctrl-C."""
+"""A page served on this machine alone, until Ctrl-C.
+
+A request must name this machine as its host: the page of a stranger whose own name was made to lead here names another.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +58,9 @@ class Served:
 def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            found = self.path.partition("?")[0] == "/"
-            self.send_response(200 if found else 404)
+            known = (self.headers.get("Host") or "").rpartition(":")[0] in (HOST, "localhost")
+            found = known and self.path.partition("?")[0] == "/"
+            self.send_response(200 if found else 404 if known else 421)
             self.send_header("Content-Type", "text/html; charset=utf-8" if found else "text/plain")
             self.send_header("Content-Length", str(len(page) if found else 0))
             self.end_headers()

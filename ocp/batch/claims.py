@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ocp.errors import ProblemError
-from ocp.storage import open_regular
+from ocp.storage import open_unlinked
 
 __all__ = ["Claims"]
 
@@ -93,7 +93,7 @@ class Claims:
             return owner == self._name
         path, sure = self._owners / owner, owner.rpartition(".")[0] == self._here
         try:
-            with open_regular(path) as stream:
+            with open_unlinked(path) as stream:
                 sign = os.fstat(stream.fileno()).st_mtime_ns
                 try:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -20,7 +20,7 @@ import numpy as np
 from ocp.errors import MOST_NUMBERS, ProblemError
 from ocp.planning import Plan
 from ocp.solution import Solution
-from ocp.storage import open_regular
+from ocp.storage import open_unlinked
 
 __all__ = ["Parcel", "digest_of", "key_of", "packed", "plain", "text_of", "unpacked"]
 
@@ -173,7 +173,7 @@ def unpacked(parcel: Parcel) -> Any:
 def digest_of(path: str) -> str | None:
     """The digest of what a file holds; None where there is no file of that name that can be read."""
     try:
-        with open_regular(os.path.realpath(path)) as stream:
+        with open_unlinked(os.path.realpath(path)) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except (OSError, ValueError):
         return None

@@ -22,7 +22,7 @@ from typing import Any
 from ocp.batch.claims import locked
 from ocp.batch.content import Parcel, key_of, text_of, unpacked
 from ocp.errors import ProblemError
-from ocp.storage import END, checked_path, open_regular, write_whole
+from ocp.storage import END, checked_path, open_unlinked, write_whole
 
 __all__ = ["ENDS", "Ledger"]
 
@@ -143,7 +143,7 @@ class Ledger:
             if not sound or record["status"] not in ENDS:
                 return None
             for i, told in enumerate(record["files"]):
-                with open_regular(file_at(place, i)) as stream:
+                with open_unlinked(file_at(place, i)) as stream:
                     if stream.seek(0, os.SEEK_END) != told["bytes"]:
                         return None
                     stream.seek(-22, os.SEEK_END)  # of a zip archive; it was not written to its end without
@@ -177,7 +177,7 @@ class Ledger:
         """
         files = []
         for i in range(len(record["files"])):
-            with open_regular(file_at(self._place(record["key"]), i)) as stream:
+            with open_unlinked(file_at(self._place(record["key"]), i)) as stream:
                 files.append(stream.read())
         return Parcel(record, tuple(files))
 
@@ -199,7 +199,7 @@ class Ledger:
 
 def loaded(path: Path) -> Any:
     """The data of a file of JSON, whose numbers are finite."""
-    with open_regular(path) as stream:
+    with open_unlinked(path) as stream:
         return json.loads(stream.read(), parse_float=finite, parse_constant=finite)
 
 

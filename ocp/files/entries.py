@@ -13,11 +13,15 @@ import numpy as np
 from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.files.lines import FileName, read_lines, wrong_line
+from ocp.files.trees import DEEPEST, checked_depth
 
 __all__ = ["Entries", "read_entries"]
 
-TABLE = re.compile(r"^\s*(\[\[?)\s*([^\[\]#]+?)\s*\]\]?\s*(?:#.*)?$")
-KEY = re.compile(r"""^\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
+LARGEST_TOML = 2**20
+"""Bytes."""
+TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
+KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
+BETWEEN = re.compile(r"[,=\[\]{}#]")
 AT_LINE = re.compile(r"\(at line (\d+)")
 NEARLY = 0.5
 """How alike two names are of which the one is taken for the other, 1 if they are equal."""
@@ -203,16 +207,19 @@ def read_entries(file: FileName) -> Entries:
     Raises:
         ProblemError: A file that cannot be read, or is no TOML, by line.
     """
-    texts = read_lines(file)
+    texts = read_lines(file, largest=LARGEST_TOML)
+    for number, text in enumerate(texts, 1):
+        if any(part.count(".") > DEEPEST for part in BETWEEN.split(text)):  # the parser's time grows by the square
+            raise wrong_line(file, number, text, f"a name has more than {DEEPEST} parts", DEEPEST)
     try:
-        values = tomllib.loads("\n".join(texts))
+        values = checked_depth(tomllib.loads("\n".join(texts)))
     except tomllib.TOMLDecodeError as error:
         told = AT_LINE.search(str(error))
         number = min(int(told[1]), len(texts)) if told else len(texts)
         why = AT_LINE.split(str(error))[0].strip() or str(error)
         raise wrong_line(file, number, texts[number - 1], f"no TOML: {why}; write name = value") from error
-    except RecursionError as error:
-        raise ProblemError(f"{file} is nested too deep", name="file", value=str(file)) from error
+    except (RecursionError, ValueError) as error:  # ValueError: also of numbers of more digits than Python reads
+        raise ProblemError(f"{file} is no TOML that is read: {error}", name="file", value=str(file)) from error
     return Entries(str(file), texts, _places(texts), (), values)
 
 
@@ -222,7 +229,8 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
     counts: dict[Place, int] = {}
     table: Place = ()
     for number, text in enumerate(texts, 1):
-        if (head := TABLE.match(text)) and "=" not in head[2]:
+        line = text.strip()
+        if (head := TABLE.match(line)) and "=" not in head[2]:
             names = tuple(part.strip().strip("\"'") for part in head[2].split("."))
             table = ()
             for k, name in enumerate(names):
@@ -233,7 +241,7 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
                 elif table in counts:
                     table = (*table, counts[table])
             found.setdefault(table, number)
-        elif told := KEY.match(text):
+        elif told := KEY.match(line):
             place = table
             for part in told[1].split("."):
                 place = (*place, part.strip().strip("\"'"))

@@ -6,6 +6,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
+from models.input_files import UnfitFile, read_regular
 from ocp.errors import ProblemError
 
 __all__ = ["LARGEST_FILE", "MOST_LINES", "FileName", "read_lines", "wrong_line"]
@@ -18,10 +19,10 @@ MOST_LINES, LONGEST_LINE = 500_000, 10_000
 LONGEST_SHOWN = 120  # characters of a line in a message
 
 
-def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE) -> list[str]:
+def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE, largest: int = LARGEST_FILE) -> list[str]:
     """The lines of a text file, of any line ends, without a byte order mark; what is no UTF-8 is read as Latin-1.
 
-    None may have more than `longest` characters.
+    None may have more than `longest` characters, and the file at most `largest` bytes.
 
     Raises:
         ProblemError: No file name, a file that cannot be read, an empty one, one or a line that is too long, bytes.
@@ -30,13 +31,12 @@ def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE) -> list[st
         raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
     path = Path(file)
     try:
-        with path.open("rb") as stream:
-            raw = stream.read(LARGEST_FILE + 1)
+        raw = read_regular(path, largest)
+    except UnfitFile as error:
+        words = f"longer than {largest // 2**20} MB; split it" if error.limit else f"cannot be read: {error.strerror}"
+        raise ProblemError(f"{path}: {words}", name="file", value=str(path), limit=error.limit) from error
     except (OSError, ValueError) as error:
         raise ProblemError(f"{path}: cannot be read: {error}", name="file", value=str(path)) from error
-    if len(raw) > LARGEST_FILE:
-        message = f"{path}: longer than {LARGEST_FILE // 2**20} MB; split it"
-        raise ProblemError(message, name="file", value=str(path), limit=LARGEST_FILE)
     if b"\0" in raw:
         raise ProblemError(f"{path}: holds zero bytes, it is no text of UTF-8", name="file", value=str(path))
     try:

@@ -1,24 +1,33 @@
 """MCAP, the log format that ROS 2 and Foxglove read and play: joint states over time, and the tip's path.
 
 Messages are those of ROS 2, written as CDR (OMG, DDS-XTypes 1.3, 7.4: little endian, each number aligned to its size,
-lengths before strings and sequences). The package `mcap`, of the extra of that name, writes the file around them.
+lengths before strings and sequences). The package `mcap`, of the extra of that name, knows the file around them.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
 from typing import IO, Any
 
 import numpy as np
 
 from models.arrays import Array
+from models.input_files import open_regular
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.planning import Plan
 from ocp.storage import write_whole
 
 __all__ = ["read_joint_messages", "write_mcap"]
 
+LARGEST_LOG, MOST_UNPACKED, LARGEST_RECORD = 2**30, 2**30, 2**26
+"""Bytes: of a log's file, of all that it unpacks to, and of one record or chunk, unpacked."""
+MOST_OF_JOINTS = 2**26
+"""Bytes of all messages that are kept: they take five times as much memory."""
 HEADER = "std_msgs/Header header\n"
 BAR = "=" * 80 + "\n"
 HEADER_PARTS = (
@@ -152,22 +161,33 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
         ProblemError: No such file, no log, no such topic, or the package `mcap` is not installed.
     """
     try:
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
+        from mcap.records import Channel, Message, Schema
     except ImportError as error:
         words = "MCAP is read by the package mcap: pip install 'selfmotion[mcap]'"
         raise ProblemError(words, name="mcap") from error
-    found: dict[str, list[tuple[int, Any]]] = {}
+    found: dict[str, list[tuple[int, int, Any]]] = {}
+    schemas: dict[int, Any] = {}
+    channels: dict[int, tuple[str, Any]] = {}  # topics, and how their messages are read
+    size = 0
     try:
-        with open(file, "rb") as stream:
-            for schema, channel, message in make_reader(stream).iter_messages():
-                read = READERS.get(schema.name) if schema is not None else None
-                if read is not None and channel.message_encoding == "cdr":
-                    told = read(_Cursor(message.data))
-                    found.setdefault(channel.topic, []).append((told.pop("stamp") or message.log_time, told))
+        with open_regular(file, LARGEST_LOG) as stream:
+            for record in _records(stream):
+                if isinstance(record, Schema):
+                    schemas[record.id] = READERS.get(record.name)
+                elif isinstance(record, Channel) and record.message_encoding == "cdr":
+                    channels[record.id] = record.topic, schemas.get(record.schema_id)
+                elif isinstance(record, Message):
+                    name, read = channels.get(record.channel_id, ("", None))
+                    if read is not None:
+                        size += len(record.data)
+                        if size > MOST_OF_JOINTS:
+                            raise ValueError(f"its messages of joints have more than {MOST_OF_JOINTS} bytes; split it")
+                        told = read(_Cursor(record.data))
+                        stamp = told.pop("stamp") or record.log_time
+                        found.setdefault(name, []).append((record.log_time, stamp, told))
     except OSError as error:
-        raise ProblemError(f"{file}: cannot be read: {error}", name="file", value=str(file)) from error
-    except (McapError, struct.error, ValueError, EOFError, UnicodeDecodeError) as error:
+        raise ProblemError(f"{file}: cannot be read: {error.strerror}", name="file", value=str(file)) from error
+    except Exception as error:  # what mcap, zstandard and lz4 say of broken bytes is of many kinds
         raise ProblemError(f"{file} is no log that can be read: {error}", name="file", value=str(file)) from error
     chosen = topic
     if topic is None and len(found) == 1:
@@ -178,7 +198,42 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
         known = ", ".join(sorted(found)) or "none"
         words = f"{file}: no topic {topic!r} of joint states or joint trajectories; there are: {known}; tell the topic"
         raise ProblemError(words, name="topic", value=topic, limit=tuple(found))
-    return chosen, found[chosen]
+    return chosen, [(stamp, told) for _, stamp, told in sorted(found[chosen], key=lambda one: one[0])]
+
+
+def _records(stream: IO[bytes]) -> Iterator[Any]:
+    """The records of a log in the order of its file, those in its chunks too.
+
+    Raises:
+        ValueError: A record is too large, or all that it unpacks to.
+    """
+    from mcap.exceptions import EndOfFile
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    room = MOST_UNPACKED
+    for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        room -= record.uncompressed_size
+        if record.uncompressed_size > LARGEST_RECORD or room < 0:
+            raise ValueError(f"it unpacks to more than {MOST_UNPACKED} bytes, or a part of it to {LARGEST_RECORD}")
+        with suppress(EndOfFile):
+            yield from StreamReader(io.BytesIO(_unpacked(record)), skip_magic=True).records
+
+
+def _unpacked(chunk: Any) -> bytes:
+    """The contents of a chunk, never more than it says that it has."""
+    data, size = chunk.data, chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        zstd = import_module("zstandard").ZstdDecompressor(max_window_size=LARGEST_RECORD)
+        data = zstd.stream_reader(data).read(size + 1)
+    elif chunk.compression == "lz4":
+        data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(data, size + 1)
+    if len(data) != size:
+        raise ValueError("a chunk does not unpack to the size that it says")
+    return bytes(data)
 
 
 class _Cursor:

@@ -62,6 +62,7 @@ from ocp.errors import ProblemError
 from ocp.files.entries import REQUIRED, Entries, read_entries
 from ocp.files.lines import FileName
 from ocp.files.obstacles import obstacles_of, turn_of
+from ocp.files.outputs import SUFFIXES, checked_output
 from ocp.files.waypoints import read_waypoints
 from ocp.schedule import LineLimits, schedule
 from ocp.tasks.limits import Limits
@@ -69,7 +70,7 @@ from ocp.tasks.tip_task import TipTask
 
 __all__ = ["OUTPUTS", "Task", "read_task"]
 
-OUTPUTS = ("plan", "csv", "json", "yaml", "mcap", "urdf", "report")
+OUTPUTS = tuple(SUFFIXES)
 LIMITED = {
     "velocity": "rad/s or m/s",
     "acceleration": "rad/s^2 or m/s^2",
@@ -91,7 +92,7 @@ class Task:
     Attributes:
         machine: Read from the robot's file. task: Of its tip.
         options: Keywords of `ocp.plan`; of `ocp.plan_in_pieces` where it is to be done `in_pieces`.
-        outputs: Files to write, by kind of OUTPUTS. period: Of samples in them, s.
+        outputs: Files to write, by kind of OUTPUTS, all below the `output_folder`. period: Of samples in them, s.
         file, urdf: Names of the task's own file and of the robot's.
     """
 
@@ -102,11 +103,15 @@ class Task:
     period: float
     file: str
     urdf: Path
+    output_folder: Path
     in_pieces: bool = False
 
 
-def read_task(file: FileName) -> Task:
+def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     """What a task file asks for; nothing is planned.
+
+    Args:
+        output_folder: Where the names of outputs begin, and below which they must lie; None: the task file's folder.
 
     Raises:
         ProblemError: By line, what is wrong and what was expected.
@@ -129,10 +134,11 @@ def read_task(file: FileName) -> Task:
         if (table := root.table(name, f"a table [{name}]")) is not None:
             options |= read(table, names, folder)
             table.done()
-    outputs, period = _outputs(root.table("output", "a table [output]"), folder)
+    written = folder if output_folder is None else Path(output_folder)
+    outputs, period = _outputs(root.table("output", "a table [output]"), written)
     root.done()
     in_pieces = options.pop("in_pieces", False)
-    return Task(machine, task, options, outputs, period, str(file), urdf, in_pieces)
+    return Task(machine, task, options, outputs, period, str(file), urdf, written, in_pieces)
 
 
 @contextmanager
@@ -310,6 +316,8 @@ def _outputs(entries: Entries | None, folder: Path) -> tuple[dict[str, Path], fl
             found[kind] = folder / name
             if not found[kind].parent.is_dir():
                 raise entries.wrong(kind, f"there is no folder {found[kind].parent}; make it, or name another")
+            with _about(entries, kind):
+                checked_output(kind, found[kind], folder, force=True)
     period = entries.number("period", "a number above 0, s", 0.01, least=0.0)
     entries.done()
     return found, period

@@ -11,9 +11,8 @@ a comment.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -25,6 +24,8 @@ from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
 from ocp.files.lines import FileName, read_lines, wrong_line
 from ocp.files.mcap import read_joint_messages
+from ocp.files.trees import parts_of, read_tree
+from ocp.tables import table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
 
@@ -54,7 +55,8 @@ UNITS = {
     "nm": 1.0,
     "n": 1.0,
 }
-HEAD = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
+HEAD = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
+BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}
 
 
@@ -125,8 +127,7 @@ def read_trajectory(
         return _read_table(file, columns, period, known)
     if kind == "mcap":
         return _from_messages(file, *read_joint_messages(file, topic))
-    text = "\n".join(read_lines(file, longest=None))
-    return _from_points(file, _tree(file, text, kind))
+    return _from_points(file, read_tree(file, kind))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------
@@ -178,7 +179,7 @@ def _read_table(
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
-        return [cell.strip("\"'") for cell in re.sub(r"\s+(?=[\[(])", "", line).split()]
+        return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
     cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
     return [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
 
@@ -217,13 +218,16 @@ def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
     """Column and unit of the time; those of each joint's values by name and kind; notes."""
+    if own := table_joints(head):  # whatever their names seem to mean
+        columns = [(name, kind) for kind in KINDS[:3] for name in own]
+        return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
     time: tuple[int, float] | None = None
     found: dict[tuple[str, str], tuple[int, float]] = {}
     notes = []
     for column, cell in enumerate(head):
         name, unit = cell.strip(), ""
-        if name not in joints and (told := HEAD.match(name)):
-            name, unit = told[1], told[2].lower()
+        if name not in joints and (told := HEAD.fullmatch(name)):
+            name, unit = told[1].strip(), told[2].strip().lower()
             for ending in ("/s^2", "/s2", "/s²", "/s"):
                 unit = unit.removesuffix(ending) or unit
             if unit and unit not in UNITS:
@@ -264,38 +268,20 @@ def _kind(name: str) -> tuple[str, str]:
 # ---- trees of names: JSON, YAML ----------------------------------------------------------------------------------
 
 
-def _tree(file: FileName, text: str, kind: str) -> Any:
-    if kind == "json":
-        try:
-            return json.loads(text)
-        except ValueError as error:
-            raise ProblemError(f"{file} is no JSON: {error}", name="file", value=str(file)) from error
-        except RecursionError as error:
-            raise ProblemError(f"{file} is nested too deep", name="file", value=str(file)) from error
-    try:
-        import yaml
-    except ImportError as error:
-        words = "YAML is read by the package pyyaml: pip install 'selfmotion[yaml]'"
-        raise ProblemError(words, name="yaml") from error
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    try:
-        return next(yaml.load_all(text, loader), None)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise ProblemError(f"{file} is no YAML: {error}", name="file", value=str(file)) from error
-
-
 def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
-    """The first thing in it that has joint names and points."""
-    if isinstance(tree, Mapping):
-        if "joint_names" in tree and "points" in tree:
-            return tree
-        inside: Iterable[Any] = tree.values()
-    elif isinstance(tree, list):
-        inside = tree[:100]
-    else:
-        return None
-    found = (_trajectory_in(part, depth - 1) for part in inside) if depth else ()
-    return next((one for one in found if one is not None), None)
+    """The outermost mapping in it that has joint names and points; each value is looked at once."""
+    level, seen = [tree], set[int]()
+    for _ in range(depth + 1):
+        below: list[Any] = []
+        for one in level:
+            if isinstance(one, Mapping) and "joint_names" in one and "points" in one:
+                return one
+            for part in parts_of(one)[:100]:
+                if id(part) not in seen:
+                    seen.add(id(part))
+                    below.append(part)
+        level = below
+    return None
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:

@@ -55,7 +55,7 @@ LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "µm": 1e-6, "in": 0.02
 ANGLES = {"rad": 1.0, "deg": np.pi / 180, "°": np.pi / 180}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEAD = re.compile(r"^([\w.]+?)\s*(?:[\[(/ _]\s*(m|mm|cm|um|µm|in|inch|rad|deg|°|s|ms|us|ns)\s*[\])]?)?$")
-BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")
+BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 SKIPPED = ("", "-", "index")
 LOOSEST = 1e-2
 """Difference of a quaternion's norm from 1 that is put down to the digits written."""
@@ -255,7 +255,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 def _name(cell: str) -> str:
     """Of a column, as it is called here; "" where it has none."""
-    found = HEAD.match(cell.strip().lower())
+    found = HEAD.match(" ".join(cell.lower().split()))
     name = found[1].removeprefix("pose.") if found else ""
     return OTHER_NAMES.get(name, name)
 
@@ -293,7 +293,7 @@ def _head(
 
 
 def _unit(cell: str) -> str | None:
-    found = HEAD.match(cell.strip().lower())
+    found = HEAD.match(" ".join(cell.lower().split()))
     return found[2] if found else None
 
 

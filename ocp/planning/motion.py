@@ -28,6 +28,7 @@ from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
 from ocp.schedule.trajectory import JointTrajectory
 from ocp.solution import Solution, read_head
 from ocp.storage import read_arrays, write_arrays, write_text
+from ocp.tables import table_head
 from ocp.tasks.targets import Target, targets_along
 from ocp.tasks.tip_task import TipTask
 
@@ -408,7 +409,7 @@ class Plan:
         columns = self.table(period)
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(table_head(self.names))
         writer.writerows([repr(value) for value in row] for row in np.column_stack([*columns.values()]).tolist())
         write_text(path, stream.getvalue())
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike as FilePath
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from models.input_files import read_regular
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, checked_instance, floats
 from ocp.schedule.limits import JointPath, check_joints, rates_along
 from ocp.schedule.planner import Schedule
 from ocp.schedule.profile import Array, LineMotion
+from ocp.storage import checked_path, write_text
+from ocp.tables import column_name, joint_name
 
 __all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
 
+LARGEST_FILE = 2**26
+"""Bytes."""
 KINDS = ("positions", "velocities", "accelerations")
 
 
@@ -64,24 +67,23 @@ class JointTrajectory:
 
     def write_csv(self, path: str | FilePath[str]) -> None:
         """Write columns t and position, velocity, acceleration of each joint, in full precision."""
-        head = ["t", *(f"{name}.{kind}" for kind in KINDS for name in self.names)]
-        if not isinstance(path, str | FilePath):
-            raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
+        head = ["t", *(f"{column_name(name)}.{kind}" for kind in KINDS for name in self.names)]
         rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
-        with Path(path).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(head)
-            writer.writerows([repr(value) for value in row] for row in rows.tolist())
+        write_text(path, "\n".join([",".join(head), *(",".join(map(repr, row)) for row in rows.tolist()), ""]))
 
     @classmethod
     def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
         """Read what write_csv wrote, bit for bit; ProblemError for anything else."""
-        with Path(path).open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
+        try:
+            text = read_regular(checked_path(path), LARGEST_FILE).decode()
+        except (OSError, ValueError) as error:
+            words = f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+            raise ProblemError(words, name="path", value=path) from error
+        rows = [line.split(",") for line in text.splitlines()]
         head = rows[0] if rows else []
         count = (len(head) - 1) // 3
-        names = tuple(column.removesuffix(f".{KINDS[0]}") for column in head[1 : count + 1])
-        if count < 1 or head != ["t", *(f"{name}.{kind}" for kind in KINDS for name in names)]:
+        columns = [column.removesuffix(f".{KINDS[0]}") for column in head[1 : count + 1]]
+        if count < 1 or head != ["t", *(f"{name}.{kind}" for kind in KINDS for name in columns)]:
             message = f"{path}: the head {head[:4]} is not that of a joint trajectory"
             raise ProblemError(message, name=str(path), value=head)
         try:
@@ -89,7 +91,7 @@ class JointTrajectory:
         except ValueError as error:
             message = f"{path}: a cell is not a number, or a row is not complete: {error}"
             raise ProblemError(message, name=str(path)) from error
-        return cls(names, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
+        return cls(tuple(map(joint_name, columns)), table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def to_ros(self) -> dict[str, Any]:
         """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there.

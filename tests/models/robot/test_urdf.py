@@ -167,7 +167,7 @@ def test_a_robot_is_written_to_a_file_as_a_whole_and_read_by_other_readers(tmp_p
 
 
 def test_names_of_any_kind_are_written_and_the_tip_link_takes_a_name_that_is_free() -> None:
-    odd = "<a> & \"b\"\t'c' \u00e9"
+    odd = "<a> & \"b\" 'c' \u00e9"
     robot = Robot(
         (Link(odd), Link(f"{odd}_tip")), (Joint(f"{odd}_tip1", "fixed", odd, f"{odd}_tip"),), odd, (1.0, 0, 0)
     )

@@ -231,15 +231,14 @@ def test_a_broken_cache_is_no_error(own_cache: Path, contents: str, monkeypatch:
     (file,) = own_cache.iterdir()
     file.write_text(contents, encoding="utf-8")
     assert same(cover(vertices, faces), first)
-    assert json.loads(file.read_text(encoding="utf-8"))  # mended
+    assert json.loads(file.read_text(encoding="utf-8").partition("\n")[2])  # mended
 
 
 def test_a_cover_that_does_not_hold_the_mesh_is_not_taken(own_cache: Path) -> None:
     vertices, faces = dumbbell()
     first = cover(vertices, faces)
     (file,) = own_cache.iterdir()
-    small = [each | {"radius": 0.9 * each["radius"]} for each in json.loads(file.read_text(encoding="utf-8"))]
-    file.write_text(json.dumps(small), encoding="utf-8")
+    cache.keep(file.stem, [each | {"radius": 0.9 * each["radius"]} for each in cache.kept(file.stem)])
     assert same(cover(vertices, faces), first)
 
 

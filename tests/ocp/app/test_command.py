@@ -355,7 +355,7 @@ def test_the_cache_is_shown_and_cleared(tmp_path: Path, capsys: Any, monkeypatch
     kept.keep_library("b" * 64, b"compiled")
     told = json.loads(run(capsys, "cache", "--json")[1])
     assert (told["folder"], told["files"], told["cleared"]) == (str(tmp_path / "selfmotion"), 2, False)
-    assert (told["libraries"], told["bytes"]) == (1, len('{"a": 1}') + len(b"compiled"))
+    assert (told["libraries"], told["bytes"]) == (1, 64 + len('\n{"a": 1}') + len(b"compiled"))
     assert kept.kept("a" * 64) == {"a": 1}
     assert run(capsys, "cache", "clear")[0] == 0
     assert kept.kept("a" * 64) is None

@@ -13,7 +13,7 @@ import pytest
 
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
-from models.machines.surroundings import Moving
+from models.machines.moving import Moving
 from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_pieces
 from ocp.planning.piecewise import _part
 from tests.ocp.planning.test_charts import planar

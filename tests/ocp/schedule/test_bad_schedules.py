@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from tests.bad_values import (
     INSTANCE,
     LIMIT,
     MAPPING,
+    NAN,
     NONNEGATIVE,
     NOTHING,
     POSITIVE,
@@ -79,6 +81,17 @@ def plan() -> Schedule:
 
 def profile() -> SpeedProfile:
     return PLAN.profile
+
+
+def write_table(path: Any) -> None:
+    with TemporaryDirectory() as folder:
+        JOINTS.write_csv(f"{folder}/{path}" if path == "trajectory.csv" else path)
+
+
+def read_table(path: Any) -> JointTrajectory:
+    with TemporaryDirectory() as folder:
+        JOINTS.write_csv(f"{folder}/trajectory.csv")
+        return JointTrajectory.read_csv(f"{folder}/{path}" if path == "trajectory.csv" else path)
 
 
 def trajectory() -> JointTrajectory:
@@ -174,7 +187,22 @@ CASES = [
             **dict.fromkeys(("positions", "velocities", "accelerations"), array(2, 2) | NOTHING),
         },
     ),
-    method(trajectory, "write_csv", {"path": "/dev/null"}, path={"None": None, "number": -3, "list": []}),
+    Case(
+        "JointTrajectory.write_csv",
+        write_table,
+        {"path": "trajectory.csv"},
+        {"path": {"None": None, "number": -3, "list": [], "device": "/dev/null", "folder": "/"}},
+    ),
+    Case(
+        "JointTrajectory.read_csv",
+        read_table,
+        {"path": "trajectory.csv"},
+        {
+            "path": NOTHING
+            | {"nan": NAN, "number": 3, "list": [], "device": "/dev/zero", "folder": "/", "absent": "/no/file.csv"}
+            | {"zero byte": "a\0b", "other": __file__}
+        },
+    ),
     Case(
         "JointTrajectory.from_ros",
         JointTrajectory.from_ros,
