@@ -46,8 +46,13 @@ def violations(
     bounds: Bounds,
     p: np.ndarray,
     horizon: float,
+    share: float,
 ) -> list[Violation]:
-    """How far every bound and constraint is missed, along some states (M, nx) on the fine grid."""
+    """How far every bound and constraint is missed, along some states (M, nx) on the fine grid.
+
+    A constraint counts as no larger than that its tolerance, where it declares one, is the ``share`` of its size that
+    is let pass.
+    """
     lower, upper = bounds
     places = form.bounds.places
     found: list[Violation] = []
@@ -94,6 +99,8 @@ def violations(
             change = changes(form, kind, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries)[1]
             by = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
             size[worst] = np.clip(by, FLOOR * size[worst], size[worst])
+        with np.errstate(divide="ignore"):
+            size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:
             mine = rows.of(name)
             found.append(judged(name, name, t, over[:, mine], size[:, mine]))

@@ -80,6 +80,7 @@ class Constraint:
         expression: Shape (m, 1).
         lower, upper: casadi expressions of parameters. Shape (m, 1).
         unit: As of a variable.
+        tolerance: Largest violation of each row that the audit lets pass, in its unit; None: as its size says. (m,).
         integral: Whether it is the integral of the expression over time that is meant. Of what is watched only.
         way: Rate of the way that it is judged against, shape (m, 1), or None. Of what is watched only.
     """
@@ -89,6 +90,7 @@ class Constraint:
     lower: Any
     upper: Any
     unit: str = ""
+    tolerance: Any = None
     integral: bool = False
     way: Any = None
 
