@@ -248,7 +248,7 @@ def audit(
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
     total: dict[str, float] = {}
-    for check in violations(form, again, motion, size, bounds, p, solution.horizon, constraints):
+    for check in violations(form, again, motion, size, bounds, p, solution.horizon, constraints, grid.states):
         finding = violation_finding(check, constraints, limits.get(check.name))
         findings.append(replace(finding, unit=form.units.get(check.name, "")))
         total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))

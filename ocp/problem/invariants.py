@@ -167,7 +167,7 @@ def implied(form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.
 
 def projector(rows: np.ndarray) -> np.ndarray:
     """Onto what is orthogonal to rows (k, n). Shape (n, n)."""
-    return np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ZERO) @ rows
+    return np.asarray(np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ZERO) @ rows)
 
 
 def rows_of_ends(form: Formulation) -> ca.Function:

@@ -321,36 +321,14 @@ class Problem:
         self._constrain("path", name, expression, lower, upper, unit, tolerance)
 
     @_about_its_name
-    def start(
-        self,
-        name: str,
-        expression: Value,
-        lower: Value = None,
-        upper: Value = None,
-        *,
-        unit: str = "",
-        tolerance: Value = None,
-    ) -> None:
-        """Declare ``lower <= expression <= upper`` at the start. ``tolerance`` as of :meth:`path`."""
-        self._constrain("start", name, expression, lower, upper, unit, tolerance)
+    def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
+        """Declare ``lower <= expression <= upper`` at the start."""
+        self._constrain("start", name, expression, lower, upper, unit)
 
     @_about_its_name
-    def end(
-        self,
-        name: str,
-        expression: Value,
-        lower: Value = None,
-        upper: Value = None,
-        *,
-        unit: str = "",
-        tolerance: Value = None,
-    ) -> None:
-        """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start.
-
-        ``tolerance`` as of :meth:`path`.
-        """
-        known = list(self.declared.at_start.values())
-        self._constrain("end", name, expression, lower, upper, unit, tolerance, known)
+    def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
+        """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
+        self._constrain("end", name, expression, lower, upper, unit, known=list(self.declared.at_start.values()))
 
     @_about_its_name
     def watch(
@@ -648,7 +626,7 @@ class Problem:
         lower: Value,
         upper: Value,
         unit: str,
-        tolerance: Value,
+        tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> None:
         """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""

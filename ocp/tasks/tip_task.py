@@ -61,9 +61,8 @@ class TipTask:
             lowers it to that where there is no gap to close. Where accelerations are asked for it damps critically, and
             velocities decay to what a `velocity` asks.
         start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
-        tolerance: By how much a plan's audit lets each row of position (m) and of orientation (rad) be off, between the
-            samples too; and by no more than 1e-3 of the path that the tip goes or turns. Of a velocity it is meant of
-            its integral. Shape (2,).
+        tolerance: By how much a plan's audit lets each row of a pose be off, position (m) and orientation (rad), and by
+            no more than 1e-3 of the path along which the tip moves or turns. Shape (2,).
         begin: When the task begins, s; its tracks are functions of the time from there on.
         duration: How long it lasts, s; None: to the end of the motion.
         breaks: Times from its beginning at which its tracks are less smooth, where a mesh should have nodes. Shape
@@ -89,7 +88,7 @@ class TipTask:
     begin: float = 0.0
     duration: float | None = None
     breaks: ArrayInput = ()
-    tolerance: Sequence[float] = (1e-4, 1e-3)
+    tolerance: ArrayInput = (1e-4, 1e-3)
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):

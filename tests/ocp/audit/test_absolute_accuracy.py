@@ -25,7 +25,7 @@ def gantry(length: float) -> FixedBase:
         Joint(f"rail{k}", "prismatic", names[k], names[k + 1], axis=axis, lower=-5 * length, upper=5 * length)
         for k, axis in enumerate(axes)
     ]
-    return FixedBase(Robot([Link(name, mass=1.0) for name in names], joints, tip="tool"))
+    return FixedBase(Robot(tuple(Link(name, mass=1.0) for name in names), tuple(joints), tip="tool"))
 
 
 @cache
@@ -66,6 +66,19 @@ def test_a_long_path_is_followed_to_a_tenth_of_a_millimetre(length: float) -> No
         assert row.value == pytest.approx(off, rel=0.05)
         assert row.limit == pytest.approx(1e-4)
     assert drifting(plan, 0.5e-4).audit()["task position"].passed
+
+
+def test_reported_joints_are_what_is_run() -> None:
+    """They may be off what the rates make of them by a thousandth of their spread, 5 mm here, but for the tip."""
+    plan = along(10.0)
+    curve = plan.state_interpolant
+    values = curve.values.copy()
+    values[5, :, 0] += 1e-3
+    edited = replace(plan, state_interpolant=replace(curve, values=values))
+    audit = edited.audit()
+    assert audit["integration error, relative"].passed
+    assert not audit["task position"].passed
+    assert audit["task position"].value == pytest.approx(1e-3 / np.sqrt(1.25), rel=0.2)
 
 
 @pytest.mark.parametrize("length", [1e-6, 1e-3, 1e-1])
@@ -110,18 +123,12 @@ def straight(kind: str, tolerance: Any) -> Problem:
     problem.horizon(1.0)
     problem.minimize(running=u**2)
     both = ca.vertcat(x - 100 * problem.time, ca.sin(x))
-    if kind == "end":
-        problem.end("row", x, 99.99, 99.99, tolerance=tolerance)
-    elif kind == "start":
-        problem.start("row", x, 0.01, 0.01, tolerance=tolerance)
-    elif kind:
+    if kind:
         getattr(problem, kind)("row", both, [0.01, -1.0], np.inf, tolerance=tolerance)
     return problem
 
 
-@pytest.mark.parametrize(
-    ("kind", "tolerance"), [("path", [5e-3, 1.0]), ("watch", 5e-3), ("end", 5e-3), ("start", 5e-3)]
-)
+@pytest.mark.parametrize(("kind", "tolerance"), [("path", [5e-3, 1.0]), ("watch", 5e-3)])
 def test_a_constraint_may_have_a_tolerance_of_its_own(kind: str, tolerance: Any) -> None:
     plan = solve(straight("", None), Collocation(5))
     assert plan.audit().passed

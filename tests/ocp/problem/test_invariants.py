@@ -18,7 +18,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.invariants import bounds_to_solve
 from tests.ocp.problems import Array, double_integrator
 
-METHODS = [
+METHODS: list[Any] = [
     Collocation(10),
     Collocation(10, scheme="legendre"),
     Collocation(40, degree=2, control="held"),
@@ -196,7 +196,8 @@ def test_other_conditions_that_follow(make: Callable[[], Problem], count: int) -
     gone = let_go(make())
     assert len(gone["terminal"]) + len(gone["end"]) == count
     costs = []
-    for method in (Collocation(16), MultipleShooting(30, control="linear")):
+    methods: list[Any] = [Collocation(16), MultipleShooting(30, control="linear")]
+    for method in methods:
         plan = solve(make(), method)
         assert plan.audit().passed, str(plan.audit())
         costs.append(plan.cost)
