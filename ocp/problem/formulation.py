@@ -413,7 +413,10 @@ class Formulation:
             equality,
             controls.reshape(len(names), self.nu).any(axis=1),
             states.reshape(len(names), self.nx),
-            np.array([t for c in pool.values() for t in c.tolerance or [np.inf] * c.size], dtype=float),
+            np.array(
+                [t for c in pool.values() for t in ([np.inf] * c.size if c.tolerance is None else c.tolerance)],
+                dtype=float,
+            ),
         )
 
     def _bound_table(self) -> BoundTable:
