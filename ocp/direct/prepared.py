@@ -332,7 +332,7 @@ class Prepared:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        arguments = self._arguments(p)
+        arguments = self._arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
             draw_in(arguments, tighter)
         again = self._again(guess, arguments, bounds, ahead)
@@ -386,9 +386,9 @@ class Prepared:
             self._badness(told_of, bounds),
         ) from told_of.error
 
-    def _arguments(self, p: np.ndarray) -> dict[str, np.ndarray]:
+    def _arguments(self, p: np.ndarray, bounds: Bounds) -> dict[str, np.ndarray]:
         """Parameters, and the bounds of variables and rows, of the program."""
-        (lower, upper), fragment = bounds_to_solve(self.formulation, p), self.fragment
+        (lower, upper), fragment = bounds, self.fragment
         return {
             "p": p,
             "lbx": lower[fragment.variable_bounds],
@@ -447,7 +447,7 @@ class Prepared:
             return None
         try:
             p = form.parameter_vector(guess.parameters)
-            before = self._known.relaxed(self._arguments(p))
+            before = self._known.relaxed(self._arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
             scales = self._scales(v, {*form.states, *form.controls, "horizon"}, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
