@@ -184,8 +184,7 @@ class AccessoryProblem:
         def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
             count = multipliers.shape[1]
             force = np.abs(multipliers) * reach[:, first : first + count]
-            gap = np.minimum(limits.below, limits.above)[:, :count]
-            touched = (gap <= AT_BOUND * size) | limits.equal[:count]
+            touched = (limits.gap[:, :count] <= AT_BOUND * size) | limits.equal[:count]
             return [force > FLAT * (force.max(initial=0.0) or 1.0), touched]
 
         strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], 0, held)

@@ -197,7 +197,8 @@ def audit(
         problem: What was asked. solution: The plan.
         integration: Largest distance from the re-integrated states, relative to the size of each state, and relative
             error of the cost.
-        constraints: Largest violation of a bound or constraint, as a share of its size.
+        constraints: Largest violation of a bound or constraint, as a share of its size; the tolerance that it declares
+            itself (:meth:`ocp.problem.problem.Problem.path`) where that is less.
         lost: What of its cost the plan may lose to the extremal beside it, as a share.
         costates: Largest error of the costates against their own equation, over the whole plan, and of the conditions
             at the ends, as a share of the cost. None: 1e-2, or the root of the share that the plan loses.
@@ -247,7 +248,7 @@ def audit(
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
     total: dict[str, float] = {}
-    for check in violations(form, again, motion, size, bounds, p, solution.horizon):
+    for check in violations(form, again, motion, size, bounds, p, solution.horizon, constraints, grid.states):
         finding = violation_finding(check, constraints, limits.get(check.name))
         findings.append(replace(finding, unit=form.units.get(check.name, "")))
         total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))

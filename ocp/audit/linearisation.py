@@ -28,6 +28,9 @@ MOST_DERIVATIVES = 3
 """Of a limit of the states, looked at for a control."""
 NEAR = 1e-2
 """A limit nearer than this share of the size of what it limits may push; what it pushes over the gap is charged."""
+TIGHTENED = 0.1
+"""Share of the size of what is limited by which a limit may have been tightened, to push where the plan rests on it:
+a first-order price says little of one that is farther away, beyond a maximum of the cost say."""
 STILL = 10 * FLOOR
 """Share of the largest of its unit by which a control that moves less stands still."""
 
@@ -35,31 +38,46 @@ STILL = 10 * FLOOR
 class Limits:
     """What may hold a plan at some points: limits on either side of some quantities, and how near they are.
 
+    A limit that was slightly tightened when the plan was solved may push where the plan rests on it. The price of a
+    push is the distance to the declared limit: the multiplier times that distance is what the plan costs too much, to
+    first order, and an upper bound of it where the problem is convex (weak duality).
+
     Attributes:
-        below, above: Distance to the lower and upper limit, at least 0. Shape (M, m).
+        below, above: Distance to the declared lower and upper limit, at least 0. Shape (M, m).
+        gap: Distance to the nearer of both as they were when the plan was solved. Shape (M, m).
         lower, upper: Which may push. Shape (M, m), bool. Both at equalities.
         equal: Which are equalities. Shape (m,).
     """
 
-    def __init__(self, value: np.ndarray, low: np.ndarray, high: np.ndarray, equal: np.ndarray, size: np.ndarray):
+    def __init__(
+        self,
+        value: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+        equal: np.ndarray,
+        size: np.ndarray,
+        tightened: Any = (0.0, 0.0),
+    ) -> None:
         self.equal = equal
-        self.below = np.where(equal, 0.0, np.maximum(value - low, 0.0))
-        self.above = np.where(equal, 0.0, np.maximum(high - value, 0.0))
-        self.lower = equal | (self.below <= NEAR * size)
-        self.upper = equal | (self.above <= NEAR * size)
+        self.below, self.above = (np.where(equal, 0.0, np.maximum(gap, 0.0)) for gap in (value - low, high - value))
+        sides = zip((self.below, self.above), tightened, strict=True)
+        gaps = [np.maximum(gap - np.where(by <= TIGHTENED * size, by, 0.0), 0.0) for gap, by in sides]
+        self.gap = np.minimum(*gaps)
+        self.lower, self.upper = (equal | (gap <= NEAR * size) for gap in gaps)
 
     def at(self, points: slice) -> Limits:
         """The same at some of the points."""
         part = copy(self)
-        part.below, part.above = self.below[points], self.above[points]
-        part.lower, part.upper = self.lower[points], self.upper[points]
+        for name in ("below", "above", "gap", "lower", "upper"):
+            setattr(part, name, getattr(self, name)[points])
         return part
 
     def extend(self, count: int) -> None:
         """Add as many equalities, which the plan meets."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
-        self.below, self.above = (np.hstack([part, np.zeros((m, count))]) for part in (self.below, self.above))
+        none = np.zeros((m, count))
+        self.below, self.above, self.gap = (np.hstack([part, none]) for part in (self.below, self.above, self.gap))
         self.lower, self.upper = (np.hstack([part, np.ones((m, count), bool)]) for part in (self.lower, self.upper))
 
     @property
@@ -223,19 +241,21 @@ class Linearisation:
         self.still = np.flatnonzero(~form.path.uses_control)
         kinds = ("state", "control", "path")
         index = np.concatenate([form.bounds.places[kind] for kind in kinds])
-        drawn = np.zeros((2, n, len(index))) if self.solution.drawn_in is None else self.solution.drawn_in
-        low, high = self.bounds[0][index] + drawn[0], self.bounds[1][index] - drawn[1]
+        low, high = (side[index] for side in self.bounds)
+        drawn = np.zeros((2, n, len(index)))
+        if self.solution.drawn_in is not None:  # one put together by hand may lack the path rows
+            drawn[:, :, : self.solution.drawn_in.shape[2]] = self.solution.drawn_in[:, :, : len(index)]
         equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
-        equal |= self.bounds[0][index] == self.bounds[1][index]
+        equal |= low == high
         size = np.concatenate([sizes.state, self.control_size, sizes.path])
         hold = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
         stand = np.concatenate([np.arange(nx), nx + nu + self.still])
         value = np.hstack([self.x, self.u, self.row])
-        by_point = np.repeat(low, q, axis=0), np.repeat(high, q, axis=0)
+        by_point = np.repeat(drawn, q, axis=1)
         self.hold, self.stand = (
-            Limits(value[:, k], by_point[0][:, k], by_point[1][:, k], equal[k], size[k]) for k in (hold, stand)
+            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (hold, stand)
         )
-        self.low, self.high = (side[:, nx : nx + nu] for side in by_point)
+        self.low, self.high = (np.tile(side[nx : nx + nu], (n * q, 1)) for side in (low, high))
         eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
         self.hold_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
         self.stand_x = np.zeros((n * q, len(stand), nx + 1))
@@ -252,8 +272,8 @@ class Linearisation:
         here = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
         row, row_y = form.sampled(still, *here, kept="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
-        ends = np.maximum(low[before], low[after])[:, stand], np.minimum(high[before], high[after])[:, stand]
-        self.node_stand = Limits(np.hstack([x, row]), *ends, equal[stand], size[stand])
+        at_nodes = np.maximum(drawn[:, before], drawn[:, after])[:, :, stand]
+        self.node_stand = Limits(np.hstack([x, row]), low[stand], high[stand], equal[stand], size[stand], at_nodes)
         self.node_stand_x = np.zeros((n + 1, len(stand), nx + 1))
         self.node_stand_x[:, :nx, :nx] = np.eye(nx)
         self.node_stand_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)

@@ -79,7 +79,7 @@ def optimality(
             costates reported.
     """
     along = along or Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
-    if not along.finite:
+    if not (along.finite and np.isfinite(solution.cost)):
         return undefined(along, hamiltonian(form, solution, p))
     cost = abs(solution.cost) or along.slope_size or 1.0
     curved = _curved(along)

@@ -46,8 +46,14 @@ def violations(
     bounds: Bounds,
     p: np.ndarray,
     horizon: float,
+    share: float,
+    reported: np.ndarray,
 ) -> list[Violation]:
-    """How far every bound and constraint is missed, along some states (M, nx) on the fine grid."""
+    """How far every bound and constraint is missed, along some states (M, nx) on the fine grid.
+
+    A constraint that declares a tolerance counts as no larger than that this is the ``share`` of its size that is let
+    pass, and is judged along the ``reported`` states (M, nx) too, which are what is run.
+    """
     lower, upper = bounds
     places = form.bounds.places
     found: list[Violation] = []
@@ -83,9 +89,12 @@ def violations(
         else:
             starts = (form.x0, begin[0]), (form.u0, begin[1])
             g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, kept=(kind, "from the start"))[0]
-        if kind == "watch":
-            g = np.where(form.watch_integral, integral(g, t), g)
-        over = beyond(g, lower[rows.bounds], upper[rows.bounds])
+        over = beyond(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
+        limited = np.isfinite(rows.tolerance)
+        if kind in along and limited.any():
+            told = form.sampled(outputs, reported, *here[1:], kept="rows along a plan")[kind == "watch"]
+            missed = beyond(_integrated(form, kind, told, t), lower[rows.bounds], upper[rows.bounds])
+            over = np.where(limited, np.maximum(over, missed), over)
         size = np.tile(size, (len(t), 1))
         worst = np.argmax(over, axis=0), np.arange(len(rows))
         if kind != "watch" and np.any(
@@ -94,10 +103,17 @@ def violations(
             change = changes(form, kind, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries)[1]
             by = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
             size[worst] = np.clip(by, FLOOR * size[worst], size[worst])
+        with np.errstate(divide="ignore"):
+            size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:
             mine = rows.of(name)
             found.append(judged(name, name, t, over[:, mine], size[:, mine]))
     return found
+
+
+def _integrated(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Values of rows (K, m), of those that are watched as integrals their integrals over time."""
+    return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 
 
 def beyond(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ from ocp.errors import (
     floats,
 )
 from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
@@ -331,7 +332,7 @@ class Prepared:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        arguments = self._arguments(p, bounds)
+        arguments = self._arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
             draw_in(arguments, tighter)
         again = self._again(guess, arguments, bounds, ahead)
@@ -446,7 +447,7 @@ class Prepared:
             return None
         try:
             p = form.parameter_vector(guess.parameters)
-            before = self._known.relaxed(self._arguments(p, form.bound_values(p)))
+            before = self._known.relaxed(self._arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
             scales = self._scales(v, {*form.states, *form.controls, "horizon"}, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)

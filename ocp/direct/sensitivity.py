@@ -25,6 +25,7 @@ from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name
 from ocp.problem.formulation import Formulation
+from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.values import symbols_of
 from ocp.solution import Sensitivity, Solution
 
@@ -167,7 +168,7 @@ def program_of(solution: Solution) -> Built:
         raise ProblemError(words, name="variables", value=len(solution.variables), limit=fragment.size)
     p = form.parameter_vector(solution.parameters)
     program = assemble(fragment, form.np, Blocks(fragment, "auto").functions)
-    return Built(form, fragment, program, solution.variables, p, *form.bound_values(p))
+    return Built(form, fragment, program, solution.variables, p, *bounds_to_solve(form, p))
 
 
 def by_parameters(

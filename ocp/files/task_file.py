@@ -203,11 +203,12 @@ def _task(entries: Entries, folder: Path) -> TipTask:
     link = entries.text("link", "the name of a link")
     gain = entries.number("gain", "a number of 1/s, 0 or more", 1.0, least=-1e-300)
     others: dict[str, Any] = {"gain": gain}
+    tolerance = entries.vector("tolerance", 2, "two numbers above 0, m and rad, that the tool may be off")
     if tool == "free" and direction is not None:
         raise entries.wrong("direction", 'tool = "free" has no direction; leave one of the two out')
     if direction is not None:
         others["direction"] = direction
-    for name, value in (("within", within), ("link", link)):
+    for name, value in (("within", within), ("link", link), ("tolerance", tolerance)):
         if value is not None:
             others[name] = value
     with _about(entries, "speed"):

@@ -37,6 +37,7 @@ from ocp.indirect.newton import Found, newton
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
 from ocp.problem.formulation import Bounds, Formulation, at_samples
+from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution, check_belongs
 
@@ -140,7 +141,7 @@ class PreparedIndirect:
     def _solve(self, parameters: ByName, guess: Guess, check: bool) -> Solution:
         form = self.formulation
         p = form.parameter_vector(checked_mapping("parameters", parameters))
-        bounds = form.bound_values(p)
+        bounds = bounds_to_solve(form, p)
         note = ""
         if isinstance(guess, Solution):
             seed = guess

@@ -80,6 +80,7 @@ class Constraint:
         expression: Shape (m, 1).
         lower, upper: casadi expressions of parameters. Shape (m, 1).
         unit: As of a variable.
+        tolerance: Largest violation of each row that the audit lets pass, in its unit; None: as its size says. (m,).
         integral: Whether it is the integral of the expression over time that is meant. Of what is watched only.
         way: Rate of the way that it is judged against, shape (m, 1), or None. Of what is watched only.
     """
@@ -89,6 +90,7 @@ class Constraint:
     lower: Any
     upper: Any
     unit: str = ""
+    tolerance: Any = None
     integral: bool = False
     way: Any = None
 
@@ -194,6 +196,8 @@ class Declarations:
             for value in (one.expression, one.lower, one.upper, *(() if one.way is None else (one.way,))):
                 column(value, one.size, f"constraint {one.name!r}")
             require(isinstance(one.unit, str) and isinstance(one.integral, bool), f"constraint {one.name!r}")
+            given = np.ones(1) if one.tolerance is None else np.asarray(one.tolerance, dtype=float)
+            require(given.size in (1, one.size) and bool((given > 0).all()), f"constraint {one.name!r}")
         for apart in self.apart.values():
             movers = {name: self.states[name].size for name in apart.movers if name in self.states}
             require(movers == apart.movers and isinstance(apart.placements, symbols), f"separation {apart.name!r}")

@@ -39,6 +39,7 @@ class Rows:
         equality: Whether lower and upper bound are one expression. Shape (m,), bool.
         uses_control: Whether the row contains a control. Shape (m,), bool.
         uses_state: Which states the row contains. Shape (m, nx), bool.
+        tolerance: Largest violation that the audit lets pass, infinite where none is declared. Shape (m,).
     """
 
     expression: Any
@@ -48,6 +49,7 @@ class Rows:
     equality: np.ndarray
     uses_control: np.ndarray
     uses_state: np.ndarray
+    tolerance: np.ndarray
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -72,6 +74,7 @@ class Rows:
             self.equality[keep],
             self.uses_control[keep],
             self.uses_state[keep],
+            self.tolerance[keep],
         )
 
 
@@ -410,6 +413,10 @@ class Formulation:
             equality,
             controls.reshape(len(names), self.nu).any(axis=1),
             states.reshape(len(names), self.nx),
+            np.array(
+                [t for c in pool.values() for t in ([np.inf] * c.size if c.tolerance is None else c.tolerance)],
+                dtype=float,
+            ),
         )
 
     def _bound_table(self) -> BoundTable:

@@ -303,9 +303,23 @@ class Problem:
         self.declared.dynamics[found.name] = expression
 
     @_about_its_name
-    def path(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
-        """Declare ``lower <= expression <= upper`` at every time; equal bounds make an equality."""
-        self._constrain("path", name, expression, lower, upper, unit)
+    def path(
+        self,
+        name: str,
+        expression: Value,
+        lower: Value = None,
+        upper: Value = None,
+        *,
+        unit: str = "",
+        tolerance: Value = None,
+    ) -> None:
+        """Declare ``lower <= expression <= upper`` at every time; equal bounds make an equality.
+
+        Args:
+            tolerance: Largest violation that the audit lets pass, in the unit of the expression, where that is less
+                than its share of the constraint's size; positive numbers, one for all rows or for each.
+        """
+        self._constrain("path", name, expression, lower, upper, unit, tolerance)
 
     @_about_its_name
     def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
@@ -315,7 +329,7 @@ class Problem:
     @_about_its_name
     def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
-        self._constrain("end", name, expression, lower, upper, unit, list(self.declared.at_start.values()))
+        self._constrain("end", name, expression, lower, upper, unit, known=list(self.declared.at_start.values()))
 
     @_about_its_name
     def watch(
@@ -328,6 +342,7 @@ class Problem:
         integral: bool = False,
         way: Value = None,
         unit: str = "",
+        tolerance: Value = None,
     ) -> None:
         """Declare that the audit judges ``lower <= expression <= upper`` at every time, which no method holds.
 
@@ -341,12 +356,12 @@ class Problem:
             integral: Whether the integral of the expression from the start to each time is meant.
             way: Rate of the way that is judged against, of the expression's size: a miss is relative to how far the
                 integral of ``way`` goes along the plan. None: to what the expression is made of.
-            unit: Of the expression, or of its integral.
+            unit: Of the expression, or of its integral. tolerance: As of :meth:`path`, in this unit.
         """
         if not isinstance(integral, bool):
             raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
         known = list(self.declared.at_start.values())
-        self._constrain("watch", name, expression, lower, upper, unit, known)
+        self._constrain("watch", name, expression, lower, upper, unit, tolerance, known)
         found = self.declared.watch.pop(name)
         rate = None if way is None else self._expression(f"watch {name!r}: way", way, [*self._inner(), *known])
         if rate is not None and rate.numel() != found.size:
@@ -597,7 +612,15 @@ class Problem:
         )
 
     def _constrain(
-        self, kind: str, name: str, expression: Value, lower: Value, upper: Value, unit: str, known: Sequence[Any] = ()
+        self,
+        kind: str,
+        name: str,
+        expression: Value,
+        lower: Value,
+        upper: Value,
+        unit: str,
+        tolerance: Value = None,
+        known: Sequence[Any] = (),
     ) -> None:
         """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""
         what = self._unused_constraint(f"{kind} constraint", name)
@@ -608,7 +631,14 @@ class Problem:
         if lower is None and upper is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         low, high = self._bounds(what, vector.numel(), lower, upper)
-        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high, unit)
+        allowed = None
+        if tolerance is not None:
+            allowed = numeric(f"{what}: tolerance", tolerance)
+            if allowed.size not in (1, vector.numel()) or not (allowed > 0).all():
+                words = f"{what}: tolerance must be positive numbers, 1 or {vector.numel()} of them, not {tolerance!r}"
+                raise ProblemError(words, value=tolerance, limit=vector.numel())
+            allowed = np.broadcast_to(allowed, vector.numel()).tolist()
+        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high, unit, allowed)
 
     def _unused_constraint(self, kind: str, name: Any) -> str:
         """``kind 'name'``; ProblemError where it is no name of a constraint that can be new."""

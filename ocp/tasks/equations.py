@@ -179,9 +179,11 @@ class TaskEquations:
         Errors of poses, "task position" and "task orientation"; of velocities the integral of what they are missed by,
         "task way" and "task turn"; each judged by the way of the tips. Where a task is held as an equation of
         velocities or accelerations, errors too small for that equation may add up. A pose may be off by the gap at the
-        start that its task allows, which the feedback closes.
+        start that its task allows, which the feedback closes, and by the tolerance of its task.
         """
+        tolerances = self.tolerances
         gaps = np.repeat([part.task.start_gap for part in self.bound], [part.task.size for part in self.bound])
+        gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # no more than the default is no gap
         error, missed = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         moving, found = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
         for posed, turning, name, unit in (
@@ -195,8 +197,15 @@ class TaskEquations:
                 what = (error if posed else missed)[rows]
                 off = gaps[rows] if posed else 0.0
                 bounds = {"lower": -off, "upper": off, "integral": not posed, "unit": unit}
-                found[name] = {"expression": what, "way": moving[rows], **bounds}
+                allowed = tolerances[rows] if posed else None
+                found[name] = {"expression": what, "way": moving[rows], "tolerance": allowed, **bounds}
         return found
+
+    @property
+    def tolerances(self) -> Array:
+        """By how much each row may be missed, m and rad. Shape (size,)."""
+        pairs = np.repeat([part.task.tolerance for part in self.bound], [part.task.size for part in self.bound], axis=0)
+        return np.asarray(np.where(self.turning, *pairs.T[::-1]))
 
     @property
     def turning(self) -> NDArray[np.bool_]:

@@ -61,6 +61,8 @@ class TipTask:
             lowers it to that where there is no gap to close. Where accelerations are asked for it damps critically, and
             velocities decay to what a `velocity` asks.
         start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
+        tolerance: By how much a plan's audit lets each row of a pose be off, position (m) and orientation (rad), and by
+            no more than 1e-3 of the path along which the tip moves or turns. Shape (2,).
         begin: When the task begins, s; its tracks are functions of the time from there on.
         duration: How long it lasts, s; None: to the end of the motion.
         breaks: Times from its beginning at which its tracks are less smooth, where a mesh should have nodes. Shape
@@ -86,6 +88,7 @@ class TipTask:
     begin: float = 0.0
     duration: float | None = None
     breaks: ArrayInput = ()
+    tolerance: ArrayInput = (1e-4, 1e-3)
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):
@@ -113,11 +116,16 @@ class TipTask:
             object.__setattr__(self, "point", checked_array(self.point, (3,), "tip task", "point"))
             object.__setattr__(self, "rows", self._checked_rows())
             object.__setattr__(self, "breaks", self._checked_breaks())
+            pair = checked_array(self.tolerance, (2,), "tip task", "tolerance")
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
         object.__setattr__(self, "tool_axis", axis / np.linalg.norm(axis))
+        if not (pair > 0).all():
+            words = f"tip task: tolerance must be two positive numbers, m and rad, not {self.tolerance!r}"
+            raise ProblemError(words, name="tolerance", value=self.tolerance)
+        object.__setattr__(self, "tolerance", tuple(pair.tolist()))
         if self.link is None and np.any(self.point):
             words = "a point is given in the frame of a link: name the link too"
             raise ProblemError(words, name="point", value=self.point)

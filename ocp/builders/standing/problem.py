@@ -232,7 +232,7 @@ def standing_problem(
             problem.watch(name, **stray)
     else:
         gap = equations.gap(none, joints, velocities, equations.targets(*progress[:2]))
-        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""))
+        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""), tolerance=equations.tolerances)
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _ground(problem, machine, motion, wrenches, zmp, limits)
