@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -76,6 +76,9 @@ frauds: $(VENV)/test.stamp ## edit eight plans 264 times and audit them: what pa
 
 faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batches of 500 plans, and fill a disk
 	$(BIN)/python -W ignore -m tests.sweep.faults
+
+fuzz: $(VENV)/test.stamp ## read 2000 mutated files of each kind: none crashes, hangs, runs code or writes elsewhere (ARGS="--only csv,urdf")
+	$(BIN)/python -W ignore -m tests.sweep.fuzz $(ARGS)
 
 browser: $(VENV)/test.stamp ## open pages of the viewer, and of the site, in a real browser (ARGS=--if-there: where there is one)
 	$(BIN)/python -W ignore -m tests.browser $(ARGS)

@@ -311,7 +311,7 @@ def _check_inertia(inertia: Array, owner: str, lenient: bool) -> None:
         raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric", name="inertia", value=inertia)
     if lenient:
         return
-    least, middle, greatest = np.linalg.eigvalsh((inertia + inertia.T) / 2)
+    least, middle, greatest = np.linalg.eigvalsh(inertia / 2 + inertia.T / 2)
     if least < -slack:
         message = f"{owner}: inertia has the negative principal moment {least:g} kg m^2"
         raise ModelError(message, name="inertia", value=float(least), limit=0.0)

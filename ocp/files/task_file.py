@@ -58,7 +58,7 @@ from models import (
     with_load,
 )
 from models import Path as ToolPath
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.files.entries import REQUIRED, Entries, read_entries
 from ocp.files.lines import FileName
 from ocp.files.obstacles import obstacles_of, turn_of
@@ -228,8 +228,8 @@ def _path(entries: Entries, folder: Path) -> SmoothPath:
         with _about(entries, "file"):
             return read_waypoints(folder / name).smooth(stray)
     try:
-        corners = np.array(points, dtype=float)
-    except (TypeError, ValueError):
+        corners = floats(points)
+    except NOT_NUMBERS:
         corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2 or not np.isfinite(corners).all():
         raise entries.wrong("points", "points must be two or more of three numbers, m: [[x, y, z], [x, y, z]]")

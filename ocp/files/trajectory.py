@@ -295,7 +295,7 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
         raise ProblemError(words, name="joint_names", value=names)
     if not isinstance(points, list) or not points or not all(isinstance(point, Mapping) for point in points):
         raise ProblemError(
-            f"{file}: points must be a list of at least one point", name="points", value=len(points or ())
+            f"{file}: points must be a list of at least one point", name="points", value=repr(points)[:80]
         )
     t = np.array([_seconds(file, number, point) for number, point in enumerate(points, 1)])
     notes: list[str] = []
@@ -327,8 +327,9 @@ def _rows(file: FileName, word: str, given: list[Any], width: int) -> Array:
     rows = np.full((len(given), width), np.nan)
     for number, one in enumerate(given, 1):
         if not isinstance(one, list) or len(one) != width:
-            words = f"{file}: point {number}: {word} has {len(one)} entries, there are {width} joints"
-            raise ProblemError(words, name=f"point {number}", value=len(one), limit=width)
+            count = len(one) if isinstance(one, list) else repr(one)[:80]
+            words = f"{file}: point {number}: {word} has {count} entries, there are {width} joints"
+            raise ProblemError(words, name=f"point {number}", value=count, limit=width)
         try:
             rows[number - 1] = [np.nan if value is None else float(value) for value in one]
         except NOT_NUMBERS as error:

@@ -234,7 +234,7 @@ def test_heads_of_tables_are_read_in_time(line: str, tmp_path: Path) -> None:
 
 def packed(path: Path, size: int, said: int) -> None:
     """A log with a chunk of zeros, packed by zstd, that says to have another size."""
-    builder = RecordBuilder()
+    builder: Any = RecordBuilder()
     compressor = zstandard.ZstdCompressor().compressobj()
     data = b"".join(compressor.compress(bytes(2**24)) for _ in range(size >> 24)) + compressor.flush()
     Chunk("zstd", data, 0, 0, 0, said).write(builder)
