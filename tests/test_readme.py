@@ -106,8 +106,10 @@ def normal(name: str) -> str:
 def test_the_readme_runs_from_first_to_last_without_extras(tmp_path: Path) -> None:
     """In a folder that is empty, with what `pip install .` installs alone, in processes of their own."""
     kept = core()
-    brought = [one.files or [] for one in metadata.distributions() if normal(one.metadata["Name"]) in kept]
-    own = {file.parts[0].partition(".")[0] for files in brought for file in files} | {"models", "ocp"}
+    own = {"models", "ocp"}
+    for one in metadata.distributions():
+        if normal(one.metadata["Name"]) in kept:
+            own |= {file.parts[0].partition(".")[0] for file in one.files or ()}
     installed = [place for place in sys.path if Path(place).name == "site-packages"]
     hidden = sorted({module.name for module in pkgutil.iter_modules(installed)} - own)
     lost = [one.metadata["Name"] for one in metadata.distributions() if normal(one.metadata["Name"]) not in kept]

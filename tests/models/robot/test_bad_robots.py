@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import models
-from models import CollisionShape, Joint, Link, Mimic, Robot, VisualShape, Wrench, planar_chain
+from models import CollisionShape, Joint, Link, Mimic, Robot, VisualShape, Wrench, example_robot, planar_chain
 from tests.bad_values import (
     CHOICE,
     FINITE,
@@ -164,6 +164,7 @@ PARTS = [
     method(chain, "link", {"name": "hull"}, name=UNKNOWN),
     method(chain, "joint", {"name": "joint1"}, name=UNKNOWN),
     method(chain, "path_to", {"name": "link2"}, name=UNKNOWN),
+    Case("example_robot", example_robot, {"name": "six_axis"}, {"name": CHOICE}),
     Case(
         "planar_chain",
         planar_chain,
