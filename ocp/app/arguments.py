@@ -24,6 +24,7 @@ from ocp.files.outputs import SUFFIXES, checked_output
 from ocp.files.task_file import read_task
 from ocp.planning import Plan
 from ocp.storage import write_text
+from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD
 
 __all__ = ["Words", "subcommands"]
 
@@ -35,7 +36,8 @@ CHECK = """Check anybody's trajectory for a robot: limits, jumps, units, clearan
 TRAJECTORY is a CSV with a head (time, and the joints by name; NAME.velocity, NAME.acceleration if there are; a unit
 may stand in brackets: `elbow [deg]`), a JointTrajectory as JSON or YAML, or an MCAP. Between samples the motion is
 what a controller makes of it: straight lines from positions alone, cubics with velocities, quintics with
-accelerations."""
+accelerations. Without --rule, velocities and accelerations between samples count as far as every motion through the
+samples has them."""
 CHECK_EXAMPLES = """examples:
   selfmotion check panda.urdf motion.csv
   selfmotion check panda.urdf motion.csv --acceleration 15 --jerk 7500 --acceleration panda_joint1=10
@@ -212,6 +214,12 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     rules = ("linear", "cubic", "quintic")
     file.add_argument("--rule", choices=rules, help="how the controller joins samples (default: by what the file has)")
     file.add_argument("--topic", help="of an MCAP with several")
+    words = "of the times: s, ms, us, ns, or the seconds from one sample number to the next (default: s)"
+    file.add_argument("--time-unit", type=lambda text: float(text) if text[:1].isdigit() else text, help=words)
+    file.add_argument(
+        "--unwrap", action="store_true", help="joints wrapped by whole turns turn on, as the controller does"
+    )
+    file.add_argument("--names-confirmed", action="store_true", help="do not suspect columns to be exchanged")
     limits = parser.add_argument_group(
         "limits, beside those of the robot; rad, m, s, N; repeatable, one joint at a time"
     )
@@ -239,12 +247,10 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     _file(around, "--srdf", "SRDF file whose disabled pairs may touch")
     path = parser.add_argument_group("the tip's path")
     _file(path, "--path", "waypoints (CSV: x, y, z) that the tip is to pass on straight lines")
-    path.add_argument(
-        "--path-tolerance", type=float, default=1e-3, metavar="M", help="that it may be off, m (default: 0.001)"
-    )
-    path.add_argument(
-        "--path-angle", type=float, default=np.inf, metavar="RAD", help="that its z axis may lean from the file's"
-    )
+    words = "that it may be off, m (default: 1e-4, at most 0.001 of the path's extent)"
+    path.add_argument("--path-tolerance", type=float, metavar="M", help=words)
+    words = f"that its z axis may lean from the file's, rad (default: {ORIENTATION_TOLERANCE_RAD})"
+    path.add_argument("--path-angle", type=float, default=ORIENTATION_TOLERANCE_RAD, metavar="RAD", help=words)
 
 
 def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
@@ -285,6 +291,9 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         path_angle=options.path_angle,
         share=options.share,
         rule=options.rule,
+        time_unit=options.time_unit,
+        unwrap=options.unwrap,
+        names_confirmed=options.names_confirmed,
         told=progress,
     )
     if options.report is not None:

@@ -1,6 +1,6 @@
 """The command `selfmotion`: what is typed, what is printed, and the exit status.
 
-0 when all holds, 1 when a check fails or there is no plan, 2 for bad input, 130 after Ctrl-C.
+0 when all holds, 1 when a check fails or stays open, or there is no plan, 2 for bad input, 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ EXAMPLES = """examples:
   selfmotion export seam.npz seam.csv --period 0.004
   selfmotion report seam.npz seam.html
 
-Exit status: 0 all holds, 1 a check fails or there is no plan, 2 bad input, 130 Ctrl-C.
+Exit status: 0 all holds, 1 a check fails or stays open, or there is no plan, 2 bad input, 130 Ctrl-C.
 `selfmotion COMMAND --help` shows more examples."""
 
 

@@ -83,16 +83,20 @@ def _looked(
     coefficients, t = along.pieces.coefficients[:, :, column], along.pieces.t
     blur = np.asarray(along.blur)[:, column]
     room = share * max(abs(one) for one in (low, high) if np.isfinite(one)) if np.isfinite([low, high]).any() else 0.0
-    sides = []
-    for sign, limit in ((1.0, high), (-1.0, -low)):
+    sides, extra = [], ""
+    for sign, limit, needed in zip((1.0, -1.0), (high, -low), along.needed, strict=True):
         towards = sign * coefficients
-        ends = np.maximum(towards[:, 0], towards[:, -1])
-        enclosed = towards.max(axis=1)
+        most = np.broadcast_to(needed, along.blur.shape)[:, column]
+        ends, enclosed = np.maximum(towards[:, 0], towards[:, -1]), towards.max(axis=1)
         # of a piece whose enclosure is above the greatest end, or beyond the limit, the greatest value is looked for
-        open_ = np.flatnonzero((enclosed > ends.max()) | ((enclosed > limit) & (ends <= limit)))
+        above = np.minimum(enclosed, most) > np.minimum(ends, most).max()
+        open_ = np.flatnonzero(above | ((enclosed > limit) & (ends <= limit)))
         value, place = ends.copy(), (towards[:, -1] > towards[:, 0]).astype(float)
         if open_.size and towards.shape[1] > 2:
             value[open_], place[open_] = highest(towards[open_])
+        if (value > np.maximum(most, limit + room)).any():
+            extra = "the interpolant is beyond, which no motion through the samples needs"
+        value = np.minimum(value, most)
         k = int(value.argmax())
         time = float(t[k] + place[k] * (t[k + 1] - t[k])) if towards.shape[1] > 1 else float((t[k] + t[k + 1]) / 2)
         sides.append((value, limit, sign, k, time))
@@ -107,7 +111,7 @@ def _looked(
     sure = [over & (side[0] > side[1] + room + blur) for over, side in zip(beyond, sides, strict=True)]
     allowed = sign * float(limit)
     if not (beyond[0] | beyond[1]).any():
-        slight = f"beyond, by less than the {100 * share:g} % allowed" if value[k] > limit else ""
+        slight = extra or (f"beyond, by less than the {100 * share:g} % allowed" if value[k] > limit else "")
         return (found, allowed, unit, time, "ok"), slight, []
     if not (sure[0] | sure[1]).any():
         return (found, allowed, unit, time, "not decided"), "", []
@@ -208,5 +212,6 @@ def states_along(motion: Motion) -> tuple[Array, Array, Array, Array]:
         return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
     piece = np.repeat(np.arange(len(h)), len(PLACES))
     place = np.tile(PLACES, len(h))
-    values = (one.within(piece, place) for one in (motion.position, motion.velocity, motion.acceleration))
-    return (t[piece] + place * h[piece], *values)  # type: ignore[return-value]
+    q, v, a = (one.within(piece, place) for one in (motion.position, motion.velocity, motion.acceleration))
+    least = np.broadcast_to(motion.needed("acceleration")[0], (len(h), a.shape[1]))[piece]
+    return t[piece] + place * h[piece], q, v, np.clip(a, -least, least)

@@ -20,7 +20,7 @@ from ocp.app.pieces import Indices, Motion, half_digits
 from ocp.errors import ProblemError
 from ocp.files import RawTrajectory
 
-__all__ = ["Fault", "Readable", "readable"]
+__all__ = ["SMALL_UNITS", "Fault", "Readable", "likely_unit", "readable"]
 
 WILD = 1.5
 """Of a limit, and 1 rad or m more: beyond that a position is hardly one of these units."""
@@ -30,6 +30,7 @@ HARDEST = 50.0
 """rad/s^2, m/s^2: a step that takes more, alone among others, is a jump; arms of industry give up to about 30."""
 LONGEST_STEP = 1000.0
 """s between samples: no controller waits so long."""
+SMALL_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 AROUND = 3
 """Steps before and after one with which it is compared."""
 FACTORS = {
@@ -48,7 +49,7 @@ class Fault:
     """Something that is wrong with a trajectory.
 
     Attributes:
-        kind: "jump", "velocity", "clearance", ...
+        kind: "jump", "velocity", "clearance", "suspicion", ...
         name: Of the joint, the two bodies, or the waypoint; "" where it is about the whole.
         text: What is wrong, in words.
         time: Where it is worst, s; None where it is everywhere. first: Where it begins.
@@ -97,11 +98,21 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 """Names of the columns of a floating base."""
 
 
-def readable(raw: RawTrajectory, robot: Robot, lower: Array, upper: Array, velocity: Array) -> Readable:
+def readable(
+    raw: RawTrajectory,
+    robot: Robot,
+    lower: Array,
+    upper: Array,
+    velocity: Array,
+    stated: bool = False,
+    unwrap: bool = False,
+) -> Readable:
     """What is left of a file's trajectory for a robot.
 
     Args:
         lower, upper, velocity: Limits of the joint vector, infinite where there are none. Shape (dof,) each.
+        stated: Whether the times are known to be in seconds.
+        unwrap: Take joints with limits that were wrapped as turning on, which is no fault then.
 
     Raises:
         ProblemError: Nothing is left: no joint of the robot, or no sample without a fault.
@@ -127,14 +138,17 @@ def readable(raw: RawTrajectory, robot: Robot, lower: Array, upper: Array, veloc
     base = raw.positions[rows][:, used[len(columns) :]] if base_names else None
     names = [robot.joint_names[k] for k in joints]
     kinds = [robot.joint(name).kind for name in names]
-    t = _in_seconds(t, faults)
-    q, v, a = _in_units(t, q, v, a, names, kinds, (lower[joints], upper[joints], velocity[joints]), faults)
+    limits = lower[joints], upper[joints], velocity[joints]
+    t = t if stated else _in_seconds(t, q, limits[2], faults)
+    q, v, a = _in_units(t, q, v, a, names, kinds, limits, faults)
     if len(t) == 1:
         notes.append("one sample is a posture, not a motion: it is looked at as one that rests for a second")
         t = np.array([t[0], t[0] + 1.0])
         q = np.repeat(q, 2, axis=0)
         v, a, efforts, base = (None if one is None else np.repeat(one, 2, axis=0) for one in (v, a, efforts, base))
-    q = _unwrapped(t, q, names, kinds, notes)
+    q, wrapped = _unwrapped(t, q, names, kinds, limits, notes)
+    faults += [] if unwrap else wrapped
+    notes += [f"{fault.name} {fault.text}" for fault in wrapped] if unwrap else []
     t = _time_by_velocities(t, q, v, names, faults)
     _jumps(t, q, names, kinds, velocity[joints], faults)
     _followers(raw, robot, rows, faults)
@@ -238,14 +252,25 @@ def _in_order(raw: RawTrajectory, kept: Indices, faults: list[Fault]) -> Indices
     return np.asarray(kept[np.unique(t, return_index=True)[1]])
 
 
-def _in_seconds(t: Array, faults: list[Fault]) -> Array:
-    """The times; in seconds where they are whole numbers that far apart that they must be micro- or nanoseconds."""
+def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
+    """The unit below a second in which the times make a plausible motion, or ""; the share of a limit used in seconds.
+
+    Plausible are samples at 10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 where it has none.
+    """
+    h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
+    used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())
+    fits = [unit for unit, n in SMALL_UNITS.items() if 1e-2 <= used * n <= 10 and np.median(h) >= 1e-4 * n]
+    return fits[-1] if fits else "", used
+
+
+def _in_seconds(t: Array, q: Array, velocity: Array, faults: list[Fault]) -> Array:
+    """The times; in seconds where they are whole numbers that far apart that they must be in a smaller unit."""
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < LONGEST_STEP:
         return t
-    power, unit = (1e9, "nanoseconds") if step >= 1e5 else (1e6, "microseconds")
+    unit = likely_unit(t, q, velocity)[0] or ("nanoseconds" if step >= 1e5 else "microseconds")
     words = f"times look like {unit}: whole numbers, {step:.6g} apart; what follows is of times in {unit}"
     faults.append(Fault("units", "time", words, None, None, step, LONGEST_STEP, "s"))
-    return t / power
+    return t / SMALL_UNITS[unit]
 
 
 def _in_units(
@@ -305,17 +330,34 @@ def _in_units(
     return q * scale, None if v is None else v * scale, None if a is None else a * scale
 
 
-def _unwrapped(t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], notes: list[str]) -> Array:
-    """Positions, joints that may turn for ever without the leaps of a whole turn."""
-    found = q.copy()
+def _unwrapped(
+    t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
+) -> tuple[Array, list[Fault]]:
+    """Positions without the leaps of whole turns, and a fault for each joint with limits that had some.
+
+    Of such a joint a leap is nearly a whole turn, and a step that it is too slow for, or that no arm makes. It turns on
+    where its limits have room for that, if need be whole turns away; elsewhere the leaps are left.
+    """
+    found, wrapped, (lower, upper, velocity), h = q.copy(), [], limits, np.diff(t)
     for k, kind in enumerate(kinds):
+        on, steps = np.unwrap(q[:, k]), np.diff(q[:, k])
+        leaps = np.abs(np.diff(on) - steps) > np.pi
+        if kind != "continuous":
+            swift = (np.abs(steps) > velocity[k] * h) | (np.abs(steps) > HARDEST * h**2)
+            leaps &= swift & (np.abs(np.diff(on)) < 0.5)
+            on = q[:, k] - np.cumsum([0.0, *np.where(leaps, steps - np.diff(on), 0.0)])
+            if on.min() < lower[k] or on.max() > upper[k]:
+                on += 2 * np.pi * np.rint((lower[k] + upper[k] - on.min() - on.max()) / (4 * np.pi))
+        if kind == "prismatic" or not leaps.any() or on.min() < lower[k] or on.max() > upper[k]:
+            continue
+        found[:, k], at = on, int(leaps.argmax())
+        words = f"is wrapped at {t[at]:.6g} s ({leaps.sum()} in all); it turns on"
         if kind == "continuous":
-            turns = np.unwrap(q[:, k])
-            leaps = np.flatnonzero(np.abs(np.diff(turns) - np.diff(q[:, k])) > np.pi)
-            if leaps.size:
-                notes.append(f"{names[k]} is wrapped at {t[leaps[0]]:.6g} s, {leaps.size} times in all; it turns on")
-                found[:, k] = turns
-    return found
+            notes.append(f"{names[k]} {words}")
+            continue
+        words += " in what follows, within its limits: unwrap it, or state --unwrap if the controller does"
+        wrapped.append(Fault("jump", names[k], words, float(t[at + 1]), float(t[at + 1]), float(steps[at]), unit="rad"))
+    return found, wrapped
 
 
 def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str], faults: list[Fault]) -> Array:
@@ -337,7 +379,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
             ratios[k] = float(ratio) if off <= 0.3 * abs(ratio) * most[k] else np.nan
     if ratios and len(ratios) == int((most * (t[-1] - t[0]) >= 1e-6).sum()):
         whole = np.median(list(ratios.values()))
-        for power, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
+        for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
                 words = f"times look like {unit}: velocities are {whole:.4g} times those of the positions over them"
                 faults.append(

@@ -1,10 +1,12 @@
 """What a controller makes of samples: polynomials from one to the next, and how far they go, between the samples too.
 
 The rule is that of the usual controllers: straight lines where a file has positions alone, cubics where it has
-velocities (Hermite), quintics where it has accelerations, too. Of accelerations that jump between two samples a quintic
-makes up to a sixth more, and so does such a controller; another one is told by its rule. Polynomials are kept by their
-Bernstein coefficients, which enclose them: halving a piece until the enclosure is met by a value tells its greatest
-value for sure.
+velocities (Hermite), quintics where it has accelerations, too. Polynomials are kept by their Bernstein coefficients,
+which enclose them: halving a piece until the enclosure is met by a value tells its greatest value for sure.
+
+Where the acceleration of the sampled motion jumps, these polynomials have more of it than the motion had: a cubic up to
+two thirds, a quintic a sixth. Samples are silent about what happens between them. A file is therefore held only to what
+every motion through its samples needs (`Motion.needed`), unless the rule of its controller is stated.
 
 Straight lines have no acceleration to look at. What the samples say of it are their divided differences: of any
 twice differentiable motion through three samples, 2 q[t0, t1, t2] is its acceleration at some time between them, and
@@ -16,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,11 +116,14 @@ class Along(NamedTuple):
         pieces: It, as polynomials; or constants, what divided differences say between two times.
         blur: By how much the digits of the file may make it more than it is. Shape (N, n).
         closed: Whether it is that of the interpolant, at every time; else what the samples prove of any motion.
+        needed: The largest value, and the largest of the negative, that every motion through the samples needs in each
+            piece; infinite where the interpolant itself counts. Shape (N, n) each, or ().
     """
 
     pieces: Pieces
     blur: Array
     closed: bool
+    needed: tuple[Any, Any] = (np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +133,14 @@ class Motion:
     Attributes:
         t: Increasing, at least two. Shape (M,), s.
         q, v, a: Positions, velocities or None, accelerations or None. Shape (M, n).
+        stated: Whether the controller is known to join them by this rule, so that the interpolant itself counts.
     """
 
     t: Array
     q: Array
     v: Array | None = None
     a: Array | None = None
+    stated: bool = False
 
     @property
     def rule(self) -> Rule:
@@ -153,7 +160,8 @@ class Motion:
             if rule in needed and values is None:
                 words = f"the rule {rule!r} needs {what}, which are not those of every joint; leave the rule out"
                 raise ProblemError(words, name="rule", value=rule)
-        return Motion(self.t, self.q, None if rule == "linear" else self.v, self.a if rule == "quintic" else None)
+        v, a = None if rule == "linear" else self.v, self.a if rule == "quintic" else None
+        return Motion(self.t, self.q, v, a, stated=True)
 
     @cached_property
     def position(self) -> Pieces:
@@ -199,18 +207,54 @@ class Motion:
         if what == "velocity":
             # of the Bernstein coefficients only the middle one has the difference of positions in it
             grows = {0: 2 * eq / h, 1: 3 * eq / h + ev, 2: 3.75 * eq / h + 2.5 * ev + 0.2 * h * ea}[smooth]
-            return Along(self.velocity, grows, True)
+            return Along(self.velocity, grows, True, self.needed(what))
         if what == "acceleration" and smooth:
             assert self.acceleration is not None
             grows = 12 * eq / h**2 + 6 * ev / h if smooth == 1 else 30 * eq / h**2 + 15 * ev / h + 3 * ea
-            return Along(self.acceleration, grows, True)
+            return Along(self.acceleration, grows, True, self.needed(what))
         if what == "jerk" and smooth == 2:
             assert self.acceleration is not None
             grows = 120 * eq / h**3 + 60 * ev / h**2 + 12 * ea / h
-            return Along(self.acceleration.derivative(), grows, True)
+            return Along(self.acceleration.derivative(), grows, True, self.needed(what))
         values, digits, order = (self.q, eq, 2 if what == "acceleration" else 3) if smooth == 0 else (self.v, ev, 2)
         assert values is not None
         return self._differences(values, digits, order)
+
+    def needed(self, what: str) -> tuple[Any, Any]:
+        """What every motion through the samples needs in each piece, as `Along.needed`.
+
+        Acceleration: a motion between positions and velocities needs the least if it switches once from A to -A, where
+        A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e the way less h times the mean
+        velocity of both ends. Accelerations that are given count, too. Jerk: by three weighted means, of weights 1 and
+        the Chebyshev polynomials U1 and U2 of the piece; from rest to rest 32 of the 60 that a quintic has. Velocity:
+        the peak of a trapezium, the lowest of all motions that accelerate no harder than this piece or the one before
+        or after it needs; without that bound only the mean velocity would be certain.
+        """
+        if self.stated or self.v is None:
+            return np.inf, np.inf
+        h, v, a = np.diff(self.t)[:, None], self.v, self.a
+        way, change, mean = np.diff(self.q, axis=0), np.diff(v, axis=0), (v[1:] + v[:-1]) / 2
+        off = way - h * mean
+        if what == "jerk" and a is not None:
+            turn = np.diff(a, axis=0)
+            means = turn * h**2, 4 * h * (change - h * (a[1:] + a[:-1]) / 2), 32 * off + 3 * h**2 * turn
+            jerk = np.abs(means).max(axis=0) / h**3
+            return jerk, jerk
+        least = (2 * np.abs(off) + np.sqrt(4 * off**2 + (h * change) ** 2)) / h**2
+        if a is not None:
+            least = np.maximum(least, np.maximum(np.abs(a[1:]), np.abs(a[:-1])))
+        if what == "acceleration":
+            return least, least
+        around = np.pad(least, ((1, 1), (0, 0)))
+        hardest = np.maximum(least, np.maximum(around[2:], around[:-2]))
+        ends = (v[1:] ** 2 + v[:-1] ** 2) / 2
+
+        def peak(sign: float) -> Array:
+            middle = hardest * h / 2 + sign * mean
+            lowest = middle - np.sqrt(np.maximum(middle**2 - sign * hardest * way - ends, 0.0))
+            return np.asarray(np.maximum(lowest, np.maximum(sign * v[1:], sign * v[:-1])))
+
+        return peak(1.0), peak(-1.0)
 
     def _differences(self, values: Array, digits: Array, order: int) -> Along | None:
         """order! times divided differences, each between the times of all of its samples."""

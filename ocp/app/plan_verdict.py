@@ -57,6 +57,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
     raw = RawTrajectory(plan.names, sample.t, *given, None, lines, True, (), name)
     base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
     place: dict[str, Any] = {} if machine.base_size else _mount(machine)
+    place |= {"time_unit": "s", "names_confirmed": True}  # a plan leaves no doubt of either
     check = check_trajectory(machine.robot, raw, base=base, clearance=None, **place)
     return PlanVerdict(plan.audit(**settings), check)
 

@@ -18,6 +18,7 @@ from ocp.app.joint_limits import Row, limit_rows, torque_rows
 from ocp.app.oddities import Fault, Readable, readable
 from ocp.app.pieces import Motion, Rule
 from ocp.app.surroundings import clearance_rows, path_rows, within_limits
+from ocp.app.suspicions import doubtful_times, exchanged_joints
 from ocp.console import check_time, interruptible
 from ocp.errors import (
     ProblemError,
@@ -30,7 +31,10 @@ from ocp.errors import (
     unknown_name,
 )
 from ocp.files import RawTrajectory, Waypoints
+from ocp.files.trajectory import UNITS
 from ocp.tasks.limits import JointBounds, unknown_limits
+from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD
+from ocp.tasks.tolerances import path_tolerance as default_tolerance
 
 __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_trajectory"]
 
@@ -51,6 +55,7 @@ class Check:
         file, robot: Their names. joints: Of the motion. samples: Of the file. duration: s.
         rule: How the samples are joined: "linear", "cubic" or "quintic".
         rows: Everything that was looked at. faults: What is wrong.
+        suspicions: What the file may mean other than it says; the verdict stays open until that is stated.
         unlimited: What nothing limits. unseen: What was not looked at, and why. notes: What was taken otherwise than
             it stands, or passed over.
     """
@@ -63,6 +68,7 @@ class Check:
     rule: str
     rows: tuple[Row, ...]
     faults: tuple[Fault, ...]
+    suspicions: tuple[Fault, ...]
     unlimited: tuple[str, ...]
     unseen: tuple[str, ...]
     notes: tuple[str, ...]
@@ -70,8 +76,8 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing that was looked at is wrong."""
-        return not self.faults
+        """Whether nothing that was looked at is wrong, or suspected to mean something else."""
+        return not self.faults and not self.suspicions
 
     @property
     def sentence(self) -> str:
@@ -81,6 +87,8 @@ class Check:
         without = f"; not looked at: {'; '.join(self.unseen)}" if self.unseen else ""
         if self.passed:
             return f"holds all that was looked at{but}{without}"
+        if not self.faults:
+            return f"is undetermined: {'; '.join(one.text for one in self.suspicions)}{without}"
         count = len(self.faults)
         return f"must not be run: {count} {'fault' if count == 1 else 'faults'}, first {self.faults[0]}{without}"
 
@@ -90,8 +98,9 @@ class Check:
             "cubic": "cubics between samples (of positions and velocities)",
             "quintic": "quintics between samples (of positions, velocities, accelerations)",
         }[self.rule]
+        verdict = "FAILED" if self.faults else "undetermined" if self.suspicions else "passed"
         lines = [
-            f"Check of {self.file} for {self.robot}: {'passed' if self.passed else 'FAILED'}",
+            f"Check of {self.file} for {self.robot}: {verdict}",
             f"  {self.samples} samples, {self.duration:.6g} s, {len(self.joints)} joints; {joined}",
         ]
         if self.faults:
@@ -108,6 +117,7 @@ class Check:
                 lines.append(f"{line}  {row.note}".rstrip())
         if self.unlimited:
             lines.append("unlimited: " + "; ".join(self.unlimited))
+        lines += map(str, self.suspicions)
         lines += [f"not looked at: {one}" for one in self.unseen]
         lines += [f"note: {one}" for one in self.notes]
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
@@ -116,7 +126,7 @@ class Check:
         """What JSON can hold: everything but the samples."""
         told = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
         told |= {"passed": self.passed, "verdict": self.sentence}
-        told |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "rows")}
+        told |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
         told |= {name: list(getattr(self, name)) for name in ("unlimited", "unseen", "notes")}
         return told
 
@@ -165,10 +175,13 @@ def check_trajectory(
     folders: Sequence[str | Path] = (),
     missing: Literal["raise", "skip"] = "raise",
     path: Waypoints | None = None,
-    path_tolerance: float = 1e-3,
-    path_angle: float = np.inf,
+    path_tolerance: float | None = None,
+    path_angle: float = ORIENTATION_TOLERANCE_RAD,
     share: float = SHARE,
     rule: Rule | None = None,
+    time_unit: str | float | None = None,
+    unwrap: bool = False,
+    names_confirmed: bool = False,
     told: Callable[[str], None] = lambda what: None,
 ) -> Check:
     """Check anybody's trajectory for a robot.
@@ -184,10 +197,15 @@ def check_trajectory(
         translation, rotation: Of a base that does not float, in world. gravity: m/s^2, in world.
         foot: That it stands on; from its collision shapes if None. friction: Of the ground.
         obstacles, clearance, ignored, srdf, folders, missing: As of `ocp.plan`; clearance None: nothing is looked at.
-        path: Waypoints that the tip is to pass on straight lines. path_tolerance: m. path_angle: rad, by which its z
-            axis may lean from the one that they tell.
+        path: Waypoints that the tip is to pass on straight lines. path_tolerance: m; None: the smaller of 0.1 mm and a
+            thousandth of the path's extent. path_angle: rad, by which its z axis may lean from the one that they tell.
         share: Of a limit, by which it may be passed.
-        rule: How the samples are joined, "linear", "cubic" or "quintic"; None: by all that they tell.
+        rule: How the controller joins the samples, "linear", "cubic" or "quintic". None: by all that they tell, and a
+            velocity, acceleration or jerk between them counts only as far as every motion through them needs it.
+        time_unit: Of the file's times, "s", "ms", "us" or "ns", or the seconds from one sample number to the next.
+            None: seconds, unless they look otherwise.
+        unwrap: Take joints with limits whose values were wrapped by whole turns as turning on.
+        names_confirmed: Do not suspect columns to be exchanged.
         told: Is called with what comes next.
 
     Raises:
@@ -197,6 +215,8 @@ def check_trajectory(
     checked_instance("trajectory", trajectory, RawTrajectory)
     checked_choice("base", base, ("fixed", "standing", "floating"))
     checked_nonnegative("share", share)
+    if path_tolerance is None:
+        path_tolerance = default_tolerance(np.zeros((1, 3)) if path is None else path.positions)
     checked_positive("path_tolerance", path_tolerance)
     for what, value in (("path_angle", path_angle), ("friction", friction)):
         if not real(value) > 0:  # which may be infinite
@@ -204,7 +224,12 @@ def check_trajectory(
     notes: list[str] = []
     bounds = bounds_of(robot, velocity, acceleration, jerk, torque, notes)
     told("reading")
-    found = readable(trajectory, robot, bounds.lower, bounds.upper, bounds.velocity)
+    if time_unit is not None:
+        units = ("s", "ms", "us", "ns")
+        size = time_unit if not isinstance(time_unit, str) else UNITS[checked_choice("time_unit", time_unit, units)]
+        checked_positive("time_unit", size)
+        trajectory = replace(trajectory, t=trajectory.t * size)
+    found = readable(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
     if rule is not None:
         checked_choice("rule", rule, get_args(Rule))
         found = replace(found, motion=found.motion.by(rule))
@@ -244,6 +269,11 @@ def check_trajectory(
             share,
         )
         notes += _machine_rows(robot, found, bounds, asked, add, unseen, told)
+    suspicions: list[Fault] = []
+    if time_unit is None and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
+        suspicions += doubtful_times(motion, bounds.velocity[found.joints])
+    if not names_confirmed:
+        suspicions += exchanged_joints(motion, robot, found.joints, whole and base != "floating")
     unlimited = _unlimited(rows)
     order = {
         kind: k for k, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
@@ -258,6 +288,7 @@ def check_trajectory(
         motion.rule,
         tuple(rows),
         tuple(faults),
+        tuple(suspicions),
         unlimited,
         tuple(unseen),
         (*found.notes, *notes),

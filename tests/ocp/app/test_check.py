@@ -197,7 +197,7 @@ def test_a_tip_off_its_path(tmp_path: Path) -> None:
     joints = ca.SX.sym("q", 4)
     tips = np.array(ca.Function("tip", [joints], [arm.tip_pose((), joints).position])(q.T)).T
     file = tmp_path / "path.csv"
-    file.write_text("x,y,z\n" + "\n".join(",".join(map(repr, row)) for row in tips[::4].tolist()))
+    file.write_text("x,y,z\n" + "\n".join(",".join(map(repr, row)) for row in tips.tolist()))
     path = read_waypoints(file)
     sound = checked(tmp_path, t, q, v, a, path=path)
     assert sound.passed, sound
@@ -256,7 +256,7 @@ def test_a_bump_beyond_a_limit(tmp_path: Path, what: str, order: int, with_rates
 
 
 def test_a_controller_that_joins_samples_otherwise_is_told(tmp_path: Path) -> None:
-    """Accelerations that jump in the middle between two samples: a quintic makes 16 % more of them, lines do not."""
+    """Accelerations that jump in the middle between two samples: a quintic makes 16 % more, the motion has no more."""
     h, most = 0.1, 2.0
     t = h * (np.arange(21) - 0.5)
     q, v, a = np.zeros((21, 4)), np.zeros((21, 4)), np.zeros((21, 4))
@@ -265,10 +265,16 @@ def test_a_controller_that_joins_samples_otherwise_is_told(tmp_path: Path) -> No
     v[:, 1] = most * (ahead - turn)
     q[:, 1] = most * (ahead**2 / 2 + 10 * h * turn - turn**2 / 2)
     s = np.linspace(0.0, 1.0, 10001)
-    fault = the(checked(tmp_path, t, q, v, a, acceleration=most, share=1e-2), "acceleration", "elbow")
+    fault = the(checked(tmp_path, t, q, v, a, acceleration=most, share=1e-2, rule="quintic"), "acceleration", "elbow")
     assert abs(fault.value or 0.0) == pytest.approx(most * ((1 - 2 * s) * (1 + 5 * s * (1 - s))).max(), rel=1e-6)
     near(fault, 10 * h, h / 2)
     assert checked(tmp_path, t, q, v, a, acceleration=most, share=1e-2, rule="linear").passed
+    for values in ([q, v], [q, v, a]):
+        found = checked(tmp_path, t, *values, acceleration=most)
+        assert found.passed, found
+        row = next(row for row in found.rows if row.name == "acceleration of elbow")
+        assert row.value == pytest.approx(np.copysign(most, row.value), rel=1e-6)
+        assert "no motion through the samples needs" in row.note
     with pytest.raises(ProblemError, match="needs accelerations"):
         checked(tmp_path, t, q, v, rule="quintic")
 
