@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz moving faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -73,6 +73,8 @@ passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularitie
 
 frauds: $(VENV)/test.stamp ## edit eight plans 264 times and audit them: what passes is looked at without the audit (ARGS="--only arm")
 	$(BIN)/python -W ignore -m tests.sweep.frauds --out "$(OUT)/sweeps/frauds.jsonl" $(ARGS)
+moving: $(VENV)/test.stamp ## prove 200 random obstacles that jump, spike and spin clear of an arm, beside coal (ARGS="--only ur5 --count 20")
+	$(BIN)/python -W ignore -m tests.sweep.moving_obstacles --out "$(OUT)/sweeps/moving_obstacles.jsonl" $(ARGS)
 
 faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batches of 500 plans, and fill a disk
 	$(BIN)/python -W ignore -m tests.sweep.faults

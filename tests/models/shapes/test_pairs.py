@@ -18,6 +18,7 @@ from models.shapes.bodies import Body, LinkMesh, bodies_of
 from models.shapes.distance import distance
 from models.shapes.pairs import (
     ALWAYS,
+    ASSUMED,
     COVERED,
     NEIGHBOURS,
     NEVER,
@@ -330,7 +331,7 @@ def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
     for source in (SRDF_TEXT, file, str(file)):
         with pytest.warns(ModelWarning, match="'ghost'"):
             pairs = checked_pairs(robot, bodies, srdf=source, ignored=[("link3", "link0")])
-        assert pairs.checked == ((1, 3),)
+        assert pairs.checked == ((0, 3), (1, 3))
         assert pairs.left["link0", "link2"] == SRDF
         assert pairs.left["link0", "link3"] == TOLD
 
@@ -492,3 +493,33 @@ def test_collision_shapes_become_checked_bodies() -> None:
     )
     robot = Robot(links, joints)
     assert checked_pairs(robot, bodies_of(robot)).checked == ((0, 2),)
+
+
+def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:
+    """Three joints about z between meshes on the axis, cubes of 0.1 m a gap apart; their covers always touch."""
+    links = tuple(Link(f"link{k}") for k in range(4))
+    joints = tuple(Joint(f"j{k}", "revolute", f"link{k}", f"link{k + 1}", axis=(0, 0, 1)) for k in range(3))
+    corners = 0.05 * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    above = corners + np.array([0.0, 0.0, 0.1 + gap])
+    small = [Body(f"link{k}", Sphere(0.01, (9.0, 9.0 * k, 0))) for k in (1, 2)]
+    return Robot(links, joints), (
+        Body("link0", Sphere(1.0, (0, 0, 0)), 0.95, LinkMesh(corners)),
+        *small,
+        Body("link3", Sphere(1.0, (0, 0, 0.1 + gap)), 0.95, LinkMesh(above)),
+    )
+
+
+def test_meshes_are_checked_where_their_covers_always_touch_and_their_hulls_do_not() -> None:
+    robot, bodies = far_meshes(0.02)
+    assert (0, 3) in checked_pairs(robot, bodies).checked
+    robot, bodies = far_meshes(-0.02)
+    found = checked_pairs(robot, bodies)
+    assert (0, 3) not in found.checked
+    assert found.left["link0", "link3"] in ASSUMED
+
+
+def test_a_joint_whose_limits_are_equal_but_for_the_sign_of_zero_is_no_error() -> None:
+    robot, bodies = chain(0.3, 0.3, 0.3, 0.3)
+    low, high = np.full(robot.dof, -3.0), np.full(robot.dof, 3.0)
+    low[0], high[0] = 0.0, -0.0
+    assert checked_pairs(robot, bodies, lower=low, upper=high).checked == ((0, 3), (1, 3))

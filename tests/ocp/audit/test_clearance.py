@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -510,3 +511,50 @@ def test_what_cannot_be_declared(case: str) -> None:
 def test_what_is_no_body(name: str, values: tuple[Any, ...]) -> None:
     with pytest.raises(ProblemError, match=name):
         Hull(*values)
+
+
+def test_pairs_left_out_by_assumption_are_told_where_the_clearance_is(tmp_path: Any) -> None:
+    hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.5, 0.0]]), 0.05)}
+    assumed = {"hand and box": "always touch", **{f"a{k} and b{k}": "always touch" for k in range(5)}}
+    solution = solve(flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1, assumed=assumed), Collocation(6, 3))
+    solution.save(tmp_path / "plan.npz")
+    for each in (solution, Solution.load(tmp_path / "plan.npz")):
+        audit = each.audit()
+        note = audit["clearance"].note
+        assert note.startswith("proven; least ball and post")
+        assert "left out by assumption: hand and box (always touch)" in note
+        assert "2 more" in note
+        assert audit.clearances["clearance"].assumed == assumed
+
+
+@pytest.mark.parametrize(
+    ("motion", "least", "word"),
+    [
+        (lambda t: ca.if_else(ca.fabs(t - 0.40321) < 1e-6, ca.fabs(t - 0.40321) / 1e-6, 1.0), -0.2, "violated"),
+        (lambda t: ca.if_else(ca.fabs(t - 0.40321) < 1e-6, 0.0, 1.0), -0.2, "violated"),
+        (lambda t: 1.0 - 2.0 * (t > 0.40321), -1.2, "not proven.*jumps by up to 2 m at 0.40321 s"),
+        (lambda t: 1.0 / (t - 0.40321), -np.inf, "not proven.*has no bound at 0.40321 s"),
+        (lambda t: ca.fmax(ca.fabs(8 * t - 4) / 8 + 0.5, 0.6), 0.4, "proven"),
+        (lambda t: 0.5 + ca.sqrt(ca.fabs(t - 0.5)), 0.3, "proven"),
+    ],
+    ids=["spike", "jump there and back", "jump past", "pole", "kinks", "root"],
+)
+def test_kinks_are_proven_spikes_of_a_microsecond_are_found_and_jumps_are_named(
+    motion: Any, least: float, word: str
+) -> None:
+    problem = Problem("beside")
+    q = problem.state("q", initial=[0, 0, 0], terminal=[1, 0, 0])
+    u = problem.control("u", 3)
+    problem.horizon(1.0)
+    problem.dynamics(q, u)
+    problem.minimize(ca.sumsqr(u) / 2)
+    post = ca.vertcat(EYE, 0.4, motion(problem.time), 0.0)
+    hulls = {"ball": BALL, "post": Hull(1, np.zeros((1, 3)), 0.1)}
+    problem.separate(
+        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], 0.0,
+        levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
+    )  # fmt: skip
+    found = proof(problem, 3)
+    assert found.worst is not None
+    assert re.match(word, str(found)), str(found)
+    assert found.worst.least == pytest.approx(least, abs=0.02)
