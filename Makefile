@@ -73,6 +73,7 @@ passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularitie
 
 frauds: $(VENV)/test.stamp ## edit eight plans 264 times and audit them: what passes is looked at without the audit (ARGS="--only arm")
 	$(BIN)/python -W ignore -m tests.sweep.frauds --out "$(OUT)/sweeps/frauds.jsonl" $(ARGS)
+
 moving: $(VENV)/test.stamp ## prove 200 random obstacles that jump, spike and spin clear of an arm, beside coal (ARGS="--only ur5 --count 20")
 	$(BIN)/python -W ignore -m tests.sweep.moving_obstacles --out "$(OUT)/sweeps/moving_obstacles.jsonl" $(ARGS)
 

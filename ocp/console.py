@@ -194,10 +194,7 @@ def check_time() -> None:
 
 
 class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate.
-
-    ``meanwhile`` is called at each.
-    """
+    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate."""
 
     def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
@@ -205,7 +202,6 @@ class Progress(ca.Callback):  # type: ignore[misc]
         self.title, self.show = title, show
         self.stopped, self.iterate, self.iterations = "", np.zeros(n), 0
         self.bar: Any = None
-        self.meanwhile: Callable[[], object] = lambda: None
         self.construct("progress", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -229,37 +225,18 @@ class Progress(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arguments: list[Any]) -> list[int]:
-        x, worst = np.asarray(arguments[0].full()).reshape(-1), 0.0
-        if self.is_shown:
-            g = np.asarray(arguments[2].full()).reshape(-1)
-            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-        return [int(not self.may_go_on(x, float(arguments[1]), worst))]
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether there is a line."""
-        return self.bar is not None and not self.bar.disable
-
-    def may_go_on(self, iterate: np.ndarray, cost: float, worst: float) -> bool:
-        """Whether the solver may go on from an iterate (n,), which is kept; its cost and infeasibility are shown."""
         try:
-            if self.is_shown:
-                self.bar.set_postfix_str(f"cost {cost:.6g}, infeasibility {worst:.1e}", refresh=False)
+            if self.bar is not None and not self.bar.disable:
+                g = np.asarray(arguments[2].full()).reshape(-1)
+                worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+                words = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
+                self.bar.set_postfix_str(words, refresh=False)
                 self.bar.update()
             self.stopped = reason_to_stop()
-            self.meanwhile()
         except KeyboardInterrupt:  # CasADi would make another error of it
             self.stopped = INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, iterate
-        return not self.stopped
-
-    def must_end(self) -> bool:
-        """Whether the solver must end inside an iteration."""
-        try:
-            self.stopped = self.stopped or reason_to_stop()
-        except KeyboardInterrupt:
-            self.stopped = INTERRUPTED
-        return bool(self.stopped)
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
+        return [int(bool(self.stopped))]
 
     def close(self) -> None:
         if self.bar is not None:
@@ -269,14 +246,13 @@ class Progress(ca.Callback):  # type: ignore[misc]
 class Watch(ca.Callback):  # type: ignore[misc]
     """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
 
-    For fatrop's plugin, which has no iteration callback. ``meanwhile`` is called at each iterate.
+    For fatrop's plugin, which has no iteration callback.
     """
 
     def __init__(self, n: int, title: str) -> None:
         ca.Callback.__init__(self)
         self.n, self.title, self.stopped = n, title, ""
         self.iterate, self.iterations = np.zeros(n), 0
-        self.meanwhile: Callable[[], object] = lambda: None
         self.construct("watch", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -296,17 +272,12 @@ class Watch(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.n, 1)
 
     def eval(self, arguments: list[Any]) -> list[float]:
-        return [float(self.may_go_on(np.asarray(arguments[0].full()).reshape(-1)))]
-
-    def may_go_on(self, iterate: np.ndarray) -> bool:
-        """Whether the solver may go on from an iterate (n,), which is kept."""
         try:
             self.stopped = self.stopped or reason_to_stop()
-            self.meanwhile()
         except KeyboardInterrupt:
             self.stopped = INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, iterate
-        return not self.stopped
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
+        return [float(not self.stopped)]
 
 
 # ---- CasADi's own words ------------------------------------------------------------------------------------------

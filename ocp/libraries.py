@@ -28,11 +28,12 @@ import casadi as ca
 from models import cache
 from ocp.console import LOG, check_time, quiet
 
-__all__ = ["CompilerError", "Library", "built", "code", "generated", "kept"]
+__all__ = ["CompilerError", "Library", "built", "code", "generated"]
 
 VERSION = "1"  # of what is made of contents
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 """What is not defined is an error here, where it is the end of Python when it is called."""
+LINK = "-lm"  # behind the C
 VECTORS = ("-ftree-vectorize", "-ftree-loop-if-convert", "-fschedule-insns", "-fno-math-errno", "-fno-trapping-math")
 """None of them changes a number, nor takes one for finite: what is none stays none."""
 LARGE = 300_000
@@ -62,17 +63,12 @@ class Library:
     Attributes:
         contents: All that its C follows from, such as serialised functions. text: Makes the C; not called where the
             library is kept.
-        include: Folders of headers. link: What the compiler is told behind the C, such as ``-lm``.
         vectors: Loops become instructions of this machine's processor that do several numbers at once.
-        flags: What the compiler is told of how much to optimize, such as ``-O3``; else little, what is LARGE less.
     """
 
     contents: tuple[str, ...]
     text: Callable[[], str]
-    include: tuple[str, ...] = ()
-    link: tuple[str, ...] = ("-lm",)
     vectors: bool = False
-    flags: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -83,17 +79,16 @@ class Library:
         """
         machine = (platform.machine(), sys.platform, ca.__version__, str(LARGE))
         own = processor() if self.vectors else ()
-        told = (*FLAGS, *own, *self.flags, *self.include, *self.link)
-        return cache.key_of(VERSION, *machine, *compiler(), *told, *self.contents)
+        return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, *own, LINK, *self.contents)
 
 
-def code(functions: Iterable[Any], source: str = "") -> str:
-    """C of casadi Functions, each by its name, with a source behind it.
+def code(functions: Iterable[Any]) -> str:
+    """C of casadi Functions, each by its name.
 
     Raises:
         CompilerError: One of them has no C.
     """
-    return f"{generated(functions, 'unit', header=False)[0]}\n{source}"
+    return generated(functions, "unit", header=False)[0]
 
 
 def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
@@ -118,15 +113,6 @@ def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> li
     return [text.replace("0+ i*0", "0") for text in texts]
 
 
-def kept(library: Library) -> Path | None:
-    """Where a library is kept; None where it is not, or there is no compiler that it could be of."""
-    try:
-        key = library.key
-    except CompilerError:
-        return None
-    return _OWN.get(key) or cache.kept_library(key)
-
-
 def built(library: Library) -> Path:
     """A library, compiled where it is not kept. It is waited for; Ctrl-C and time limits end that.
 
@@ -134,15 +120,15 @@ def built(library: Library) -> Path:
         CompilerError: There is no compiler, or it takes the C for wrong.
         OutOfTime: The time limit is over.
     """
-    return kept(library) or build(library.key, library.text(), library, check_time)
-
-
-def build(key: str, text: str, library: Library, ask: Callable[[], None], nice: int = 0) -> Path:
-    with cache.alone(key, ask):
+    key = library.key
+    found = _OWN.get(key) or cache.kept_library(key)
+    if found is not None:
+        return found
+    with cache.alone(key, check_time):
         found = _OWN.get(key) or cache.kept_library(key)  # another process may have made it meanwhile
         if found is not None:
             return found
-        content = _compiled(text, library, ask, nice)
+        content = _compiled(library)
         found = cache.keep_library(key, content)
     if found is None:  # for this process only
         found = Path(_own_folder().name) / f"{key}.so"
@@ -208,24 +194,24 @@ def _processor(command: str, path: str) -> tuple[str, ...]:
     return (told.decode(errors="replace"), *VECTORS, "-march=native", *wide)
 
 
-def _compiled(text: str, library: Library, ask: Callable[[], Any], nice: int) -> bytes:
-    """What the compiler makes of C. ``ask`` is called every 50 ms, to raise where it is to end.
+def _compiled(library: Library) -> bytes:
+    """What the compiler makes of the C of a library.
 
     Raises:
-        CompilerError: It fails.
+        CompilerError: It fails, or there is no C. OutOfTime: The time limit is over.
     """
+    text = library.text()
     if len(text) > MOST:
         raise CompilerError(f"{len(text)} characters of C are more than {MOST}")
     levels = ("-O2", "-O1") if library.vectors else ("-O1", "-O0")
-    speed = (*(library.flags or (levels[len(text) > LARGE],)), *(processor()[1:] if library.vectors else ()))
+    speed = (levels[len(text) > LARGE], *(processor()[1:] if library.vectors else ()))
     place = Path(tempfile.mkdtemp(prefix="selfmotion-"))
     process = None
     try:
         (place / "unit.c").write_text(text, encoding="utf-8")
-        include = [f"-I{folder}" for folder in library.include]
-        words = [*shlex.split(compiler()[0]), *speed, *FLAGS, *include, "unit.c", "-o", "unit.so", *library.link]
-        process = begun(words, place, nice)
-        if wait(process, ask):
+        words = [*shlex.split(compiler()[0]), *speed, *FLAGS, "unit.c", "-o", "unit.so", LINK]
+        process = begun(words, place)
+        if wait(process):
             told = (place / "words").read_text(errors="replace").strip().splitlines()
             raise CompilerError(f"{words[0]} fails: {told[-1] if told else 'it does not say why'}")
         return (place / "unit.so").read_bytes()
@@ -238,10 +224,10 @@ def _compiled(text: str, library: Library, ask: Callable[[], Any], nice: int) ->
         shutil.rmtree(place, ignore_errors=True)
 
 
-def begun(words: list[str], place: Path, nice: int) -> subprocess.Popen[bytes]:
+def begun(words: list[str], place: Path) -> subprocess.Popen[bytes]:
     """A command that runs in a folder, where what it says is kept too, until its input is closed."""
     with open(place / "words", "wb") as told:
-        process = subprocess.Popen(
+        return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],
             cwd=place,
             env={**os.environ, "TMPDIR": str(place)},
@@ -250,15 +236,12 @@ def begun(words: list[str], place: Path, nice: int) -> subprocess.Popen[bytes]:
             stderr=told,
             start_new_session=True,
         )
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PGRP, process.pid, nice)
-    return process
 
 
-def wait(process: subprocess.Popen[bytes], ask: Callable[[], Any]) -> int:
-    """The exit status of a process. ``ask`` is called every 50 ms, and may raise."""
+def wait(process: subprocess.Popen[bytes]) -> int:
+    """The exit status of a process. The time limit is looked at every 50 ms."""
     while True:
-        ask()
+        check_time()
         with suppress(subprocess.TimeoutExpired):
             return process.wait(0.05)
 

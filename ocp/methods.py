@@ -41,9 +41,9 @@ class Method(Protocol):
         self,
         problem: Problem,
         *,
-        solver: str = "auto",
+        solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool | str = "auto",
+        compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedProblem:
         """Build a problem once, to be solved many times; see :func:`prepare`."""
@@ -55,29 +55,24 @@ def prepare(
     problem: Problem,
     method: Method,
     *,
-    solver: str = "auto",
+    solver: str = "ipopt",
     options: ByName = None,
-    compiled: bool | str = "auto",
+    compiled: bool = False,
     scaling: bool = True,
 ) -> PreparedProblem:
     """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
 
     Args:
         problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt``, ``native`` (an interior-point method of our own from stage to stage: built and solved in a
-            time that grows with the intervals alone; needs a C compiler once a machine), ``fatrop`` (another such
-            method, by CasADi's plugin, slow to build; takes no coupling of controls at the end) or ``sleqp`` (an
-            active-set method, to confirm a plan, started there). Where ``native`` cannot be had, fails or misses its
-            tolerance, it is ipopt that solves; ``Solution.solver`` says which did. ``auto`` is ``native``, but ipopt
-            while that is being compiled, or where options are given. For the indirect method, of the direct solution
-            that seeds it.
+        solver: ``ipopt``, ``fatrop`` (another interior-point method, whose linear algebra goes from stage to stage;
+            slow to build, and takes no coupling of controls at the end) or ``sleqp`` (an active-set method, to confirm
+            a plan, started there). For the indirect method, of the direct solution that seeds it.
         options: Passed to the solver, for example ``{"max_iter": 500}``.
         compiled: Whether the functions of the problem and their derivatives go through the machine's C compiler (that
             of the environment's CC, else cc), which makes solves several times faster and changes no number. What was
-            compiled is kept for all meshes, processes and runs (``selfmotion cache``). True: now, which takes seconds.
-            False: never. ``auto``: what is kept is taken, and the rest is compiled in the background once solves have
-            taken longer than that is expected to. Without a compiler functions are interpreted, which is told once;
-            for sleqp they always are.
+            compiled is kept for all meshes, processes and runs (``selfmotion cache``); what is not kept is compiled
+            first, which takes seconds. Without a compiler functions are interpreted, which is told once; for sleqp
+            they always are.
         scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where
             these are far from 1; all that is reported stays in the units of the problem.
 
@@ -89,9 +84,7 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    if not isinstance(compiled, bool | np.bool_) and not (isinstance(compiled, str) and compiled == "auto"):
-        words = f"prepare: compiled must be True, False or 'auto', not {compiled!r}"
-        raise ProblemError(words, name="compiled", value=compiled)
+    checked_flag("prepare: compiled", compiled)
     checked_flag("prepare: scaling", scaling)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
@@ -102,7 +95,7 @@ def solve(
     method: Method,
     *,
     parameters: ByName = None,
-    solver: str = "auto",
+    solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
     check: bool = True,

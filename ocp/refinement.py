@@ -52,7 +52,7 @@ def refine(
     breaks: Sequence[float] = (),
     max_intervals: int = MOST_INTERVALS,
     parameters: ByName = None,
-    solver: str = "auto",
+    solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
     time_limit: float | None = None,

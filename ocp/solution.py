@@ -140,7 +140,7 @@ class Solution:
     Attributes:
         name: Name of the problem.
         method: What solved it, as a dictionary of its settings.
-        solver: What solved it: ``ipopt``, ``native``, ``fatrop``, ..., ``newton`` beside an earlier plan.
+        solver: What solved it: ``ipopt``, ``fatrop``, ..., ``newton`` beside an earlier plan.
         success: Whether the solver reports an optimum within its tolerance.
         status: The solver's word, with what to try where it failed.
         cost: Value of the cost. iterations: of the solver. horizon: Final time, s.

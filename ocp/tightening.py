@@ -33,7 +33,7 @@ def tighten(
     *,
     tolerance: float = 1e-6,
     parameters: ByName = None,
-    solver: str = "auto",
+    solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
     time_limit: float | None = None,

@@ -21,7 +21,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PARTS = (
     "build_and_solve",
     "costate_rate",
-    "native",
     "optimal_control",
     "arms",
     "audit",

@@ -24,7 +24,6 @@ import numpy as np
 
 from models.errors import ModelError
 from ocp.batch.content import Parcel, digest_of, packed, text_of, unpacked
-from ocp.direct.native import is_ready
 from ocp.errors import Detailed, ProblemError
 
 __all__ = [
@@ -70,7 +69,6 @@ def attempt(function: Function, task: str, near: bool, guess: Parcel | None) -> 
         Broken: There is no room on the disk.
     """
     with _ONE:
-        is_ready()  # or the first results would be another solver's, whose last digits differ
         began = time.perf_counter()
         _INPUTS.clear()
         try:

@@ -45,10 +45,9 @@ IPOPT = {
     "sb": "yes",
 }
 FATROP = {"tol": 1e-10, "print_level": 0, "max_iter": 1000}
-NATIVE = {"tol": 1e-10, "acceptable_tol": 1e-8, "acceptable_iter": 10, "max_iter": 120}
 SLEQP = {"print_level": 0, "max_iter": 1000}
-DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "native": NATIVE, "fatrop": FATROP, "sleqp": SLEQP}
-SOLVERS = ("auto", *DEFAULTS)
+DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp": SLEQP}
+SOLVERS = tuple(DEFAULTS)
 """What may be asked for."""
 
 ADVICE = {
@@ -66,7 +65,7 @@ ADVICE = {
 }
 FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
 FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
-KINDS = {"IpoptInterface": "ipopt", "NativeSolver": "native", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
+KINDS = {"IpoptInterface": "ipopt", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
 """Names of solvers by the class that calls them."""
 HUGE = 1e20
 ROUNDING = 1e-8  # of the residuals at which ipopt cannot move any more, relative to variables and multipliers
@@ -260,9 +259,7 @@ def tell(words: str) -> None:
 
 
 def regularised(stats: dict[str, Any]) -> bool:
-    """Whether ipopt changed the Hessian in its last step, or made no step; native looks, and fatrop does not tell."""
-    if "regularised" in stats:
-        return bool(stats["regularised"])
+    """Whether ipopt changed the Hessian in its last step, or made no step; fatrop does not tell."""
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 

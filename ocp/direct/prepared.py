@@ -9,40 +9,30 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from ocp.console import INTERRUPTED, LOG, OUT_OF_TIME, Progress, interruptible, limited
+from ocp.console import INTERRUPTED, OUT_OF_TIME, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.compiled import Blocks, stop_compiling
+from ocp.direct.compiled import block_derivatives
 from ocp.direct.controller import write_controller
 from ocp.direct.diagnosis import diagnosis, elastic_plan
 from ocp.direct.fragment import Fragment
 from ocp.direct.guess import initial_point, later, names_told
 from ocp.direct.kkt import held_by
 from ocp.direct.known import Known
-from ocp.direct.native import NativeSolver, checked_options, is_at_hand, why_not
-from ocp.direct.nlp import (
-    DEFAULTS,
-    SOLVERS,
-    Outcome,
-    broken_down,
-    build_solver,
-    call_solver,
-    largest_number_of_iterations,
-)
+from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
 from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.direct.starts import ELASTIC, GUESS, other_starts
 from ocp.errors import (
     NOT_NUMBERS,
     Interrupted,
     ProblemError,
-    SolveError,
     about,
     checked_choice,
     checked_count,
@@ -96,9 +86,9 @@ class DirectMethod(ABC):
         self,
         problem: Problem,
         *,
-        solver: str = "auto",
+        solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool | str = "auto",
+        compiled: bool = False,
         scaling: bool = True,
     ) -> Prepared:
         """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
@@ -184,7 +174,7 @@ class Prepared:
 
     Attributes:
         formulation, fragment, program: What was built.
-        solver_name: The solver, ``ipopt`` where ``native`` cannot be had.
+        solver_name: The solver.
         seconds: Wall time of the build.
     """
 
@@ -194,7 +184,7 @@ class Prepared:
         method: DirectMethod,
         solver: str,
         options: ByName,
-        compiled: bool | str = "auto",
+        compiled: bool = False,
         scaling: bool = True,
     ) -> None:
         began = time.monotonic()
@@ -203,59 +193,27 @@ class Prepared:
         checked_choice("solver", solver, SOLVERS)
         own = checked_mapping("options", options)
         self._own_options, self._scaling = own, scaling
-        self.solver_name = chosen(solver, own, self.formulation)
-        try:
-            self._make(compiled)
-        except ProblemError as error:  # of stages, else it comes again
-            if self.solver_name != "native":
-                raise
-            self.solver_name = no_native(self.formulation, str(error))
-            self._make(compiled)
+        self.solver_name = solver
+        self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
+        # sleqp asks for products with the Hessian, which compiled functions do not have
+        blocks = block_derivatives(self.fragment, compiled and solver != "sleqp")
+        self.program = assemble(self.fragment, self.formulation.np, blocks)
+        self._solver, self._progress = self._built_solver(own)
+        self._pattern = Pattern(self.formulation, self.fragment, self.program)
+        self._known = Known(self.formulation, self.fragment, self.program)
         self._most = largest_number_of_iterations(self.solver_name, own)
         self._made_of = problem, method, solver, options, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
         self.seconds = time.monotonic() - began
-
-    def _make(self, compiled: bool | str) -> None:
-        """The fragment, and the rest of it."""
-        self.fragment = self.method.transcribe(self.formulation, staged=self.solver_name in ("native", "fatrop"))
-        # sleqp asks for products with the Hessian, which compiled functions do not have
-        self._blocks = Blocks(self.fragment, compiled if self.solver_name != "sleqp" else False)
-        self._build()
-
-    def _build(self) -> None:
-        """The program and its solver, of the functions of the blocks that are at hand."""
-        form, fragment = self.formulation, self.fragment
-        for made_of_others in ("scaled", "_ipopt", "_newton"):
-            self.__dict__.pop(made_of_others, None)
-        self.program = assemble(fragment, form.np, self._blocks.functions)
-        self._solver, self._progress = self._built_solver(self.solver_name, self._own_options)
-        self._pattern = Pattern(form, fragment, self.program)
-        self._known = Known(form, fragment, self.program)
 
     @cached_property
     def scaled(self) -> Program:
         """The program as it is solved, see :func:`ocp.direct.scaling.scaled_program`."""
         return scaled_program(self.program)
 
-    @property
-    def second(self) -> str:
-        """The solver that goes on where the first one fails."""
-        return "ipopt" if self.solver_name == "native" else self.solver_name
-
-    @cached_property
-    def _ipopt(self) -> tuple[Any, Any]:
-        """The second solver, for the same start."""
-        return self._built_solver(self.second, self._own_options)
-
-    def _built_solver(self, solver: str, options: dict[str, Any]) -> tuple[Any, Any]:
-        """A solver, and what ends it where it must end."""
-        fragment, title = self.fragment, self.problem.name
-        if solver != "native":
-            return build_solver(self.scaled, solver, options, fragment.stages, title)
-        form, own = self.formulation, {**DEFAULTS["native"], **options}
-        progress = Progress(fragment.size, fragment.n_rows, form.np, title, show=True)
-        return NativeSolver(form, fragment, self._blocks.functions, own, progress), progress
+    def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
+        """The solver with some options, and what ends it where it must end."""
+        return build_solver(self.scaled, self.solver_name, options, self.fragment.stages, self.problem.name)
 
     def __reduce__(self) -> Any:
         """Pickled and copied as what it was prepared of, to be prepared again."""
@@ -279,7 +237,7 @@ class Prepared:
         and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
         From a plan of this problem, method and mesh, the limits that push there are held first, and the others let go,
         which takes a few steps of Newton's; then those that come out of it (:mod:`ocp.direct.active_set`;
-        ``Solution.solver`` is ``newton``). Where that ends nowhere, ipopt or native begins from the guess as ever.
+        ``Solution.solver`` is ``newton``). Where that ends nowhere, ipopt begins from the guess as ever.
         ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
         ``shift`` is by how many intervals a receding horizon has moved on since such a plan: each interval then begins
         from what the plan has so many intervals later, its limits and multipliers too, and the last ones from their
@@ -288,20 +246,12 @@ class Prepared:
         Raises:
             ProblemError: Wrong arguments. SolveError: There is no plan, and why.
         """
-        if "_plain" in self.__dict__ and tighter is None and self._plain._fits(guess):
-            return self._plain.solve(parameters, guess, check, None, time_limit, shift=shift)
         ahead = checked_count("solve: shift", shift, least=0, most=self.method.intervals - 1)
         if ahead and not (self._fits(guess) and self.method.mesh is None):
             words = "solve: shift asks for a plan of this very problem, method and mesh, of equal intervals, as guess"
             raise ProblemError(words, name="shift", value=shift)
         with limited(checked_time_limit(time_limit)), self._lock:
-            if self._blocks.seconds > self.seconds and self._blocks.renewed():
-                self._build()
-            try:
-                return self._solve(parameters, guess, check, tighter, ahead)
-            except KeyboardInterrupt:
-                stop_compiling()
-                raise
+            return self._solve(parameters, guess, check, tighter, ahead)
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
@@ -343,10 +293,6 @@ class Prepared:
             point = guess.variables[later(fragment, ahead)[0]]
         told = names_told(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
-        if self.solver_name == "native" and not self._is_enough(first):
-            if tighter is None:
-                return self._handed_over(first, parameters, self._moved(point, p) if ahead else guess, check)
-            first = self._confirmed(first, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
         attempts, left = [first], self._most
@@ -397,40 +343,6 @@ class Prepared:
             "ubg": upper[fragment.row_bounds],
         }
 
-    def _is_enough(self, first: Attempt) -> bool:
-        """Whether native met its tolerance, or ended as it was asked to."""
-        status = first.outcome.status
-        asked = "max_iter" in self._own_options and status.startswith("Maximum_Iterations_Exceeded")
-        return status == "Solve_Succeeded" or status.startswith(OUT_OF_TIME) or asked
-
-    @cached_property
-    def _plain(self) -> Prepared:
-        """The same for ipopt, without stages, of which it would have more variables and take more iterations."""
-        return Prepared(self.problem, self.method, "ipopt", self._own_options, self._made_of[4], self._scaling)
-
-    def _moved(self, point: np.ndarray, p: np.ndarray) -> Solution:
-        """A start of this program as a guess for any."""
-        cost, rows = self.program.numbers.values(point, p)
-        return self._solution(Outcome(point, cost, rows, np.zeros(rows.shape), False, "", 0, 0.0), p, GUESS)
-
-    def _handed_over(self, first: Attempt, parameters: ByName, guess: Guess, check: bool) -> Solution:
-        """What ipopt finds; what native did, where that is a plan and ipopt finds none."""
-        try:
-            found = self._plain.solve(parameters, guess, check)
-        except SolveError:
-            if first.found is None:
-                raise
-            return first.found
-        if first.found is not None and not found.success:
-            return first.found
-        seconds = {"build": self.seconds, "solve": first.outcome.seconds + found.seconds["solve"]}
-        return dataclasses.replace(found, seconds=seconds)
-
-    def _confirmed(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> Attempt:
-        """What ipopt finds from the same start with bounds of this very program; what native did, where that is all."""
-        second = self._attempt(GUESS, first.arguments["x0"], first.told, arguments, bounds, self._ipopt)
-        return second if second.found is not None or first.found is None else first
-
     def _fits(self, guess: Guess) -> bool:
         """Whether a guess is a plan of this very program, by its method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self._told_method:
@@ -441,7 +353,7 @@ class Prepared:
     def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, ahead: int) -> Solution | None:
         """The plan beside the guess, moved on by ``ahead`` intervals; None where it is not found near it."""
         form = self.formulation
-        if not isinstance(guess, Solution) or not self._fits(guess) or self.solver_name not in ("ipopt", "native"):
+        if not isinstance(guess, Solution) or not self._fits(guess) or self.solver_name != "ipopt":
             return None
         if guess.regularised or not guess.success:
             return None
@@ -462,7 +374,6 @@ class Prepared:
                 outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
             if outcome is None or not outcome.success:
                 return None
-            self._blocks.worked(outcome.seconds)
             return self._solution(outcome, arguments["p"], GUESS)
         except (ProblemError, RuntimeError):  # parameters that this problem refuses; an integrator that breaks down
             return None
@@ -474,7 +385,7 @@ class Prepared:
 
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
-        return self._built_solver(self.second, {**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)})
+        return self._built_solver({**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)})
 
     def _attempt(
         self,
@@ -496,11 +407,9 @@ class Prepared:
         own = scales.inside(relaxed)
         run, progress = solver or (self._solver, self._progress)
         try:
-            progress.meanwhile = partial(self._blocks.working, time.monotonic())
             outcome = call_solver(run, progress, own)
         except RuntimeError as error:
             outcome = broken_down(run, own, error)
-        self._blocks.worked(outcome.seconds)
         outcome = scales.outside(outcome)
         outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
         try:
@@ -654,27 +563,6 @@ class Attempt:
     def __str__(self) -> str:
         word = self.outcome.status.partition(":")[0]
         return f"from the {self.start}: {word} after {self.outcome.iterations} iterations"
-
-
-def chosen(solver: str, options: Mapping[str, Any], form: Formulation) -> str:
-    """The solver that begins: for ``auto`` native where its driver is at hand and no options of ipopt are given.
-
-    Raises:
-        ProblemError: An option that native does not take.
-    """
-    if solver == "auto":
-        return "native" if not options and is_at_hand() else "ipopt"
-    if solver == "native":
-        checked_options(options)
-        why = why_not()
-        return no_native(form, why) if why else solver
-    return solver
-
-
-def no_native(form: Formulation, why: str) -> str:
-    """The solver in its place, which is told."""
-    LOG.info("problem %r is solved by ipopt, not by native: %s", form.name, why)
-    return "ipopt"
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

@@ -17,7 +17,6 @@ import scipy.sparse.linalg as sla
 
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.collocation import Collocation
-from ocp.direct.compiled import Blocks
 from ocp.direct.fragment import Fragment
 from ocp.direct.kkt import Conditions, conditions
 from ocp.direct.nlp import Outcome
@@ -167,7 +166,7 @@ def program_of(solution: Solution) -> Built:
         words = f"{what}: it is no solution of its problem by its method"
         raise ProblemError(words, name="variables", value=len(solution.variables), limit=fragment.size)
     p = form.parameter_vector(solution.parameters)
-    program = assemble(fragment, form.np, Blocks(fragment, "auto").functions)
+    program = assemble(fragment, form.np)
     return Built(form, fragment, program, solution.variables, p, *bounds_to_solve(form, p))
 
 

@@ -80,9 +80,9 @@ class Indirect:
         self,
         problem: Problem,
         *,
-        solver: str = "auto",
+        solver: str = "ipopt",
         options: ByName = None,
-        compiled: bool | str = "auto",
+        compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedIndirect:
         """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.

@@ -23,7 +23,7 @@ from scripts import drawing
 from scripts.papers.run import text_table
 from scripts.robots.panda import HOME, LAP, circling
 from scripts.robots.robots import PANDA
-from scripts.timing.native import least
+from scripts.timing.measure import least_of_processor as least
 from scripts.timing.optimal_control import installed
 from scripts.timing.schedules import JOINTS, Along, largest, peer_row
 

@@ -56,6 +56,16 @@ def least(work: Callable[[], Any], repeats: int) -> float:
     return min(timed(work)[1] for _ in range(repeats))
 
 
+def least_of_processor(work: Callable[[], Any], repeats: int) -> float:
+    """Least time of the processor of a number of runs, s."""
+    times = []
+    for _ in range(max(1, repeats)):
+        began = time.process_time()
+        work()
+        times.append(time.process_time() - began)
+    return min(times)
+
+
 def median(work: Callable[[], Any], repeats: int) -> float:
     """Median wall time of a number of runs, s."""
     return float(np.median([timed(work)[1] for _ in range(repeats)]))

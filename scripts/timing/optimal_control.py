@@ -2,7 +2,7 @@
 
 Every tool runs in a process of its own, on finer and finer meshes, until it comes as near to the optimum as rounding
 allows or has had its time. What is not installed is left out. Times are of the processor: posing and solving, and
-solving again with another parameter from the plan before, without what is made once (imports, compiled functions).
+solving again with another parameter from the plan before, without the imports.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ASKED = 1e-6
 """Relative error of the cost at which times are compared."""
 DISTRIBUTIONS = {"rockit": "rockit-meco", "Dymos": "dymos", "Drake": "drake"}
 README_MARKS = ("<!-- made by scripts/benchmark.py -->", "<!-- end -->")
-MARKS = dict(zip(TOOLS, zip("osD^v", ("blue", "sky", "orange", "green", "purple"), strict=True), strict=True))
+MARKS = dict(zip(TOOLS, zip("oD^v", ("blue", "orange", "green", "purple"), strict=True), strict=True))
 
 
 def run(repeats: int = 5) -> dict[str, Any]:
@@ -128,8 +128,8 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
     problems = [name for name in STATEMENTS if any(row["problem"] == name for row in rows)]
     note = (
         "Filled: posed and solved; hollow: solved again with another parameter from the plan before. Meshes of "
-        f"{', '.join(map(str, MESHES))} intervals; time of the processor of one run, imports and compiled functions at "
-        "hand. Same formulas, guess and degree (Drake: cubic), IPOPT at 1e-9 (Dymos: SLSQP; Drake: SNOPT, else IPOPT)."
+        f"{', '.join(map(str, MESHES))} intervals; time of the processor of one run, without imports. "
+        "Same formulas, guess and degree (Drake: cubic), IPOPT at 1e-9 (Dymos: SLSQP; Drake: SNOPT, else IPOPT)."
     )
     with drawing.sheet(path, (2, 3), (9.0, 6.0), note) as (figure, axes):
         for axis, problem in zip(axes.ravel(), problems, strict=False):

@@ -35,25 +35,16 @@ Posed: TypeAlias = tuple[Callable[[float], float], str]
 
 
 def selfmotion(statement: Statement, intervals: int) -> Posed:
-    """By the native solver, its functions compiled before."""
-    return _selfmotion(statement, intervals, solver="native", compiled=True)
-
-
-def by_ipopt(statement: Statement, intervals: int) -> Posed:
-    """As without a compiler: by ipopt, functions interpreted."""
-    return _selfmotion(statement, intervals, solver="ipopt", compiled=False)
-
-
-def _selfmotion(statement: Statement, intervals: int, **how: Any) -> Posed:
+    """By ipopt, functions interpreted, as by default."""
     method = Collocation(intervals, DEGREE, control="held" if statement.held else "points")
-    prepared, last = prepare(statement.problem, method, options={"tol": TOLERANCE}, **how), list[Any]()
+    prepared, last = prepare(statement.problem, method, options={"tol": TOLERANCE}), list[Any]()
 
     def solve(p: float) -> float:
         plan = prepared.solve({"p": p}, last[0] if last else None)
         last[:] = [plan]
         return float(plan.cost)
 
-    return solve, f"Radau {DEGREE}, {how['solver']}"
+    return solve, f"Radau {DEGREE}, ipopt"
 
 
 def rockit(statement: Statement, intervals: int) -> Posed:
@@ -362,7 +353,7 @@ def _terminal_slope(statement: Statement) -> Any:
     return ca.substitute(ca.jacobian(statement.formulas["terminal"](x, horizon), both), both, ca.DM.zeros(form.nx + 1))
 
 
-TOOLS = {"selfmotion": selfmotion, "selfmotion, ipopt": by_ipopt, "rockit": rockit, "Dymos": dymos, "Drake": drake}
+TOOLS = {"selfmotion": selfmotion, "rockit": rockit, "Dymos": dymos, "Drake": drake}
 
 
 @contextlib.contextmanager
@@ -397,7 +388,7 @@ def main(tool: str, name: str, *meshes: str) -> int:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)  # some write reports
         with contextlib.suppress(Exception):
-            measured(tool, statement, 5)  # imports; compiled functions
+            measured(tool, statement, 5)  # imports
         for intervals in map(int, meshes):
             try:
                 row = measured(tool, statement, intervals)

@@ -34,6 +34,15 @@ CVODES: dict[str, Method] = {
 METHODS = {**COLLOCATIONS, **SHOOTINGS}
 EVERY_METHOD = {**METHODS, **CVODES}
 
+# the same on more intervals
+FINE: dict[str, Method] = {
+    "radau": Collocation(10),
+    "radau-held": Collocation(10, 2, control="held"),
+    "legendre": Collocation(10, scheme="legendre"),
+    "rk4-held": MultipleShooting(12, steps=2),
+    "rk4-linear": MultipleShooting(12, steps=2, control="linear"),
+}
+
 
 def plant(
     name: str,
@@ -186,3 +195,21 @@ def relative(value: Any, reference: Any) -> float:
     """Largest difference, relative to the largest entry of the reference (at least 1)."""
     reference = np.asarray(reference)
     return float(np.max(np.abs(np.asarray(value) - reference)) / max(1.0, float(np.max(np.abs(reference)))))
+
+
+def moved() -> Problem:
+    """Bounds, an end and a horizon that are parameters; a cost of the end."""
+    problem = Problem("moved")
+    x, v = problem.state("x", initial=0.0), problem.state("v", initial=0.0, upper=problem.parameter("fastest"))
+    u = problem.control("u", lower=-problem.parameter("strength"), upper=2.0)
+    problem.dynamics(x, v)
+    problem.dynamics(v, u - 0.3 * v * ca.fabs(v) - ca.sin(x))
+    problem.horizon(problem.parameter("duration"))
+    way = problem.parameter("way")
+    problem.end("there", x, way, way)
+    problem.path("power", u * v, upper=0.8)
+    problem.minimize(running=u**2, terminal=v**2)
+    return problem
+
+
+MOVED = {"fastest": 0.75, "strength": 1.0, "duration": 3.0, "way": 1.4}

@@ -19,7 +19,6 @@ from ocp import ProblemError, SolveError
 from ocp.batch import BatchError, kept, read_batch, run_batch
 from ocp.batch.ledger import Ledger
 from ocp.batch.run import source_version
-from ocp.direct.native import is_ready
 from tests.ocp.batch import functions
 from tests.ocp.batch.drivers import ROOT, children_of, count, driver, runs, stored, until, workers_of
 
@@ -118,7 +117,7 @@ def test_tasks_begin_from_the_results_of_neighbours_the_same_whoever_does_them(t
         assert result.cost == own[result.key].cost
         if result.neighbour is not None:
             assert result.value["guess"] == by_key[result.neighbour].task["mass"]
-    assert cold[0].value["solver"] == ("native" if is_ready() else "ipopt")
+    assert cold[0].value["solver"] == "ipopt"
     assert {result.value["solver"] for result in alone if result.neighbour is not None} == {"newton"}
 
 

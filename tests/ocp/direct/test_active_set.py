@@ -12,8 +12,7 @@ import pytest
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, prepare
 from ocp.direct.guess import later
 from ocp.direct.prepared import Prepared
-from tests.ocp.direct.test_native import FINE, MOVED, moved
-from tests.ocp.problems import Method, relative, van_der_pol
+from tests.ocp.problems import FINE, MOVED, SOLVERS, Method, moved, relative, van_der_pol
 
 
 def ready(problem: Problem, method: Method, solver: str = "ipopt") -> Prepared:
@@ -41,12 +40,9 @@ def test_from_the_last_plan_a_few_steps_lead_to_the_next(name: str, method: str)
             assert plan.solver == "newton"
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "native"])
 @pytest.mark.parametrize("change", [{"fastest": 0.7}, {"strength": 0.5}, {"way": 1.2}, {"fastest": 0.8}], ids=str)
-def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(
-    solver: str, change: dict[str, float]
-) -> None:
-    prepared = ready(moved(), FINE["radau"], solver)
+def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(change: dict[str, float]) -> None:
+    prepared = ready(moved(), FINE["radau"])
     near = prepared.solve(MOVED)
     cold = prepared.solve(MOVED | change)
     began = time.monotonic()
@@ -225,7 +221,7 @@ def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -
 
 
 @pytest.mark.parametrize("method", FINE)
-@pytest.mark.parametrize("solver", ["ipopt", "native"])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_what_is_later_stands_for_the_same_so_many_intervals_later(method: str, solver: str) -> None:
     fragment = ready(van_der_pol(), FINE[method], solver).fragment
     n = len(fragment.mesh) - 1

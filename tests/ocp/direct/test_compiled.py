@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,7 @@ from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, p
 from ocp.console import OutOfTime, limited
 from ocp.direct import compiled
 from ocp.direct.assembly import Derivatives, derivatives
-from ocp.direct.compiled import Background, stop_compiling
-from ocp.direct.native import why_not
-from ocp.libraries import CompilerError, Library, built, code, kept
+from ocp.libraries import CompilerError, Library, built
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
@@ -38,7 +37,6 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and notices that have not been given yet."""
-    why_not()  # native's driver is not made beside
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     libraries.notice.cache_clear()
     return tmp_path / "cache" / "selfmotion"
@@ -70,7 +68,7 @@ def script(file: Path, lines: str) -> str:
 
 
 def is_compiled(prepared: Any) -> bool:
-    return any(each.value.class_name() == "External" for each in prepared._blocks.functions)
+    return any(each.class_name() == "External" for each in prepared.program.gradient.find_functions())
 
 
 # ---- the same numbers --------------------------------------------------------------------------------------------
@@ -100,7 +98,7 @@ def test_compiled_functions_are_the_interpreted_ones_to_the_last_bit(shared: Pat
     random = np.random.default_rng(0)
     seen = 0
     blocks = method.transcribe(form).blocks
-    for block, own in zip(blocks, compiled.Blocks(method.transcribe(form), True).functions, strict=True):
+    for block, own in zip(blocks, compiled.block_derivatives(method.transcribe(form), True), strict=True):
         for name, plain, other in zip(Derivatives._fields, derivatives(block.function), own, strict=True):
             seen += other.class_name() == "External"
             for _ in range(5):
@@ -172,11 +170,10 @@ def test_what_has_no_c_is_interpreted(own: Path, caplog: pytest.LogCaptureFixtur
 
 
 ALONE = """
-import ctypes, sys, time, types
+import ctypes, sys, threading, time, types
 for face in ("models", "ocp"):  # what the faces show is not needed, and takes a second
     sys.modules[face] = types.ModuleType(face)
     sys.modules[face].__path__ = [face]
-from ocp.direct.compiled import Background
 from ocp.libraries import Library, built
 def number(value):
     return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
@@ -187,11 +184,10 @@ COUNTED = 'echo once >> "$(dirname "$0")/count"; exec cc "$@"'
 def test_meshes_share_what_is_compiled(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "counted", COUNTED))
     for method in (Collocation(3), Collocation(9), Collocation(2, mesh=(0.0, 0.1, 1.0))):
-        prepared = prepare(van_der_pol(), method, solver="ipopt", compiled=True)
+        prepared = prepare(van_der_pol(), method, compiled=True)
         assert is_compiled(prepared)
         assert prepared.solve().success
-    assert is_compiled(prepare(van_der_pol(), Collocation(5), solver="ipopt"))  # what is kept is taken
-    assert not is_compiled(prepare(van_der_pol(), Collocation(5), solver="ipopt", compiled=False))
+    assert not is_compiled(prepare(van_der_pol(), Collocation(5)))  # kept or not
     assert (tmp_path / "count").read_text().split() == ["once"]
 
 
@@ -208,9 +204,7 @@ def test_compilers_flags_and_contents_are_told_apart(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = number(1), number(2)
-    words = ("-lx",)
-    others = (replace(one, include=words), replace(one, link=words), replace(one, vectors=True))
-    keys = [library.key for library in (one, two, *others)]
+    keys = [library.key for library in (one, two, replace(one, vectors=True))]
     monkeypatch.setenv("CC", script(tmp_path / "another", COUNTED))
     keys.append(one.key)
     newer = (tmp_path / "another").read_text().replace("ours 1", "ours 2")
@@ -218,7 +212,7 @@ def test_compilers_flags_and_contents_are_told_apart(
     assert one.key == keys[-1]  # asked once a process for its version
     libraries._version.cache_clear()
     keys.append(one.key)
-    assert len(set(keys)) == len(keys) == 7
+    assert len(set(keys)) == len(keys) == 5
 
 
 # ---- what goes wrong ---------------------------------------------------------------------------------------------
@@ -230,7 +224,7 @@ def test_a_damaged_file_is_made_again(own: Path, damage: bytes | None) -> None:
     whole = library.read_bytes()
     library.unlink()  # Python has not loaded it
     library.write_bytes(whole[:-1] + b"x" if damage is None else damage)
-    assert kept(number(4)) is None
+    assert cache.kept_library(number(4).key) is None
     assert told(built(number(4))) == 4
     assert [file.read_bytes() for file in own.iterdir()] == [whole]
 
@@ -239,9 +233,9 @@ def test_without_a_folder_it_is_compiled_for_the_process(tmp_path: Path, monkeyp
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setenv("CC", script(tmp_path / "counted", COUNTED))
-    hows = (True, True, "auto", False)
-    plans = [prepare(van_der_pol(), Collocation(3), solver="ipopt", compiled=how) for how in hows]
-    assert [is_compiled(plan) for plan in plans] == [True, True, True, False]
+    hows = (True, True, False)
+    plans = [prepare(van_der_pol(), Collocation(3), compiled=how) for how in hows]
+    assert [is_compiled(plan) for plan in plans] == [True, True, False]
     assert (tmp_path / "count").read_text().split() == ["once"]
 
 
@@ -255,7 +249,7 @@ def test_a_folder_that_may_only_be_read_serves(own: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(cache, "NamedTemporaryFile", refused)
     assert built(number(5)) == library
     assert told(built(number(6))) == 6
-    assert kept(number(6)) != library
+    assert built(number(6)) != library
 
 
 @pytest.mark.parametrize("words", ["false", "no-such-compiler", "'", " "])
@@ -263,12 +257,31 @@ def test_without_a_compiler_the_numbers_are_the_same_and_one_line_says_so(
     own: Path, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("CC", words)
-    plans = [prepare(van_der_pol(), Collocation(4), compiled=how).solve() for how in (True, True, "auto", False)]
+    plans = [prepare(van_der_pol(), Collocation(4), compiled=how).solve() for how in (True, True, False)]
     for plan in plans[:-1]:
         np.testing.assert_array_equal(plan.variables, plans[-1].variables)
     (record,) = (record for record in caplog.records if record.levelno >= logging.WARNING)
     assert "no C compiler" in record.getMessage()
     assert not own.exists()
+
+
+@pytest.mark.parametrize("compiler", ["cc", "false"])
+def test_the_solver_and_its_numbers_depend_on_no_cache_and_no_compiler(
+    own: Path, compiler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before something is compiled, by a compiled solve and after it; what is not asked for is not compiled."""
+    monkeypatch.setenv("CC", compiler)
+    plans = []
+    problem, method = van_der_pol(), Collocation(6)
+    for make in (prepare, partial(prepare, compiled=True), prepare):
+        prepared = make(problem, method)
+        assert is_compiled(prepared) == (make is not prepare and compiler == "cc")
+        plans.append(prepared.solve())
+        if len(plans) == 1:
+            assert not own.exists()
+        assert plans[-1].solver == "ipopt"
+        assert plans[-1].iterations == plans[0].iterations
+        np.testing.assert_array_equal(plans[-1].variables, plans[0].variables)
 
 
 def test_a_compiler_that_fails_is_told_of_and_not_asked_again(
@@ -294,20 +307,21 @@ def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert kept(number(9)) is None
+    key = number(9).key
+    assert cache.kept_library(key) is None
     library = built(number(9))
-    assert kept(number(9)) == library
+    assert cache.kept_library(key) == library
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     if library.stat().st_uid == 0:
         os.chown(library, 12345, -1)
-    assert kept(number(9)) is None
+    assert cache.kept_library(key) is None
 
 
 def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = [built(number(value)) for value in range(10, 13)]
     for age, file in enumerate(files):
         os.utime(file, (0, 1000 + age))
-    assert kept(number(10)) == files[0]  # used again
+    assert built(number(10)) == files[0]  # used again
     monkeypatch.setattr(cache, "MOST_KEPT", 3 * files[0].stat().st_size)
     newest = built(number(13))
     assert {file for file in own.iterdir() if file.suffix == ".so"} == {files[0], files[2], newest}
@@ -316,61 +330,7 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
     assert len(list(own.glob("*.so"))) == 1
 
 
-# ---- in the background -------------------------------------------------------------------------------------------
-
-
-def test_a_problem_solved_long_is_compiled_meanwhile(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "SECONDS_A_LIBRARY", 0.0)
-    monkeypatch.setattr(compiled, "SECONDS_AN_INSTRUCTION", 0.0)
-    prepared: Any = prepare(van_der_pol(), Collocation(10))
-    first = prepared.solve()
-    assert not is_compiled(prepared)
-    work = prepared._blocks._background
-    work.join()
-    prepared._blocks.seconds = np.inf  # worth building again
-    second = prepared.solve()
-    assert is_compiled(prepared)
-    np.testing.assert_array_equal(first.variables, second.variables)
-    assert is_compiled(prepare(van_der_pol(), Collocation(20)))
-
-
-def test_short_solves_compile_nothing(own: Path) -> None:
-    prepared: Any = prepare(van_der_pol(), Collocation(4))
-    for _ in range(3):
-        prepared.solve()
-    blocks: Any = prepared._blocks
-    under_way = blocks._background
-    assert under_way is None
-    blocks.worked(60.0)
-    blocks._background.join()
-    assert blocks.renewed()
-    assert not blocks.renewed()
-
-
-SLOW = 'echo $$ > "$(dirname "$0")/pid"; sleep 60 & wait'
-
-
-def test_what_is_stopped_leaves_nothing(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", script(tmp_path / "slow", SLOW))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
-    work = Background([number(15), number(16)])
-    pid = appears(tmp_path / "pid")
-    stop_compiling()
-    work.join(2.0)
-    assert not work.is_alive()
-    assert is_gone(pid)
-    assert is_empty(tmp_path / "temporary")
-    assert [file.suffix for file in own.iterdir()] == []
-
-
-def test_what_is_done_leaves_nothing(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    work = Background([number(19), number(20)])
-    work.join(20.0)
-    assert [told(path) for path in work.found if isinstance(path, Path)] == [19, 20]
-    assert {file.name for file in tmp_path.iterdir()} == {"cache"}
-    assert [file.suffix for file in own.iterdir()] == [".so", ".so"]
+# ---- locks, and what is stopped --------------------------------------------------------------------------------------
 
 
 def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
@@ -382,15 +342,24 @@ def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
     assert not list(own.glob("*.lock"))
 
 
-def test_a_time_limit_ends_the_wait(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+SLOW = 'echo $$ > "$(dirname "$0")/pid"; sleep 60 & wait'
+
+
+def test_a_time_limit_ends_the_wait_and_leaves_nothing(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "slow", SLOW))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
     with limited(0.3), pytest.raises(OutOfTime):
         built(number(17))
     assert is_gone(appears(tmp_path / "pid"))
+    assert is_empty(tmp_path / "temporary")
+    assert not list(own.iterdir())
 
 
 LEAVING = """
-work = Background([number(18)])
+threading.Thread(target=built, args=[number(18)], daemon=True).start()
 print("under way", flush=True)
 time.sleep(float(sys.argv[1]))
 """
@@ -415,7 +384,7 @@ def test_a_process_that_ends_takes_its_compiler_along(
     assert time.monotonic() - began < 3.0
     assert is_gone(pid)
     assert is_empty(tmp_path / "temporary")
-    assert kept(number(18)) is None
+    assert cache.kept_library(number(18).key) is None
 
 
 def appears(file: Path) -> int:
@@ -447,22 +416,3 @@ def is_gone(pid: int) -> bool:
             return True
         time.sleep(0.02)
     return False
-
-
-TWICE = """
-double twice(double v) {
-  double w;
-  const double *in[] = {&v};
-  double *out[] = {&w};
-  square(in, out, 0, 0, 0);
-  return 2 * w;
-}
-"""
-
-
-def test_c_of_functions_and_a_source_together(own: Path) -> None:
-    x = ca.SX.sym("x")
-    square = ca.Function("square", [x], [x**2])
-    library = ctypes.CDLL(str(built(Library((square.serialize(), TWICE), lambda: code([square], TWICE)))))
-    library.twice.restype, library.twice.argtypes = ctypes.c_double, [ctypes.c_double]
-    assert library.twice(3.0) == 18.0

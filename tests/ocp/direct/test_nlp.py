@@ -106,7 +106,7 @@ def test_fatrop_constrains_controls_at_the_end_where_they_stand_at_nodes() -> No
 
 @pytest.mark.parametrize("solver", ["snopt", "", None, "IPOPT", 3])
 def test_unknown_solvers_are_named(solver: Any) -> None:
-    with pytest.raises(ProblemError, match=r"solver must be 'auto' or 'ipopt' or 'native' or 'fatrop' or 'sleqp'"):
+    with pytest.raises(ProblemError, match=r"solver must be 'ipopt' or 'fatrop' or 'sleqp'"):
         solve(energy(), Collocation(2), solver=solver)
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, ProblemError, Sensitivity, Solution, prepare, solve
-from tests.ocp.direct.test_native import MOVED, moved
-from tests.ocp.problems import Method, energy, relative, started_anywhere, swing, van_der_pol
+from tests.ocp.problems import MOVED, Method, energy, moved, relative, started_anywhere, swing, van_der_pol
 
 
 def loaded(upper: float = np.inf) -> Problem:
@@ -75,10 +74,9 @@ def told(plan: Solution) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("solver", ["ipopt", "native"])
-def test_derivatives_are_the_differences_of_plans_solved_again(case: str, solver: str) -> None:
+def test_derivatives_are_the_differences_of_plans_solved_again(case: str) -> None:
     build, method, parameters, name = CASES[case]
-    prepared = prepare(build(), method, solver=solver)
+    prepared = prepare(build(), method)
     plan = prepared.solve(parameters)
     found = plan.sensitivity(name)
     assert isinstance(found, Sensitivity)

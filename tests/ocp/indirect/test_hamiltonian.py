@@ -246,7 +246,7 @@ def test_bad_settings_are_refused(arguments: dict[str, Any], message: str) -> No
 def test_what_is_no_problem_and_no_solver_is_refused() -> None:
     with pytest.raises(ProblemError, match="a Problem is expected, not str"):
         prepare("energy", Indirect())  # type: ignore[arg-type]
-    words = "solver must be 'auto' or 'ipopt' or 'native' or 'fatrop' or 'sleqp', not 'snopt'"
+    words = "solver must be 'ipopt' or 'fatrop' or 'sleqp', not 'snopt'"
     with pytest.raises(ProblemError, match=words):
         prepare(energy(), Indirect(), solver="snopt")
     with pytest.raises(ProblemError, match="parameters must be a dictionary"):
