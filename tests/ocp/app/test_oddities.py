@@ -70,7 +70,7 @@ def test_a_rule_gives_back_polynomials_of_its_degree(degree: int) -> None:
     rng = np.random.default_rng(degree)
     f = np.polynomial.Polynomial(rng.normal(size=degree + 1))
     t = np.sort(rng.uniform(0.0, 2.0, 7))
-    values = [f.deriv(k)(t)[:, None] if k else f(t)[:, None] for k in range((degree + 1) // 2)]
+    values: list[Any] = [f.deriv(k)(t)[:, None] if k else f(t)[:, None] for k in range((degree + 1) // 2)]
     motion = Motion(t, *values)
     x = np.linspace(t[0], t[-1], 40)
     np.testing.assert_allclose(motion.position.at(x)[:, 0], f(x), atol=1e-9)

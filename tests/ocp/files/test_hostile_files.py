@@ -238,7 +238,7 @@ def packed(path: Path, size: int, said: int) -> None:
     compressor = zstandard.ZstdCompressor().compressobj()
     data = b"".join(compressor.compress(bytes(2**24)) for _ in range(size >> 24)) + compressor.flush()
     Chunk("zstd", data, 0, 0, 0, said).write(builder)
-    path.write_bytes(b"\x89MCAP0\r\n" + builder.end())  # type: ignore[no-untyped-call]
+    path.write_bytes(b"\x89MCAP0\r\n" + builder.end())
 
 
 def test_a_log_that_unpacks_to_gigabytes_takes_no_memory(tmp_path: Path) -> None:
