@@ -18,6 +18,7 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.robot.indices import checked_rows
 from models.spatial import expression
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_nonnegative, checked_positive, checked_text
+from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 from ocp.tasks.tracks import Track, along, run_by
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "one_of", "timed"]
@@ -88,7 +89,7 @@ class TipTask:
     begin: float = 0.0
     duration: float | None = None
     breaks: ArrayInput = ()
-    tolerance: ArrayInput = (1e-4, 1e-3)
+    tolerance: ArrayInput = (POSITION_TOLERANCE_M, ORIENTATION_TOLERANCE_RAD)
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):
