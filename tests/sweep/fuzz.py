@@ -31,14 +31,15 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
+import casadi as ca
 import numpy as np
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from models import FixedBase, ModelError, Robot
+from models import Box, FixedBase, ModelError, Moving, Robot, Sphere, planar_chain
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
-from ocp import AuditError, ProblemError, SolveError
+from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Solution, SolveError, TipTask, plan, solve
 from ocp.files import read_gcode, read_trajectory, read_waypoints
 from ocp.files.mcap import _joint_state
 from ocp.files.obstacles import read_obstacles
@@ -209,12 +210,18 @@ def in_archive(mend: Callable[[dict[str, bytes]], dict[str, bytes]] = lambda mem
     right again, such as digests."""
 
     def changed(data: bytes, rng: Random) -> bytes:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {member: archive.read(member) for member in archive.namelist()}
-        name = sorted(members)[int(rng.integers(len(members)))]
-        array = np.lib.format.read_array(io.BytesIO(members[name]), allow_pickle=False)
+        try:
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                members = {member: archive.read(member) for member in archive.namelist()}
+            name = sorted(members)[int(rng.integers(len(members)))]
+            array = np.lib.format.read_array(io.BytesIO(members[name]), allow_pickle=False)
+        except Exception:  # another mutator broke it before
+            return data
         if array.dtype == np.uint8 and array.tobytes()[:1] in (b"{", b"["):
-            text = json.dumps(changed_tree(json.loads(array.tobytes()), rng)) if rng.random() < 0.7 else ""
+            text = ""
+            if rng.random() < 0.7:
+                with suppress(ValueError):
+                    text = json.dumps(changed_tree(json.loads(array.tobytes()), rng))
             array = np.frombuffer(text.encode() or TEXT_CHANGED[int(rng.integers(8))](array.tobytes(), rng), np.uint8)
         elif rng.random() < 0.5:
             values = np.array([np.nan, np.inf, -1, 0, 2**31, 1e308], dtype=float)
@@ -400,7 +407,44 @@ def read_robot(file: Path) -> Any:
     return Robot.from_urdf(robot.to_urdf()), FixedBase(robot)
 
 
+def saved(thing: Plan | Solution) -> bytes:
+    with TemporaryDirectory() as folder:
+        thing.save(Path(folder) / "thing.npz")
+        return (Path(folder) / "thing.npz").read_bytes()
+
+
+@cache
+def plan_file() -> bytes:
+    """A plan among obstacles that stand and move."""
+    arm = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0] * 3))
+    ball = Moving(Sphere(0.05, (0, 0, 0)), lambda time: (2.0, 1.0 + 0.3 * time, 0.0))
+    around = [ball, Box((0.1, 0.1, 0.1), position=(0, -2, 0))]
+    task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
+    return saved(plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), obstacles=around, search="start"))
+
+
+@cache
+def solution_file() -> bytes:
+    """A solution whose problem calls tables, splines, a linear system, an integrator and other functions."""
+    grid = np.linspace(-3.0, 3.0, 9)
+    table = ca.interpolant("table", "linear", [grid], grid**2)
+    spline = ca.interpolant("spline", "bspline", [grid], np.cosh(grid))
+    decay = {"x": (y := ca.MX.sym("y")), "p": (rate := ca.MX.sym("p")), "ode": -y * rate}
+    run = ca.integrator("run", "rk", decay, 0.0, 1.0, {"number_of_finite_elements": 2})
+    problem = Problem("calls", ca.MX)
+    x, u = problem.state("x", 2, initial=[1.0, 0.5]), problem.control("u", 2)
+    cell = ca.low(ca.DM(grid), x[0])
+    problem.dynamics(x, ca.solve(ca.MX(ca.DM([[2.0, 1.0], [1.0, 3.0]])) + ca.diag(x**2), u))
+    problem.horizon(1.0)
+    problem.path("limits", u, lower=-9, upper=9)
+    running = spline(x[0]) + table(x[1]) + run(x0=x[0], p=1.0)["xf"] ** 2 + 1e-3 * cell + ca.sumsqr(u)
+    problem.minimize(running=running)
+    return saved(solve(problem, Collocation(3)))
+
+
 KINDS: dict[str, Kind] = {
+    "plan": Kind(".npz", plan_file, lambda file: Plan.load(file).audit(), in_archive()),
+    "solution": Kind(".npz", solution_file, lambda file: Solution.load(file).audit(), in_archive()),
     "urdf": Kind(".urdf", URDF.encode, read_robot, mostly(changed_xml)),
     "srdf": Kind(
         ".srdf", (SRDF + "</robot>").encode, lambda file: checked_pairs(bars(), [], srdf=file), mostly(changed_xml)
