@@ -11,6 +11,7 @@ from models.robot import urdf
 from models.shapes.triangles import MOST_BYTES, MOST_FACES
 from ocp import storage
 from ocp.files import entries, lines, mcap, trees
+from ocp.problem import function_reader
 from ocp.schedule import trajectory
 
 ROOT = Path(__file__).parents[3]
@@ -32,6 +33,9 @@ LIMITS = {
     "a record or chunk of it, unpacked": mcap.LARGEST_RECORD / MB,
     "its messages of joints": mcap.MOST_OF_JOINTS / MB,
     "plan or solution, as it is and unpacked": storage.MOST_BYTES / MB,
+    "elementary operations of its expressions": function_reader.MAX_OPERATIONS,
+    "entries of the arguments and results of its functions": function_reader.MAX_ENTRIES,
+    "operations of one evaluation, calls included": function_reader.MAX_WORK,
     "characters of a name of a link or joint": LONGEST_NAME,
 }
 
