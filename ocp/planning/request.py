@@ -198,7 +198,13 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         words = f"a {type(value).__name__} is no data that a file can hold"
         raise ProblemError(words, name=type(value).__name__, value=repr(value)[:80])
 
-    return {"builder": builder, "arguments": put(dict(arguments)), "functions": writer.records}
+    pool = []
+    for name, value in arguments.items():
+        try:
+            pool.append([name, put(value)])
+        except ProblemError as error:
+            raise ProblemError(f"{name}: {error}", name=name, value=error.value) from error
+    return {"builder": builder, "arguments": {"pool": pool}, "functions": writer.records}
 
 
 def _around(around: Surroundings) -> dict[str, Any]:
