@@ -68,7 +68,8 @@ class Robot:
             checked_each(self.links, Link, "robot", "links"),
             checked_each(self.joints, Joint, "robot", "joints"),
         )
-        checked_name(self.name if self.name != "" else "robot", "robot", "name")
+        if not (isinstance(self.name, str) and self.name == ""):  # a description may leave it out
+            checked_name(self.name, "robot", "name")
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = held(joints, {})

@@ -188,7 +188,8 @@ def test_a_plan_that_stands_still_does_not_go_a_small_way(way: float, where: str
 def test_an_arm_that_never_moves_does_no_task_however_small_it_is(size: float) -> None:
     """Links of a size draw a circle of a fifth of it."""
     machine = arm(size)
-    problem = minimum_velocity_problem(machine, task=circle(machine, size / 5, 2.0), start_joints=START, horizon=2.0)
+    task = replace(circle(machine, size / 5, 2.0), tolerance=(2e-4 * size, 1e-3))
+    problem = minimum_velocity_problem(machine, task=task, start_joints=START, horizon=2.0)
     holds(solve(problem, Collocation(20)).audit())
     still = {"joints": START.tolist()}
     does_not_do_what_is_asked(drawn(problem, still, {"rates": 0 * START}, {"joints": 0 * START}, 2.0).audit())

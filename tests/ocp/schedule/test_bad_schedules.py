@@ -85,13 +85,15 @@ def profile() -> SpeedProfile:
 
 def write_table(path: Any) -> None:
     with TemporaryDirectory() as folder:
-        JOINTS.write_csv(f"{folder}/{path}" if path == "trajectory.csv" else path)
+        JOINTS.write_csv(f"{folder}/{path}" if isinstance(path, str) and path == "trajectory.csv" else path)
 
 
 def read_table(path: Any) -> JointTrajectory:
     with TemporaryDirectory() as folder:
         JOINTS.write_csv(f"{folder}/trajectory.csv")
-        return JointTrajectory.read_csv(f"{folder}/{path}" if path == "trajectory.csv" else path)
+        return JointTrajectory.read_csv(
+            f"{folder}/{path}" if isinstance(path, str) and path == "trajectory.csv" else path
+        )
 
 
 def trajectory() -> JointTrajectory:
