@@ -18,6 +18,7 @@ from ocp.errors import ProblemError, checked_flag
 from ocp.methods import prepare
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["certificate"]
 
@@ -30,7 +31,7 @@ def certificate(
     problem: Problem,
     solutions: Mapping[str, Solution] | Sequence[Solution],
     *,
-    tolerance: float = 1e-3,
+    tolerance: float = LIMIT_SHARE,
     second_solver: bool = False,
 ) -> Certificate:
     """Compare solutions of one problem by different methods, and audit each.

@@ -9,13 +9,13 @@ import numpy as np
 
 from ocp.audit.curvature import Curvature
 from ocp.audit.optimality import optimality
-from ocp.audit.principle import FLAT
 from ocp.console import interruptible, limited
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_time_limit
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
+from ocp.tolerances import FLAT_SHARE
 
 __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
 
@@ -148,7 +148,7 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
         if not solution.regularised:
             break
         found = optimality(form, solution, p, bounds, allowed=np.inf).curvature
-        if not found.least < -FLAT:
+        if not found.least < -FLAT_SHARE:
             break
         others = [
             prepared.solve(solution.parameters, beside(form, solution, found, bounds, sign), check=False)

@@ -32,7 +32,7 @@ FLOORS = {
         ["papers"],
     ],
     "ocp": [
-        ["errors", "curves", "console"],
+        ["errors", "curves", "console", "tolerances"],
         ["storage", "libraries", "tables"],
         ["problem", "schedule", "tasks"],
         ["solution"],

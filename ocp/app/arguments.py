@@ -16,7 +16,7 @@ from models.arrays import Array
 from models.spatial import rotation_from_rpy
 from ocp.app.planned import EXPORTED, check_period, export, run_task
 from ocp.app.progress import Progress
-from ocp.app.verdict import SHARE, bounds_of, check_trajectory
+from ocp.app.verdict import bounds_of, check_trajectory
 from ocp.errors import ProblemError
 from ocp.files import read_trajectory, read_waypoints
 from ocp.files.obstacles import read_obstacles
@@ -24,7 +24,7 @@ from ocp.files.outputs import SUFFIXES, checked_output
 from ocp.files.task_file import read_task
 from ocp.planning import Plan
 from ocp.storage import write_text
-from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD
+from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
 __all__ = ["Words", "subcommands"]
 
@@ -228,7 +228,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
             f"--{what}", type=_limit, action="append", default=[], metavar="[JOINT=]MOST", help=f"greatest {what}"
         )
     limits.add_argument(
-        "--share", type=float, default=SHARE, metavar="S", help="of a limit, by which it may be passed (default: 0.001)"
+        "--share", type=float, default=LIMIT_SHARE, metavar="S", help="of a limit that may be passed (default: 0.001)"
     )
     stands = parser.add_argument_group("the base")
     base = stands.add_mutually_exclusive_group()

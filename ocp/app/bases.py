@@ -13,11 +13,9 @@ from ocp.app.joint_limits import Row, states_along
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Motion
 from ocp.problem.formulation import Sampler
+from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
 __all__ = ["floating_base", "momentum_rows", "standing_rows"]
-
-KEPT = 1e-2
-"""Of the momentum that the joints carry: by so much that of the whole may change, which finite samples tell."""
 
 
 def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
@@ -131,7 +129,7 @@ def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[
     for what, part, unit in (("moment of momentum", slice(0, 3), "N m s"), ("momentum", slice(3, 6), "N s")):
         off = np.linalg.norm(whole[:, part] - np.median(whole[:, part], axis=0), axis=1)
         size_ = float(np.linalg.norm(carried[:, part], axis=1).max())
-        limit = KEPT * size_ + 1e-9
+        limit = MOMENTUM_SHARE * size_ + ROUNDING_SHARE
         k = int(off.argmax())
         value, time = float(off[k]), float(motion.t[k + 1])
         failed = value > limit

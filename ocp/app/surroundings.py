@@ -17,11 +17,10 @@ from ocp.builders.clearance import clearance_of
 from ocp.files import Waypoints
 from ocp.local.touching import distances_along
 from ocp.problem.formulation import Sampler
+from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 __all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]
 
-TOUCHING = 1e-6
-"""m, by which bodies may be nearer than they are asked to stay, as in the audit of a plan."""
 SHOWN = 20
 """Pairs that are named."""
 MOST_LOOKS = 1000
@@ -83,13 +82,13 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     for near in sorted(found.pairs, key=lambda near: near.distance - near.asked)[:SHOWN]:
         one, other = near.bodies
         time = start + near.time
-        if near.distance < near.asked - TOUCHING:
+        if near.distance < near.asked - CLEARANCE_TOLERANCE_M:
             verdict, note = "FAILED", "touching" if near.distance < 0 else "too near"
             between = "" if np.isclose(motion.t, time, rtol=0, atol=1e-12).any() else ", between two samples"
             how = f"overlap by {-near.distance:.4g} m" if near.distance < 0 else f"are {near.distance:.4g} m apart"
             text = f"{how} at {time:.6g} s{between}, at least {near.asked:g} m asked"
             faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.asked, "m"))
-        elif near.missed > TOUCHING:
+        elif near.missed > CLEARANCE_TOLERANCE_M:
             verdict, note = "not decided", f"at least {near.least:.4g} m is proven"
         else:
             verdict, note = (
@@ -103,7 +102,8 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     faults = _with_beginnings(around, motion, faults)
     for near in found.pairs:
         name = f"clearance of {near.bodies[0]} and {near.bodies[1]}"
-        if near.missed > TOUCHING and near.distance >= near.asked - TOUCHING and name not in shown:
+        touches = near.distance < near.asked - CLEARANCE_TOLERANCE_M
+        if near.missed > CLEARANCE_TOLERANCE_M and not touches and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
             rows.append(Row(name, near.distance, near.asked, "m", start + near.time, "not decided", note))
     return [*rows, *told], faults
@@ -120,7 +120,7 @@ def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) 
     columns = {f"{one} and {other}": k for k, (one, other) in enumerate(around.labels)}
     found = []
     for fault in faults:
-        near = np.flatnonzero(apart[:, columns[fault.name]] < around.clearance - TOUCHING)
+        near = np.flatnonzero(apart[:, columns[fault.name]] < around.clearance - CLEARANCE_TOLERANCE_M)
         first = float(times[near[0]]) if near.size else fault.time
         found.append(replace(fault, first=first))
     return found
@@ -137,7 +137,7 @@ def _sampled(around: Surroundings, motion: Motion, bases: Array) -> tuple[list[R
         k = int(apart[:, pair].argmin())
         one, other = around.labels[pair]
         value, time = float(apart[k, pair]), float(times[k])
-        failed = value < around.clearance - TOUCHING
+        failed = value < around.clearance - CLEARANCE_TOLERANCE_M
         note = "at samples and middles; not proven between them"
         rows.append(
             Row(

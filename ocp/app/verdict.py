@@ -33,8 +33,8 @@ from ocp.errors import (
 from ocp.files import RawTrajectory, Waypoints
 from ocp.files.trajectory import UNITS
 from ocp.tasks.limits import JointBounds, unknown_limits
-from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD
-from ocp.tasks.tolerances import path_tolerance as default_tolerance
+from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
+from ocp.tolerances import path_tolerance as default_tolerance
 
 __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_trajectory"]
 
@@ -43,8 +43,6 @@ Limit: TypeAlias = float | Mapping[str, float] | None
 """One number for all joints, or numbers by name; "" is the name of all others. None: the robot's own."""
 
 GRAVITY = (0.0, 0.0, -9.81)
-SHARE = 1e-3
-"""Of a limit, by which it may be passed: as much as the audit of a plan and schedules allow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +175,7 @@ def check_trajectory(
     path: Waypoints | None = None,
     path_tolerance: float | None = None,
     path_angle: float = ORIENTATION_TOLERANCE_RAD,
-    share: float = SHARE,
+    share: float = LIMIT_SHARE,
     rule: Rule | None = None,
     time_unit: str | float | None = None,
     unwrap: bool = False,

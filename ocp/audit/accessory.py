@@ -19,20 +19,12 @@ import numpy as np
 
 from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import FLAT, slope
-from ocp.audit.sizes import FLOOR, as_others
+from ocp.audit.principle import slope
+from ocp.audit.sizes import as_others
 from ocp.problem.formulation import Formulation
+from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
 __all__ = ["AccessoryProblem", "end_conditions"]
-
-NOISE = 1e-14
-"""Curvature along a control of its size, of the largest, below which it is rounding."""
-STILL = 10 * FLOOR
-"""Share of the largest entry of a state or a control below which another one stands still."""
-LITTLE = 1e-3
-"""Share of the largest state of its unit below which another one might as well move as that does."""
-AT_BOUND = 1e-5
-"""A value nearer to its bound than this share of its spread or range is held by it."""
 
 
 class AccessoryProblem:
@@ -79,14 +71,14 @@ class AccessoryProblem:
         bend = np.abs(np.einsum("kii->ki", self.curved)).mean(axis=0)
         least, most = self.along.u.min(axis=0, initial=np.inf), self.along.u.max(axis=0, initial=-np.inf)
         value = np.maximum(np.abs(least), np.abs(most))
-        size = np.where(most - least <= FLOOR * value, np.maximum(value, sizes.control), sizes.control)
+        size = np.where(most - least <= SOLVER_SHARE * value, np.maximum(value, sizes.control), sizes.control)
         weight = bend * size**2
         largest = float(weight.max(initial=0.0))
-        still = size <= STILL * size.max(initial=0.0)  # whose size says nothing
-        curves = (weight > NOISE * largest) | (still & (bend > NOISE * bend.max(initial=0.0)))
+        still = size <= RESOLVED_SHARE * size.max(initial=0.0)  # whose size says nothing
+        curves = (weight > MACHINE_SHARE * largest) | (still & (bend > MACHINE_SHARE * bend.max(initial=0.0)))
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, bend, 1.0)), sizes.control)
         state = self.along.state_size.copy()
-        as_others(state, self.along.form.states, self.along.form.problem.declared.states, LITTLE)
+        as_others(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
         self.unit = np.concatenate([state, horizon, *([state] if self.tied else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
@@ -128,7 +120,7 @@ class AccessoryProblem:
         """Controls along which the Hamiltonian does not curve. Shape (nu,), bool."""
         bends = np.abs(self.curved * self.range * self.range[:, None]).max(axis=(0, 2), initial=0.0)
         pull = np.abs(slope(self.along, self.adjoint.costate) * self.range).max(initial=0.0)
-        return np.asarray(bends <= FLAT * max(float(bends.max(initial=0.0)), float(pull)))
+        return np.asarray(bends <= FLAT_SHARE * max(float(bends.max(initial=0.0)), float(pull)))
 
     @cached_property
     def left(self) -> np.ndarray:
@@ -184,8 +176,8 @@ class AccessoryProblem:
         def pushing(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
             count = multipliers.shape[1]
             force = np.abs(multipliers) * reach[:, first : first + count]
-            touched = (limits.gap[:, :count] <= AT_BOUND * size) | limits.equal[:count]
-            return [force > FLAT * (force.max(initial=0.0) or 1.0), touched]
+            touched = (limits.gap[:, :count] <= RESOLVED_SHARE * size) | limits.equal[:count]
+            return [force > FLAT_SHARE * (force.max(initial=0.0) or 1.0), touched]
 
         strong, touched = pushing(along.hold, self.adjoint.holding[:, :nh], 0, held)
         self.fixed = strong[:, :nu] & touched[:, :nu]
@@ -265,10 +257,10 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     end_curved = end_curved + along.final_yy[np.ix_(order, order)]
     psi_y, psi0_y = np.split(along.end_y[:, order], [len(form.end)])
     force = max(np.abs(ends.end).max(initial=0.0), np.abs(ends.start).max(initial=0.0)) or 1.0
-    at_end = (np.abs(ends.end) > FLAT * force) | form.end.equality
-    at_start = (np.abs(ends.start) > FLAT * force) | form.start.equality
+    at_end = (np.abs(ends.end) > FLAT_SHARE * force) | form.end.equality
+    at_start = (np.abs(ends.start) > FLAT_SHARE * force) | form.start.equality
     fixed = {k: low[places[k]] == high[places[k]] for k in ("terminal", "initial")}
-    slack = AT_BOUND * along.sizes.state
+    slack = RESOLVED_SHARE * along.sizes.state
     for k, x in (("terminal", x1), ("initial", x0)):
         fixed[k] = fixed[k] | (x <= low[places[k]] + slack) | (x >= high[places[k]] - slack)
 
@@ -285,8 +277,8 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     if accessory.tied:
         extra.append(eye[:nx] - eye[accessory.nz - nx :])
     if accessory.free:
-        at = places["horizon"]
-        if solution.horizon <= low[at][0] * (1 + AT_BOUND) or solution.horizon >= high[at][0] * (1 - AT_BOUND):
+        least, most = (float(side[places["horizon"][0]]) for side in (low, high))
+        if not least * (1 + RESOLVED_SHARE) < solution.horizon < most * (1 - RESOLVED_SHARE):
             extra.append(eye[nx : nx + 1])
     scale = z_unit * z_unit[:, None]
     return end_hessian * scale, end_rows * z_unit, start_hessian * scale, np.vstack([start_rows * z_unit, *extra])

@@ -14,7 +14,6 @@ import numpy as np
 from ocp.audit.clearance import Clearance, clearance
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
-from ocp.audit.principle import FLAT
 from ocp.audit.reintegration import Reintegration, reintegrate
 from ocp.audit.sizes import Sizes, fine_grid, sizes_along
 from ocp.audit.violations import Violation, violations
@@ -24,13 +23,16 @@ from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs, check_structure, in_order_of, stack, unstack
+from ocp.tolerances import (
+    CLEARANCE_TOLERANCE_M,
+    COSTATE_SHARE,
+    FLAT_SHARE,
+    LIMIT_SHARE,
+    SOLVER_SHARE,
+    UNFIT_COSTATE_SHARE,
+)
 
 __all__ = ["Audit", "Finding", "audit"]
-
-COSTATES = 1e-2  # share of the cost that errors of costates may be
-UNFIT = 0.1  # share of the cost that costates may be beside the best where controls enter linearly: many fit a plan
-TOUCHING = 1e-6  # m, by which bodies may be nearer than they are asked to stay
-HORIZON_SLACK = 1e-6  # of the horizon, which solvers keep to their tolerance
 
 
 @dataclass(frozen=True)
@@ -170,9 +172,9 @@ def audit(
     problem: Problem,
     solution: Solution,
     *,
-    integration: float = 1e-3,
-    constraints: float = 1e-3,
-    lost: float = 1e-3,
+    integration: float = LIMIT_SHARE,
+    constraints: float = LIMIT_SHARE,
+    lost: float = LIMIT_SHARE,
     costates: float | None = None,
     stationarity: float | None = None,
     drift: float | None = None,
@@ -254,7 +256,7 @@ def audit(
         total[check.name] = max(total.get(check.name, 0.0), float(np.max(check.missed)))
 
     clearances = {name: clearance(form, each, solution, p) for name, each in problem.declared.apart.items()}
-    findings += [clearance_finding(each, limits.get(name, TOUCHING)) for name, each in clearances.items()]
+    findings += [clearance_finding(each, limits.get(name, CLEARANCE_TOLERANCE_M)) for name, each in clearances.items()]
     findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     sound = all(finding.passed for finding in findings)
@@ -285,7 +287,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
     miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     asked = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
-    return Finding("horizon", miss, HORIZON_SLACK * solution.horizon, None, f"{solution.horizon:.6g} s, asked {asked}")
+    return Finding("horizon", miss, SOLVER_SHARE * solution.horizon, None, f"{solution.horizon:.6g} s, asked {asked}")
 
 
 def optimality_findings(
@@ -306,11 +308,11 @@ def optimality_findings(
     cost, errors = found.cost_size, found.error_size
     share = float(found.lost.sum()) / cost + over
     if costates is None:
-        costates = max(COSTATES, found.known_to)
+        costates = max(COSTATE_SHARE, found.known_to)
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{found.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", found.adjoint.total / errors, costates),
-        Finding("costates beside the best, relative", found.unfit, UNFIT if found.flat else costates),
+        Finding("costates beside the best, relative", found.unfit, UNFIT_COSTATE_SHARE if found.flat else costates),
         worst("costates between the nodes, relative", found.adjoint.between / errors, found.adjoint.t[:-1], costates),
         Finding("transversality, relative", found.adjoint.ends.transversality / errors, costates),
     ]
@@ -318,7 +320,7 @@ def optimality_findings(
         rows.append(Finding("condition of the free horizon, relative", found.adjoint.ends.horizon / errors, costates))
     second = found.curvature
     note = f"not decided: {second.flat}" if second.upwards is None else f"least {second.least:.3g} of the largest"
-    downwards = 0.0 if second.upwards is not False else max(-second.least, FLAT)
+    downwards = 0.0 if second.upwards is not False else max(-second.least, FLAT_SHARE)
     limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
     if form.nu:

@@ -15,6 +15,7 @@ from ocp.errors import ProblemError, checked_each, checked_mapping, checked_posi
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_belongs
+from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["Certificate", "Comparison", "certificate"]
 
@@ -103,7 +104,7 @@ class Certificate:
 
 @interruptible
 def certificate(
-    problem: Problem, solutions: Mapping[str, Solution] | Sequence[Solution], *, tolerance: float = 1e-3
+    problem: Problem, solutions: Mapping[str, Solution] | Sequence[Solution], *, tolerance: float = LIMIT_SHARE
 ) -> Certificate:
     """Compare solutions of one problem by different methods, and audit each.
 

@@ -21,13 +21,12 @@ from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import holders, inverse_of, nonnegative
 from ocp.curves import lagrange
 from ocp.solution import stack
+from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
 
 __all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "ends_of_intervals"]
 
 ROUNDS = 3
 """Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
-TRUSTED = 1e-2
-"""Error of the costates, as a share of the cost, that weighs as much as a gap to a limit of the same share."""
 
 
 class Ends(NamedTuple):
@@ -280,7 +279,7 @@ def _pushes(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     slopes_c = np.einsum("j,juv,cjv->cju", weight, held, unit * np.einsum("jiu,cji->cju", rate_u, answer))
     target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
     matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    found = nonnegative(matrix, target, TRUSTED * np.array(charges), np.array(free, bool)) * cost
+    found = nonnegative(matrix, target, COSTATE_SHARE * np.array(charges), np.array(free, bool)) * cost
     for (kind, j, i, scale), value in zip(owners, found, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
@@ -292,7 +291,7 @@ def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.
     at = along.solution.t / along.solution.horizon
     k = np.clip(np.searchsorted(along.mesh, at, side="right") - 1, 0, n - 1)
     place = (at - along.mesh[k]) / along.width[k]
-    inner = (place > 1e-9) & (place < 1 - 1e-9)
+    inner = (place > ROUNDING_SHARE) & (place < 1 - ROUNDING_SHARE)
     nodes, values = np.append(along.places, 1.0), np.concatenate([costate.reshape(n, q, nx), last[:, None]], axis=1)
     found = np.einsum("md,mdn->mn", lagrange(nodes, place[inner]), values[k[inner]])
     off = np.abs(stack(along.solution.costates)[inner] - found) @ along.state_size
@@ -336,7 +335,7 @@ def _ends(
     free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
     free[-1] = form.horizon_is_free
     matrix = (limits.slope * (limits.sign / reach)[:, None] * unit).T[free]
-    prices = TRUSTED * limits.gap / reach
+    prices = COSTATE_SHARE * limits.gap / reach
     found = nonnegative(matrix, (target * unit)[free] / cost, prices, limits.equal) * cost
     left = np.zeros(2 * nx + 1)
     left[free] = (target * unit)[free] - matrix @ found

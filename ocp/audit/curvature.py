@@ -15,18 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem, end_conditions
-from ocp.audit.principle import FLAT, groups
+from ocp.audit.principle import groups
 from ocp.problem.formulation import Formulation
+from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["Curvature", "curvature"]
 
-RANK = 1e-9
-"""Size of a singular value, for rows of length 1, from which on constraints count as dependent."""
 NEARLY = "constraints are nearly dependent"
-TIED = 1e-4
-"""Size of a singular value below which conditions may be implied by others but for the error of a plan."""
-SLIP = 1e-6
-"""What a variation that lowers the cost may miss its constraints by, relative to its size."""
 
 
 class Tied(NamedTuple):
@@ -41,7 +36,7 @@ class Tied(NamedTuple):
     seen: float
 
 
-INDEPENDENT = Tied(RANK, RANK)
+INDEPENDENT = Tied(ROUNDING_SHARE, ROUNDING_SHARE)
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ class Curvature:
         """Whether the cost curves upwards along all feasible variations; None where that is not decided."""
         if self.flat:
             return None
-        return bool(self.least > FLAT)
+        return bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
         """What start and horizon could win, to second order, where the cost has this slope (nz,) in them.
@@ -103,19 +98,19 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
         return Curvature(np.nan, None, accessory.obstacle, None, along.t)
     stages = _Linearised.of(accessory)
     found = _sweep(accessory, stages, weak=False)
-    if found.least <= FLAT and accessory.weak.any():
+    if found.least <= FLAT_SHARE and accessory.weak.any():
         # a limit that is touched without a push takes away one side of a direction only
         inside = _sweep(accessory, stages, weak=True)
-        if inside.least > FLAT:
+        if inside.least > FLAT_SHARE:
             why = "the cost curves upwards only because of limits that are touched without a push"
             return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:])
         found = inside
     if found.flat.startswith(NEARLY):
         # conditions that others imply are seen by controls up to the error of the plan alone: they are for the stages
         # before; and without what is left of them there is more to vary: upwards all the more
-        for tied in (Tied(SLIP, SLIP), Tied(TIED, RANK)):
+        for tied in (Tied(SOLVER_SHARE, SOLVER_SHARE), Tied(IMPLIED_SHARE, ROUNDING_SHARE)):
             wider = _sweep(accessory, stages, weak=False, tied=tied)
-            if wider.least > FLAT and not wider.flat:
+            if wider.least > FLAT_SHARE and not wider.flat:
                 found = wider
                 break
     return Curvature(*found[:4], along.t, *found[4:])
@@ -188,13 +183,13 @@ def _swept(
                 values, vectors = np.linalg.eigh(curve)
                 if values[0] / scale < least:
                     least, at = float(values[0] / scale), float(mesh[k] * horizon)
-                if values[0] < -FLAT * scale:
+                if values[0] < -FLAT_SHARE * scale:
                     worst = lift[m:, m:] @ vectors[:, 0]
                     why = _singular(accessory, k, worst)
                     if why:
                         return _Swept(least, at, why, None)
                     return _confirmed(least, at, _variation(accessory, sweep, k, worst, gains), scale)
-                curved = values > FLAT * scale
+                curved = values > FLAT_SHARE * scale
                 if not curved.all() and not flat:
                     label = _label(accessory.along.form, lift[m:, m:] @ vectors[:, 0], nu)
                     flat = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
@@ -206,7 +201,7 @@ def _swept(
     for curves in solid.values():
         smallest = np.linalg.eigvalsh(np.array([curve for _, curve in curves]))[:, 0] / scale
         i = int(np.argmin(smallest))
-        if not smallest[i] > FLAT:
+        if not smallest[i] > FLAT_SHARE:
             return None
         if smallest[i] < least:
             least, at = float(smallest[i]), float(mesh[curves[i][0]] * horizon)
@@ -218,11 +213,11 @@ def _swept(
         values, vectors = np.linalg.eigh(basis.T @ (cost[:nz, :nz] + sweep.start_cost) @ basis)
         if values[0] / scale < least:
             least, at = float(values[0] / scale), 0.0
-        if values[0] < -FLAT * scale:
+        if values[0] < -FLAT_SHARE * scale:
             return _confirmed(least, at, _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
-        if values[0] <= FLAT * scale:
+        if values[0] <= FLAT_SHARE * scale:
             flat = flat or "the cost does not curve along a variation of the start"
-        starts = basis @ vectors, np.where(values > FLAT * scale, values, 0.0)
+        starts = basis @ vectors, np.where(values > FLAT_SHARE * scale, values, 0.0)
     return _Swept(least, at, flat, None, starts, won, cost[:nz, nz])
 
 
@@ -283,7 +278,7 @@ class _Linearised(NamedTuple):
         stage[:, nz, own] = stage[:, own, nz] = (slope.reshape(n, 1, -1) @ together)[:, 0]
         ends = end_conditions(accessory)
         bends = np.abs(np.linalg.eigvalsh(stage[:, m:, m:])).max(initial=0.0) if nu else 0.0
-        scale = float(max(bends, np.abs(ends[0]).max(initial=0.0) * FLAT)) or 1.0
+        scale = float(max(bends, np.abs(ends[0]).max(initial=0.0) * FLAT_SHARE)) or 1.0
         return cls(whole, step, stage, metric, *ends, scale)
 
 
@@ -379,7 +374,7 @@ def rows_of_length_one(rows: np.ndarray, rank: float) -> np.ndarray:
 
 def _told(rows: np.ndarray) -> np.ndarray:
     """Conditions at an end as rows of length 1: what they see of states that hardly move is small, and counts."""
-    return rows_of_length_one(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), RANK)
+    return rows_of_length_one(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
 class _Variation(NamedTuple):
@@ -432,7 +427,7 @@ def _confirmed(least: float, at: float | None, found: _Variation, scale: float) 
     Conditions at the ends that path constraints imply already are dependent up to the error of the plan, and what is
     left over of them then is no freedom.
     """
-    if found.curvature < -FLAT * scale and found.slip < SLIP:
+    if found.curvature < -FLAT_SHARE * scale and found.slip < SOLVER_SHARE:
         return _Swept(least, at, "", (found.controls, found.states))
     return _Swept(least, at, f"{NEARLY} at {at or 0.0:.4g} s", None)
 
@@ -451,7 +446,7 @@ def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
     parts = controls.reshape(q, nu)
     curved = float(np.einsum("ju,juv,jv->", parts, own, parts))
     size = float(np.abs(accessory.hessian[:, nz:, nz:]).max(initial=0.0))
-    if abs(curved) > FLAT * size:
+    if abs(curved) > FLAT_SHARE * size:
         return ""
     label, time = _label(along.form, controls, nu), along.t[k * q]
     return f"singular in control {label!r} at {time:.4g} s: the Hamiltonian does not curve along it"

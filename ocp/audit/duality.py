@@ -17,7 +17,7 @@ import numpy as np
 
 from ocp.audit.costates import Adjoint, EndLimits, end_limits, ends_of_intervals
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import FLAT
+from ocp.tolerances import FLAT_SHARE
 
 __all__ = ["Fit", "best_multipliers"]
 
@@ -218,7 +218,7 @@ class _Dual:
         program.add(rows[:, :, None], self.costate[:, None, :], rate.transpose(0, 2, 1))
         program.add(rows[hold.point], hold.index[:, None], hold.slope * unit)
         bends, vectors = np.linalg.eigh(curved * unit * unit[:, None] / self.cost)
-        solid = bends > FLAT * float(np.abs(bends).max(initial=0.0))
+        solid = bends > FLAT_SHARE * float(np.abs(bends).max(initial=0.0))
         self.price = np.where(solid, 0.0, share)
         self.weight = np.where(solid, share / np.where(solid, bends, 1.0), 0.0)
         self.left = []

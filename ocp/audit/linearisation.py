@@ -14,11 +14,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import FLOOR, Sizes, as_others, nearest_bound
+from ocp.audit.sizes import Sizes, as_others, nearest_bound
 from ocp.problem.formulation import Bounds, Formulation, Sampler
 from ocp.solution import Solution, stack
+from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 
-__all__ = ["NEAR", "Limits", "Linearisation", "gauss", "integrals"]
+__all__ = ["Limits", "Linearisation", "gauss", "integrals"]
 
 POINTS = (3, 5)
 """Least and largest number of Gauss points of an interval."""
@@ -26,13 +27,6 @@ MOST_NEEDED = 150
 """Gauss points of a plan from which on the least of an interval are enough: few intervals are wide ones."""
 MOST_DERIVATIVES = 3
 """Of a limit of the states, looked at for a control."""
-NEAR = 1e-2
-"""A limit nearer than this share of the size of what it limits may push; what it pushes over the gap is charged."""
-TIGHTENED = 0.1
-"""Share of the size of what is limited by which a limit may have been tightened, to push where the plan rests on it:
-a first-order price says little of one that is farther away, beyond a maximum of the cost say."""
-STILL = 10 * FLOOR
-"""Share of the largest of its unit by which a control that moves less stands still."""
 
 
 class Limits:
@@ -61,9 +55,9 @@ class Limits:
         self.equal = equal
         self.below, self.above = (np.where(equal, 0.0, np.maximum(gap, 0.0)) for gap in (value - low, high - value))
         sides = zip((self.below, self.above), tightened, strict=True)
-        gaps = [np.maximum(gap - np.where(by <= TIGHTENED * size, by, 0.0), 0.0) for gap, by in sides]
+        gaps = [np.maximum(gap - np.where(by <= TIGHTENED_SHARE * size, by, 0.0), 0.0) for gap, by in sides]
         self.gap = np.minimum(*gaps)
-        self.lower, self.upper = (equal | (gap <= NEAR * size) for gap in gaps)
+        self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: slice) -> Limits:
         """The same at some of the points."""
@@ -216,7 +210,7 @@ class Linearisation:
         fastest = np.vstack(speed).max(axis=0)
         found = sizes.state.copy()
         with np.errstate(divide="ignore"):  # what moves nothing but by rounding is as large as its floor says
-            found[still] = np.minimum(1.0 / fastest, found[still] / FLOOR)
+            found[still] = np.minimum(1.0 / fastest, found[still] / SOLVER_SHARE)
         return found
 
     def _control_sizes(self) -> np.ndarray:
@@ -228,11 +222,11 @@ class Linearisation:
         form, own = self.form, self.sizes.control
         low, high = (side[form.bounds.places["control"]] for side in self.bounds)
         others = own.copy()
-        as_others(others, form.controls, form.problem.declared.controls, STILL)
+        as_others(others, form.controls, form.problem.declared.controls, RESOLVED_SHARE)
         bound = np.minimum(1.0, nearest_bound((low, high)))
-        whole = np.where(others <= STILL * bound, bound, others)
+        whole = np.where(others <= RESOLVED_SHARE * bound, bound, others)
         off = np.minimum(np.abs(self.u - low), np.abs(self.u - high)).max(axis=0, initial=0.0)
-        return np.asarray(np.where(off <= STILL * whole, whole, own))
+        return np.asarray(np.where(off <= RESOLVED_SHARE * whole, whole, own))
 
     def _limits(self) -> None:
         form, sizes, (n, q) = self.form, self.sizes, self.shape

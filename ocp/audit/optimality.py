@@ -17,19 +17,12 @@ from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope, t
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
+from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE
 
 __all__ = ["Optimality", "optimality"]
 
-CONTROLS_KNOWN = 1e-3
-"""Share of their sizes up to which controls are told apart, where the cost itself is nearly nothing."""
-
-
 SPREADS = 4
 """Times that pushes at single nodes are spread: each finds them better by the width of an interval."""
-DEGENERATE = 1e-3
-"""Share of the cost from which on others than the reported costates are looked for."""
-ROUNDING = 1e-10
-"""Share of what the controls themselves would cost, below which costates are rounding."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,7 @@ def optimality(
     p: np.ndarray,
     bounds: Bounds,
     along: Linearisation | None = None,
-    allowed: float = DEGENERATE,
+    allowed: float = LIMIT_SHARE,
 ) -> Optimality:
     """Look for the multipliers of a plan, for what it loses and for how the cost curves.
 
@@ -94,7 +87,7 @@ def optimality(
             first, told = found, now
     accessory = AccessoryProblem(along, first)
     spread = accessory.spread
-    cost = max(abs(solution.cost), CONTROLS_KNOWN * accessory.price, CONTROLS_KNOWN**2 * along.slope_size)
+    cost = max(abs(solution.cost), LIMIT_SHARE * accessory.price, LIMIT_SHARE**2 * along.slope_size)
     cost = cost if cost > 0 else 1.0
     total = lost(along, first.costate, first.holding, accessory.curved)
     total, best = np.maximum(total, 0.0) + first.charge, first
@@ -118,7 +111,7 @@ def optimality(
     return Optimality(
         total,
         cost,
-        max(float(np.sqrt(cost * max(cost, spread))), ROUNDING * accessory.magnitude),
+        max(float(np.sqrt(cost * max(cost, spread))), RESOLVED_SHARE**2 * accessory.magnitude),
         along.t,
         reduced_slope(along, best.costate, best.holding),
         best,

@@ -15,10 +15,9 @@ import numpy as np
 from ocp.audit.linearisation import Linearisation
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, stack
+from ocp.tolerances import FLAT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = [
-    "DEPENDENT",
-    "FLAT",
     "Hamiltonian",
     "balance",
     "groups",
@@ -32,15 +31,6 @@ __all__ = [
     "slope",
     "turning",
 ]
-
-DEPENDENT = 1e-9
-"""Singular values below this share of the largest are none."""
-ROUNDED = 1e-14
-"""Of a slope: what is left of it by rounding."""
-STEEP = 1e-6
-"""Slope of the Hamiltonian, of the largest, above which it is worth looking for what holds it across a gap."""
-FLAT = 1e-7
-"""Curvature, relative to the largest of the plan, below which the cost counts as not curved."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +89,11 @@ def holders(
         return found, across
     left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
     steep = float(np.abs(gradient).max())
-    for k in np.flatnonzero(left > STEEP * steep):
+    for k in np.flatnonzero(left > SOLVER_SHARE * steep):
         bend = curved[k] * unit * unit[:, None]
         values, vectors = np.linalg.eigh((bend + bend.T) / 2)
-        root = vectors / np.sqrt(np.maximum(values, np.abs(gradient[k]).max() * FLAT + FLAT * np.abs(values).max()))
+        least = FLAT_SHARE * (np.abs(gradient[k]).max() + np.abs(values).max())
+        root = vectors / np.sqrt(np.maximum(values, least))
         sides = []
         for i in range(len(found[k])):
             both = hold.lower[k, i] and hold.upper[k, i]
@@ -144,7 +135,7 @@ def inverses(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
     found = np.zeros((m, n, count))
     for pattern, members in groups(held):
         if pattern.any():
-            inverse = np.linalg.pinv(rows[members][:, pattern], rcond=DEPENDENT)
+            inverse = np.linalg.pinv(rows[members][:, pattern], rcond=ROUNDING_SHARE)
             found[members[:, None], :, np.flatnonzero(pattern)] = inverse.transpose(0, 2, 1)
     return found
 
@@ -187,7 +178,7 @@ def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free:
     y = np.zeros(matrix.shape[1])
     bound = ~free
     if free.any():
-        inverse = np.linalg.pinv(matrix[:, free], rcond=DEPENDENT)
+        inverse = np.linalg.pinv(matrix[:, free], rcond=ROUNDING_SHARE)
         rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
         left = target - matrix[:, free] @ (inverse @ target)
         y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
@@ -253,7 +244,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
     low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
     size = np.abs(along.hold_u * unit).max(axis=2)
-    pushes = (np.abs(multipliers) * size > FLAT * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
+    pushes = (np.abs(multipliers) * size > FLAT_SHARE * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
     fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
     best = np.zeros(len(won))
     while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
@@ -268,7 +259,7 @@ def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, cur
             change = np.einsum("ku,ku->k", gradient[members], step)
             change += np.einsum("ku,kuv,kv->k", step, curved[members], step) / 2
             best[members] = np.maximum(best[members], -change)
-            blocked[members, :nu] |= room <= DEPENDENT
+            blocked[members, :nu] |= room <= ROUNDING_SHARE
         if (blocked == fixed).all():
             break
         fixed = blocked
@@ -283,7 +274,7 @@ def turning(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np
     (n, q), unit = along.shape, along.control_size
     pull, bends = slope(along, costate) * unit, curved * (unit * unit[:, None])
     largest = max(float(np.abs(bends).max(initial=0.0)), float(np.abs(pull).max(initial=0.0)))
-    flat = np.abs(bends).max(axis=(0, 2), initial=0.0) <= FLAT * largest
+    flat = np.abs(bends).max(axis=(0, 2), initial=0.0) <= FLAT_SHARE * largest
     if along.mixed.size or not flat.any():
         return np.zeros(n)
     m, pull = int(flat.sum()), pull[:, flat].reshape(n, q, -1)
@@ -318,7 +309,7 @@ def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale
     inside = projector @ curved @ projector + scale * (np.eye(nu) - projector)
     values, vectors = np.linalg.eigh((inside + inside.transpose(0, 2, 1)) / 2)
     along = np.einsum("kuv,ku->kv", vectors, pull)
-    solid = values > FLAT * scale
+    solid = values > FLAT_SHARE * scale
     step = np.where(solid, -along / np.where(solid, values, 1.0), -np.sign(along))
-    step = np.where(np.abs(along) > ROUNDED * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
+    step = np.where(np.abs(along) > MACHINE_SHARE * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
     return np.asarray(projector @ np.einsum("kuv,kv->ku", vectors, step)[..., None])[..., 0]

@@ -19,26 +19,11 @@ from ocp.curves import lagrange
 from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
+from ocp.tolerances import HELD_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
-__all__ = [
-    "FLOOR",
-    "FineGrid",
-    "Sizes",
-    "as_others",
-    "changes",
-    "fine_grid",
-    "integral",
-    "plan_at",
-    "sizes",
-    "sizes_along",
-]
+__all__ = ["FineGrid", "Sizes", "as_others", "changes", "fine_grid", "integral", "plan_at", "sizes", "sizes_along"]
 
 GRID_FACTOR = 10  # times as fine as the plan's own points is the grid on which a plan is looked at
-FLOOR = 1e-6  # of the largest value: what is smaller cannot be told from the solver's own tolerance
-ROUNDING = 1e-9  # of the largest of its kind: what moves less stands still
-HELD = 1e-2  # of what it is made of: a task that asks for less of a way is judged by this share of it
-STILL = 1e-12  # SI units: what moves less, and is not told to move, stands still
-SAME = 1e-14  # of the horizon, between breaks that are one
 COSTS = ("running", "terminal")
 PLACES = 32  # of the horizon, at which a constraint is looked at for what it is made of
 
@@ -86,7 +71,7 @@ def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     pieces, d = max((len(curve.breaks) - 1) // n, 1), len(curve.nodes)
     inside = places + np.where(places > 0, -0.1, 0.1) / (GRID_FACTOR * pieces * d)
     even = (mesh[:-1, None] + width[:, None] * (np.arange(pieces) / pieces)).ravel()
-    same = len(even) == len(curve.breaks) - 1 and np.abs(even - curve.breaks[:-1]).max() < SAME
+    same = len(even) == len(curve.breaks) - 1 and np.abs(even - curve.breaks[:-1]).max() < MACHINE_SHARE
     if same and np.isfinite(curve.values).all():
         piece = np.clip((inside * pieces).astype(int), 0, pieces - 1)
         basis = np.zeros((m, pieces, d))
@@ -151,7 +136,8 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
         for what, at in zip(COSTS, (spaced(grid), spaced(grid)[-1:]), strict=True)
     ]
     watch = _watched(form, watch, horizon, integral(way, grid.t))
-    return Sizes(state, control, path, start, end, watch, max(spent, FLOOR * (horizon * made_of[0] + made_of[1])))
+    least = SOLVER_SHARE * (horizon * made_of[0] + made_of[1])
+    return Sizes(state, control, path, start, end, watch, max(spent, least))
 
 
 def spaced(grid: FineGrid) -> np.ndarray:
@@ -192,8 +178,8 @@ def _sizes_of(
     spread = np.where(free, largest, spread)
     known = np.zeros(spread.shape, dtype=bool)
     for end in ends:
-        known |= np.abs(np.nan_to_num(end)) > STILL
-    return _floored(np.maximum(spread, FLOOR * largest), known, np.minimum(1.0, nearest_bound(declared)))
+        known |= np.abs(np.nan_to_num(end)) > STANDSTILL
+    return _floored(np.maximum(spread, SOLVER_SHARE * largest), known, np.minimum(1.0, nearest_bound(declared)))
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
@@ -203,11 +189,11 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 
 
 def _floored(
-    size: np.ndarray, known: np.ndarray, least: np.ndarray, still: Any = STILL
+    size: np.ndarray, known: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sizes, those of what stands still at zero not below the floor, and which of them do not stand still."""
-    moves = known | (size > np.maximum(ROUNDING * size.max(initial=0.0), still))
-    floor = FLOOR * np.minimum(least, size[moves].max() if moves.any() else 1.0)
+    moves = known | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
+    floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
 
 
@@ -240,10 +226,10 @@ def _rows_of(
     made_of, moved, own, largest = _made_of(form, kind, grid, picked, horizon, p, entries)
     if values is not None:
         own, largest = _spread(values)
-    made_of = np.where(moved | (largest <= STILL), made_of, 0.0)  # what is there though nothing moves has a size
-    size = np.maximum(np.maximum(own, made_of), FLOOR * largest)
+    made_of = np.where(moved | (largest <= STANDSTILL), made_of, 0.0)  # what is there though nothing moves has a size
+    size = np.maximum(np.maximum(own, made_of), SOLVER_SHARE * largest)
     least = np.minimum(1.0, nearest_bound(_of(bounds, rows.bounds)))
-    still, told = np.where(moved, 0.0, STILL), ~moved & (largest > STILL)
+    still, told = np.where(moved, 0.0, STANDSTILL), ~moved & (largest > STANDSTILL)
     for name in rows.names:
         mine = rows.of(name)
         size[mine] = _floored(size[mine], told[mine], least[mine], still[mine])[0]
@@ -261,7 +247,7 @@ def _watched(form: Formulation, made_of: np.ndarray, horizon: float, ways: np.nd
     for name in form.watch.names:
         mine = form.watch.of(name)
         if form.problem.declared.watch[name].way is not None:
-            size[mine] = max(way[mine].max(), HELD * made_of[mine].max())
+            size[mine] = max(way[mine].max(), HELD_SHARE * made_of[mine].max())
     return np.asarray(size)
 
 
@@ -290,7 +276,7 @@ def _made_of(
     change = change.max(axis=1)
     moves = np.resize(entries[1], len(change))
     told, every = change[moves].sum(axis=0), change.sum(axis=0)
-    moved = told > ROUNDING * every
+    moved = told > ROUNDING_SHARE * every
     return np.where(moved, told, every), moved, *_spread(here)
 
 

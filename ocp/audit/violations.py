@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ocp.audit.reintegration import Reintegration
-from ocp.audit.sizes import FLOOR, Sizes, changes, integral
+from ocp.audit.sizes import Sizes, changes, integral
 from ocp.problem.formulation import Bounds, Formulation
+from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 __all__ = ["Violation", "violations"]
-
-SHIFT = 1e-3  # of the sizes of states and controls, by which they are moved to see how a constraint changes
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def violations(
                 over = beyond(values[at][:, place][:, given], low[given], high[given])
                 found.append(judged(f"{what} {name}", name, again.t[at], over, size[place][given]))
     begin = states[0], again.controls[0]
-    entries = SHIFT * np.concatenate([sizes.state, sizes.control])
+    entries = LIMIT_SHARE * np.concatenate([sizes.state, sizes.control])
     whole = slice(None)
     here = states, again.controls, again.t, horizon, p, (form.x0, begin[0]), (form.u0, begin[1])
     outputs = [form.path.expression, form.watch.expression]
@@ -97,12 +96,10 @@ def violations(
             over = np.where(limited, np.maximum(over, missed), over)
         size = np.tile(size, (len(t), 1))
         worst = np.argmax(over, axis=0), np.arange(len(rows))
-        if kind != "watch" and np.any(
-            over[worst] > FLOOR * size[worst]
-        ):  # by how much it changes where it is missed most
+        if kind != "watch" and np.any(over[worst] > SOLVER_SHARE * size[worst]):  # judged by how it changes there
             change = changes(form, kind, (x[worst[0]], u[worst[0]], t[worst[0]]), begin, horizon, p, entries)[1]
-            by = change.sum(axis=0)[worst[1], worst[1]] / SHIFT
-            size[worst] = np.clip(by, FLOOR * size[worst], size[worst])
+            by = change.sum(axis=0)[worst[1], worst[1]] / LIMIT_SHARE
+            size[worst] = np.clip(by, SOLVER_SHARE * size[worst], size[worst])
         with np.errstate(divide="ignore"):
             size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:

@@ -18,11 +18,10 @@ from ocp.schedule.rows import causes
 from ocp.schedule.stretch import fastest_over
 from ocp.schedule.window import Stretch
 from ocp.schedule.zones import ramps_below_the_curve
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Dip", "Schedule", "schedule"]
 
-KEPT = 1e-9
-"""Limits count as kept, and speeds as reached, up to this, relative."""
 BINDING = 0.98
 """A limit binds where more than this share of it is used."""
 REACHED = 1e-4
@@ -212,8 +211,8 @@ def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
         turn = LineMotion(*(value[inside] for value in turns))
         for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
             motion = LineMotion(*(value[ends] for value in here))
-            over[first:last] |= (np.abs(rows.demands(motion)) > 1 + KEPT).any(axis=1)
-            passed = (np.abs(rows.of(at[inside] - first).demands(turn)) > 1 + KEPT).any(axis=1)
+            over[first:last] |= (np.abs(rows.demands(motion)) > 1 + ROUNDING_SHARE).any(axis=1)
+            passed = (np.abs(rows.of(at[inside] - first).demands(turn)) > 1 + ROUNDING_SHARE).any(axis=1)
             np.logical_or.at(over, at[inside], passed)
     return over
 
@@ -225,9 +224,9 @@ def _stretches(grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], reach:
     """
     count, s, limits = len(broken), grid.distance, grid.limits
     here = base.at_distance(s)
-    steady = (np.abs(here.acceleration) <= KEPT * limits.acceleration) & (here.jerk == 0)
+    steady = (np.abs(here.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (here.jerk == 0)
     asked = np.minimum(np.append(grid.asked, np.inf), np.insert(grid.asked, 0, np.inf))
-    steady &= np.abs(here.speed - asked) <= KEPT * asked
+    steady &= np.abs(here.speed - asked) <= ROUNDING_SHARE * asked
     steady[[0, -1]] = True
     seats = np.flatnonzero(steady)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], broken.astype(np.int8), [0]]))).reshape(-1, 2)

@@ -25,11 +25,10 @@ from ocp.schedule.profile import Array, SpeedProfile, joined
 from ocp.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.schedule.rows import Rows
 from ocp.schedule.window import HELD, INSIDE, ROOM, Ends, Motion, Stretch, Window, demanded, profile_of
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["fastest_over"]
 
-KEPT = 1e-9
-"""Limits count as kept up to this, relative."""
 ROUNDS = 20
 """Of tightening."""
 MANY = 200
@@ -249,7 +248,7 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Arr
             tight.hold_near(used, values, window.rows[1].jerk[:, :, 0])
             start = x, slope
             continue
-        passed = used > 1 + KEPT
+        passed = used > 1 + ROUNDING_SHARE
         over = np.asarray(passed.any(axis=(0, 2)))
         if not over[:seen].any() and accuracy == ACCURACIES[-1]:
             return x, slope
@@ -483,7 +482,7 @@ def _rows(
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
     second = first + places[0].acceleration.shape[1]
-    nodes = np.flatnonzero((caps < implied * (1 - KEPT)) & np.isfinite(caps))
+    nodes = np.flatnonzero((caps < implied * (1 - ROUNDING_SHARE)) & np.isfinite(caps))
     nodes = nodes[(nodes >= int(moving[0])) & (nodes <= count - int(moving[1]))]
     parts = [_speeds(np.minimum(nodes, count - 1), (nodes == count).astype(float), 1 / caps[nodes])]
     slow = np.flatnonzero(shares.speed < SEAM * (1 - ROOM))

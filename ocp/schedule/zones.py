@@ -15,11 +15,10 @@ from ocp.errors import ProblemError
 from ocp.schedule.limits import LineLimits, PathLike, curvature_along
 from ocp.schedule.profile import Array, SpeedProfile, piece_of
 from ocp.schedule.ramps import Zones, plan
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["ramps_below_the_curve"]
 
-KEPT = 1e-9
-"""Limits count as kept up to this, relative."""
 KEPT_BACK = 2e-4
 """Share of the permitted speed kept back for what lies between two points of the grid."""
 MINIMUM_ERROR = 2e-4
@@ -131,7 +130,7 @@ def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, th
     peaks = profile.peaks()
     np.maximum.at(top, piece_of(s, peaks.distance), peaks.speed)
     most = np.minimum(permitted[:-1], permitted[1:])
-    fast = np.minimum(top, speed) > most * (1 + KEPT)
+    fast = np.minimum(top, speed) > most * (1 + ROUNDING_SHARE)
     if thoroughly:
         speed[fast] = most[fast]
         return bool(fast.any())

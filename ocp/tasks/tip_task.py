@@ -18,8 +18,8 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.robot.indices import checked_rows
 from models.spatial import expression
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_nonnegative, checked_positive, checked_text
-from ocp.tasks.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 from ocp.tasks.tracks import Track, along, run_by
+from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "one_of", "timed"]
 
