@@ -4,7 +4,7 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
-from models.machines.actuators import Gyro, Thruster, gyro_matrix, gyros_of, wheels_of, with_gyros, with_wheels
+from models.machines.actuators import wheels_of, with_wheels
 from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine
@@ -62,7 +62,6 @@ __all__ = [
     "Footprint",
     "Frame",
     "FreeFloating",
-    "Gyro",
     "HalfSpace",
     "Helix",
     "Joint",
@@ -84,7 +83,6 @@ __all__ = [
     "Standing",
     "Support",
     "Surroundings",
-    "Thruster",
     "Tunnel",
     "VisualShape",
     "Wrench",
@@ -97,8 +95,6 @@ __all__ = [
     "example_robot",
     "footprint",
     "frame_jacobian",
-    "gyro_matrix",
-    "gyros_of",
     "inverse_dynamics",
     "link_frames",
     "link_jacobians",
@@ -129,7 +125,6 @@ __all__ = [
     "tip_jacobian",
     "tip_pose",
     "wheels_of",
-    "with_gyros",
     "with_load",
     "with_wheels",
 ]

@@ -5,7 +5,8 @@ from ocp.audit.certificate import Certificate
 from ocp.builders.capture import capture_problem, chained_capture, plan_capture
 from ocp.builders.clearance import Clear
 from ocp.builders.cts import roll_problem, spline_targets
-from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem, joint_torques
+from ocp.builders.drives import Effort, JointFriction, joint_torques
+from ocp.builders.dynamics import dynamics_problem
 from ocp.builders.dynamics_plan import plan_dynamics
 from ocp.builders.grasping import Cone, Grasp
 from ocp.builders.joint_spline import joint_path

@@ -31,7 +31,6 @@ MADE_BY_THE_PACKAGE = {
     "Finding",
     "Footprint",
     "Frame",
-    "Gyro",
     "JointPath",
     "JointRates",
     "TorqueRates",

@@ -23,8 +23,9 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, ArrayInput, checked_array, checked_choice, checked_instance
+from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_instance
 from models.errors import ModelError
+from models.robot.dynamics import inverse_dynamics
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import (
     center_of_mass,
@@ -45,7 +46,6 @@ from models.spatial import (
     Frame,
     angular_velocity_from_quaternion,
     cross,
-    expression,
     force_transform,
     motion_transform,
     on_scalars,
@@ -73,10 +73,6 @@ class FreeFloating:
     a planar base, (x, y, z, qw, qx, qy, qz) for a spatial one, with a unit quaternion. A base twist is
     (angular velocity, velocity of the root frame's origin) in world axes, shape (6, 1); for a planar base
     (angular velocity, vx, vy), shape (3, 1).
-
-    Where something acts from outside, the momentum is a state beside the configuration: every function takes it below
-    the configuration of the base, (pose, momentum), of shape (base_size + 6, 1), or (base_size + 3, 1) if planar,
-    instead of the conserved one; `momentum_rate` is its derivative.
 
     Attributes:
         robot: The kinematic tree; a single body without joints moves as its momentum makes it tumble.
@@ -128,7 +124,7 @@ class FreeFloating:
 
     def world_from_base(self, base: Expression) -> Frame:
         """Placement of the root link's frame in the world."""
-        base = self._split(base)[0]
+        base = self._checked_base(base)
         if self.base == "planar":
             return Frame(rotation((0, 0, 1), base[2]), ca.vertcat(base[0:2], type(base)(1, 1)))
         return Frame(rotation_from_quaternion(base[3:7]), base[0:3])
@@ -169,7 +165,7 @@ class FreeFloating:
         if self.base == "planar":
             twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
-        pose = self._split(base)[0]
+        pose = self._checked_base(base)
         reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
         turn = self.world_from_base(base).rotation
         quaternion, spin = pose[3:7], reaction.base_angular
@@ -180,7 +176,7 @@ class FreeFloating:
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
         """Twist of a base whose configuration changes with `base_rate`. Shape (6, 1), or (3, 1) if planar."""
         rate = checked_vector(base_rate, self.base_size, "base_rate", "the derivative of the base configuration")
-        base = self._split(base)[0]
+        base = self._checked_base(base)
         if self.base == "planar":
             return ca.vertcat(rate[2], rate[0:2])
         return ca.vertcat(angular_velocity_from_quaternion(base[3:7], rate[3:7]), rate[0:3])
@@ -212,21 +208,36 @@ class FreeFloating:
         return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
 
     @on_scalars
-    def momentum_rate(self, base: Expression, q: Expression, wrench: Expression) -> Expression:
-        """Time derivative of the momentum under what acts from outside, in the order of `conserved_momentum`.
+    def joint_torques(
+        self, base: Expression, q: Expression, joint_rates: Expression, accelerations: Expression
+    ) -> Expression:
+        """Torques (forces of prismatic joints) of a motion on which nothing acts from outside. Shape (n, 1), N m or N.
 
-        The linear one changes by the force, the angular one about the centre of mass by the moment about it.
+        Computed in the axes of the base. Its pose enters only through the carried momentum h, whose components change
+        as these axes turn with the angular velocity w: h' = -w x h.
 
         Args:
-            wrench: (Moment about the world's origin, force), world axes, as of `external_wrench`. Shape (6, 1).
-
-        Returns:
-            Shape (6, 1) or (3, 1).
+            base, q, joint_rates: Symbols, for they are differentiated. Shape (base_size, 1), (n, 1) and (n, 1).
+            accelerations: Of the joints. Shape (n, 1).
         """
-        wrench = checked_vector(wrench, TWIST_SIZE, "wrench", "moment about the world's origin, then force")
-        center = center_of_mass(self.robot, q, self.world_from_base(base))
-        about_center = wrench[0:3] - cross(center, wrench[3:6])
-        return ca.densify(ca.vertcat(about_center, wrench[3:6]))[self.twist_rows, :]
+        carried, plane = self._carried(), ca.DM.eye(TWIST_SIZE)[:, self.twist_rows]
+        momentum = ca.SX.sym("momentum", 0 if carried is None else TWIST_SIZE)
+        held = None if carried is None else (momentum[:3], momentum[3:])
+        reaction = _reaction(self.robot, q, joint_rates, held, planar=self.base == "planar", tip=False)
+        twist = ca.mtimes(plane, ca.vertcat(reaction.base_angular, reaction.base_linear)[self.twist_rows])
+        spin = twist[0:3]
+        turning = ca.vertcat(ca.DM(0, 1), *(-cross(spin, part) for part in held or ()))
+        along = ca.vertcat(turning, joint_rates, accelerations)
+        second = ca.mtimes(plane.T, ca.jtimes(twist, ca.vertcat(momentum, q, joint_rates), along))
+        second = ca.mtimes(plane, second) + ca.vertcat(ca.DM(3, 1), cross(spin, twist[3:6]))
+        found = inverse_dynamics(
+            self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_twist=twist,
+            base_acceleration=second,
+        )  # fmt: skip
+        if carried is None:
+            return found
+        turn = self.world_from_base(base).rotation.T
+        return ca.substitute(found, momentum, ca.densify(ca.SX(ca.vertcat(*(ca.mtimes(turn, h) for h in carried)))))
 
     @on_scalars
     def momentum_residual(
@@ -237,7 +248,7 @@ class FreeFloating:
         Zero if the motion is possible.
         """
         found = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
-        carried = self._carried(base)
+        carried = self._carried()
         if carried is None:
             return found
         angular, linear = carried
@@ -271,37 +282,26 @@ class FreeFloating:
         angular, linear = ca.mtimes(turn, reaction.tip_angular), ca.mtimes(turn, reaction.tip_linear)
         return ca.densify(ca.vertcat(angular, linear))
 
-    def _split(self, base: Expression) -> tuple[Expression, Expression | None]:
-        """Pose of the base, and the momentum where it is given with it."""
+    def _checked_base(self, base: Expression) -> Expression:
+        """Configuration of the base; ModelError for another size."""
         meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
-        size, whole = self.base_size, self.base_size + len(self.twist_rows)
-        try:
-            given = expression(base)
-        except NOT_NUMBERS:
-            given = ca.DM()
-        if given.shape == (whole, 1):
-            both = checked_vector(given, whole, "base", f"{meaning} and the momentum")
-            return both[:size], both[size:]
-        return checked_vector(base, size, "base", meaning), None
+        return checked_vector(base, self.base_size, "base", meaning)
 
-    def _carried(self, base: Expression) -> tuple[Expression, Expression] | None:
+    def _carried(self) -> tuple[Expression, Expression] | None:
         """(Angular about the centre of mass, linear) momentum, world axes, shape (3, 1) each; None where it is zero."""
-        momentum = None if base is None else self._split(base)[1]
-        if momentum is None:
-            if not np.any(self.conserved_momentum):
-                return None
-            momentum = expression(self.conserved_momentum)
-        if self.base == "planar":
-            zero = ca.DM(1, 1)
-            return ca.vertcat(zero, zero, momentum[0]), ca.vertcat(momentum[1:3], zero)
-        return momentum[0:3], momentum[3:6]
+        momentum = np.asarray(self.conserved_momentum)
+        if not momentum.any():
+            return None
+        spatial = np.zeros(TWIST_SIZE)
+        spatial[self.twist_rows] = momentum
+        return ca.DM(spatial[:3]), ca.DM(spatial[3:])
 
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
         """Of the robot, with the momentum in the base's axes where rates are given."""
         carried = None
-        if joint_rates is not None and (momentum := self._carried(base)) is not None:
+        if joint_rates is not None and (momentum := self._carried()) is not None:
             turn = self.world_from_base(base).rotation
             carried = ca.mtimes(turn.T, momentum[0]), ca.mtimes(turn.T, momentum[1])
         return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar", tip=tip)

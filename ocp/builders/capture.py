@@ -6,9 +6,9 @@ Chaser and target both float. The target has no joints and nothing acts on it, s
 
 and its tip is the frame that is grasped. The chaser's tip reaches that frame with the same twist, at a time that may be
 free. From there on both are one machine, the target a link on the chaser's tip: base and joints go on as they were, and
-the momentum is that of both (`ocp.builders.grasping`), a constant that is known before anything is planned, unless
-thrusters act. At the end neither joints nor base turn: the momentum is in wheels and gyros then, which have to be able
-to hold it (`ocp.builders.capture_bounds`). Rest is relative to the centre of mass of the pair, which goes on at P / m.
+the momentum is that of both (`ocp.builders.grasping`), a constant that is known before anything is planned. At the end
+neither joints nor base turn: the momentum is in the wheels then, which have to be able to hold it
+(`ocp.builders.capture_bounds`). Rest is relative to the centre of mass of the pair, which goes on at P / m.
 
 Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) plan both objectives at once, too, without wheels: the
 chaser brings the momentum against that of the target, which is `conserved_momentum` here. Each phase at its own least
@@ -17,33 +17,23 @@ effort, one after the other, is `chained_capture`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypedDict, Unpack
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from models import FreeFloating, Thruster, center_of_mass, wheels_of
+from models import FreeFloating, center_of_mass, wheels_of
 from models.arrays import Array
-from ocp.audit.clearance import Clearance
-from ocp.builders.capture_bounds import Start, held_by_rotors, require_reach, require_room
+from ocp.builders.capture_bounds import Start, held_by_wheels, require_reach, require_room
 from ocp.builders.capture_guess import guess_approach, guess_braking, guessed
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import (
-    Effort,
-    JointFriction,
-    checked_steady,
-    checked_thrusters,
-    dynamics_problem,
-    rates_at,
-    told_or,
-)
+from ocp.builders.drives import Effort, JointFriction
+from ocp.builders.dynamics import dynamics_problem, rates_at
 from ocp.builders.dynamics_plan import within_limits
 from ocp.builders.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.builders.standing.problem import FreeTime
-from ocp.builders.target_clearance import ClearOfTarget
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_instance
@@ -68,11 +58,8 @@ class AskedOfCapture(TypedDict, total=False):
     limits: Limits | None
     effort: Effort | None
     friction: JointFriction | None
-    thrusters: Sequence[Thruster]
-    steady: Sequence[str]
     cone: Cone | None
     grasp: Grasp | None
-    clearance: float | ClearOfTarget | None
     clear: Clear | None
     end_joints: Any
     rest: bool
@@ -94,48 +81,39 @@ def capture_problem(
     counted from the start of each phase.
 
     Args:
-        chaser: With its arm, and wheels or gyros among its joints (`models.with_wheels`, `with_gyros`); its momentum is
-            that at the start, of the rotors that spin, too.
+        chaser: With its arm, and wheels among its joints (`models.with_wheels`); its momentum is that at the start, of
+            the wheels that spin, too.
         target: A machine of one link without joints, on the same kind of base, with its momentum; its tip is the frame
             that is grasped, which the chaser's tip meets axis by axis.
         start_joints: Of the chaser. Shape (n,), rad or m.
         approach, detumble: How long the phases take, s, or FreeTime(...).
         asked: start_base, target_base: configurations of both bases at the start; home if None. Shape (base_size,).
             start_velocities: Of the chaser's joints; at rest if None. Shape (n,), rad/s.
-            limits, effort, friction, thrusters, steady: As of `dynamics_problem`, of both phases; rotors of gyros are
-            steady, at the velocities with which they start.
+            limits, effort, friction: As of `dynamics_problem`, of both phases.
             cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
             grasp: What the hand bears while detumbling.
-            clearance: How far the chaser's bodies stay from the target's while approaching, m, but for those of the
-            hand: what moves with the tip, and what hangs on it. None: they are not looked at.
-            clear: What the chaser stays clear of besides while approaching, as of `dynamics_problem`.
+            clear: What the chaser stays clear of while approaching, as of `dynamics_problem`; not the target.
             end_joints: At the end of the detumbling. Shape (n,), nan where free, as those of wheels.
             rest: Whether joints (but for wheels) and base turn no more at the end; True if not given.
 
     Raises:
-        ProblemError: Machines that are none, a target with joints, sizes and values as of `dynamics_problem`, a
-            clearance between bodies without shapes; or "momentum": rest is asked for, and wheels, gyros and thrusters
-            cannot take the momentum of both: `value` is its size, `limit` what they take at most, N m s; or "reach":
-            the target is farther off, `value`, than the arm is long, `limit`, m, and nothing pushes the chaser there.
+        ProblemError: Machines that are none, a target with joints, sizes and values as of `dynamics_problem`; or
+            "momentum": rest is asked for, and the wheels cannot take the momentum of both: `value` is its size, `limit`
+            what they take at most, N m s; or "reach": the target is farther off, `value`, than the arm is long,
+            `limit`, m.
     """
     given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     begin, after = given.approach(approach), given.detumbling(detumble, None)
     given.guess_approach(begin)
-    guess_braking(after, given.pair, given.steady, *_end_of(begin))
+    guess_braking(after, given.pair, *_end_of(begin))
     problem = Phases("capture", {APPROACH: begin, DETUMBLE: after})
     one, other = problem[APPROACH], problem[DETUMBLE]
     end = {name: one.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
-    rates_kept = np.where(given.steady, given.start.velocities, np.nan)
-    begins = {"joints": ca.DM(given.arm) * end["joints"], "velocities": told_or(rates_kept, one.at_end("velocities"))}
-    if given.thrusters:
-        begins["base"] = _of_unit_length(chaser, end["base"])
-        base = ca.vertcat(base, one.at_end("momentum"))
-        begins["momentum"] = pair_momentum(
-            chaser, target, end["base"], end["target"], end["joints"], one.at_end("momentum")
-        )
-    else:
-        begins["base"] = given.base_after(end["base"], end["joints"], one.duration)
+    begins = {
+        "joints": ca.DM(given.arm) * end["joints"], "velocities": one.at_end("velocities"),
+        "base": given.base_after(end["base"], end["joints"], one.duration),
+    }  # fmt: skip
     problem.join(APPROACH, DETUMBLE, begins)
     given.grasp(problem, base, joints, rates, end["target"])
     return problem
@@ -169,13 +147,13 @@ def plan_capture(
         SolveError: As of `plan_dynamics`.
     """
 
-    def declare(kept: _Kept) -> Problem:
-        return capture_problem(chaser, target, start_joints, approach, detumble, **kept.told(asked))
+    def declare(clear: Clear | None) -> Problem:
+        kept: AskedOfCapture = {**asked, "clear": clear}
+        return capture_problem(chaser, target, start_joints, approach, detumble, **kept)
 
     mesh = POINTS if method is None else method
     driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
-    return within_limits(declare, given.kept, mesh, (), options, tolerances, driven)
+    return within_limits(declare, asked.get("clear"), mesh, (), options, tolerances, driven)
 
 
 @interruptible
@@ -203,41 +181,26 @@ def chained_capture(
     given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     given.detumbling(detumble, None)  # refused before the approach is solved
 
-    def first(kept: _Kept) -> Problem:
-        problem = replace(given, asked=kept.told(given.asked)).approach(approach)
+    def first(clear: Clear | None) -> Problem:
+        problem = replace(given, asked={**asked, "clear": clear}).approach(approach)
         given.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
         given.guess_approach(problem)
         return problem
 
-    one = within_limits(first, given.kept, mesh, (), options, tolerances, {"": (chaser, limits)})
+    one = within_limits(first, asked.get("clear"), mesh, (), options, tolerances, {"": (chaser, limits)})
     end = dict(one.at_fraction(1.0))
     end["joints"] = given.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
-    def second(_: _Kept) -> Problem:
+    def second(_: Clear | None) -> Problem:
         problem = given.detumbling(detumble, end)
-        guess_braking(problem, given.pair_after(end), given.steady, end["joints"], end["velocities"], end["base"])
+        guess_braking(problem, given.pair, end["joints"], end["velocities"], end["base"])
         return problem
 
-    return one, within_limits(second, _Kept(None, None), mesh, (), options, tolerances, {"": (given.pair, limits)})
+    return one, within_limits(second, None, mesh, (), options, tolerances, {"": (given.pair, limits)})
 
 
 # ---- inside ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """What the approach stays clear of: itself and its surroundings, and the target."""
-
-    clear: Clear | None
-    target: ClearOfTarget | None
-
-    def widened(self, proofs: Sequence[Clearance]) -> _Kept:
-        return _Kept(self.clear and self.clear.widened(proofs), self.target and self.target.widened(proofs))
-
-    def told(self, asked: AskedOfCapture) -> AskedOfCapture:
-        """What is asked, with these margins."""
-        return {**asked, "clear": self.clear, "clearance": self.target}
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +214,6 @@ class _Capture:
     base: Array
     target_base: Array
     times: tuple[float | FreeTime, float | FreeTime]
-    thrusters: tuple[Thruster, ...]
     asked: AskedOfCapture
 
     @classmethod
@@ -271,12 +233,11 @@ class _Capture:
         _, there = checked_configuration(target, np.zeros(0), asked.get("target_base"))
         carried = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=carried)
-        thrusters = checked_thrusters(chaser, asked.get("thrusters", ()))
-        found = cls(chaser, target, pair, joints, base, there, times, thrusters, asked)
+        found = cls(chaser, target, pair, joints, base, there, times, asked)
         if asked.get("rest", True):
             bounds = (asked.get("limits") or Limits()).bounds(chaser)
-            held = held_by_rotors(chaser, bounds, found.steady, found.start, asked.get("friction") is None)
-            require_room(chaser, target, carried, found.start, held, thrusters)
+            held = held_by_wheels(chaser, bounds, found.start, asked.get("friction") is None)
+            require_room(chaser, carried, held)
         return found
 
     @property
@@ -284,11 +245,6 @@ class _Capture:
         """1 of joints, 0 of wheels, whose angles do not matter: each phase counts them from zero. Shape (n,)."""
         wheels = wheels_of(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
-
-    @property
-    def steady(self) -> NDArray[np.bool_]:
-        """Whether joints keep their speed. Shape (n,)."""
-        return checked_steady(self.chaser.robot, self.asked.get("steady", ()))
 
     @property
     def start(self) -> Start:
@@ -302,20 +258,7 @@ class _Capture:
     def shared(self) -> dict[str, Any]:
         """Options of both phases."""
         asked: Mapping[str, Any] = self.asked
-        return {name: asked[name] for name in ("limits", "effort", "friction", "thrusters", "steady") if name in asked}
-
-    @property
-    def kept(self) -> _Kept:
-        """What a first plan stays clear of: none of the target's bodies is held before it comes too near."""
-        near = self.clear_of_target
-        return _Kept(self.asked.get("clear"), near and replace(near, margins={}))
-
-    @property
-    def clear_of_target(self) -> ClearOfTarget | None:
-        near, limits = self.asked.get("clearance"), self.asked.get("limits")
-        if near is None or isinstance(near, ClearOfTarget):
-            return near
-        return ClearOfTarget.of(self.chaser, self.target, near, limits=limits is None or limits.joints)
+        return {name: asked[name] for name in ("limits", "effort", "friction") if name in asked}
 
     def approach(self, duration: float | FreeTime) -> Problem:
         """The first phase: the target's motion, and the grasp at the end."""
@@ -325,7 +268,7 @@ class _Capture:
             start=self.start.velocities, **self.shared,
         )  # fmt: skip
         earliest = duration.lower if isinstance(duration, FreeTime) else duration
-        require_reach(chaser, target, self.start, earliest, self.thrusters)
+        require_reach(chaser, target, self.start, earliest)
         base, joints, _ = motion_of(problem)
         none = ca.DM(0, 1)
         goal = problem.state(
@@ -334,13 +277,10 @@ class _Capture:
         problem.dynamics(goal, target.base_rate(goal, none, none))
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone, near = asked.get("cone"), self.clear_of_target
+        cone = asked.get("cone")
         if cone is not None:
             self._require_inside(cone)
             problem.path("cone", cone.inside(place), lower=0.0, unit="m")
-        if near is not None:
-            near.require_room(self.base, self.joints, self.target_base)
-            near.declare(problem, base[: chaser.base_size], joints, goal)
         return problem
 
     def _require_inside(self, cone: Cone) -> None:
@@ -357,7 +297,7 @@ class _Capture:
 
     def detumbling(self, duration: float | FreeTime, start: Mapping[str, Array] | None) -> Problem:
         """The second phase, from the end of an approach, or free to be joined to one."""
-        pair, asked = self.pair if start is None else self.pair_after(start), self.asked
+        pair, asked = self.pair, self.asked
         wheels = wheels_of(pair.robot)
         rest = asked.get("rest", True)
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
@@ -374,7 +314,7 @@ class _Capture:
             most = float(getattr(grasp, what))
             if np.isfinite(most):
                 problem.path(f"grasp {what}", ca.sumsqr(value) / most**2, upper=1.0)
-        if rest and (wheels or self.thrusters):
+        if rest and wheels:
             angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
             problem.end("base turns", pair.base_twist(*motion_of(problem))[angular], 0.0, 0.0, unit="rad/s")
         return problem
@@ -405,14 +345,6 @@ class _Capture:
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
         place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
         return ca.vertcat(place, attitude)
-
-    def pair_after(self, end: Mapping[str, Array]) -> FreeFloating:
-        """Both as one machine, with their momentum after an approach."""
-        if "momentum" not in end:
-            return self.pair
-        states = [end[name] for name in ("base", "target", "joints", "momentum")]
-        found = np.array(ca.DM(pair_momentum(self.chaser, self.target, *states))).ravel()
-        return replace(self.pair, conserved_momentum=found)
 
     def guess_approach(self, problem: Problem) -> None:
         cone = self.asked.get("cone")

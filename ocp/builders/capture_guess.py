@@ -12,10 +12,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from models import FreeFloating, gyros_of, wheels_of
+from models import FreeFloating, wheels_of
 from models.arrays import Array
 from ocp.builders.dynamics import QUINTIC
 from ocp.problem.problem import Problem
@@ -160,12 +159,10 @@ def _way_of_tip(
     return places, turns.as_matrix()
 
 
-def guess_braking(
-    problem: Problem, pair: FreeFloating, steady: NDArray[np.bool_], joints: Array, rates: Array, base: Array
-) -> None:
-    """Give a detumbling its guess from where it starts: the arm slows down evenly, rotors take the momentum.
+def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Array, base: Array) -> None:
+    """Give a detumbling its guess from where it starts: the arm slows down evenly, wheels take the momentum.
 
-    Wheels turn faster, and gimbals of gyros elsewhere, until they hold it, which is Newton's method.
+    Which speeds of the wheels hold it follows by Newton's method: the attitude at the end depends on them.
     """
     robot, duration = pair.robot, guessed(problem)
     times = np.linspace(0.0, duration, STEPS + 1)
@@ -173,26 +170,22 @@ def guess_braking(
     slowing = 1 - 3 * share**2 + 2 * share**3
     way = (share - share**3 + share**4 / 2) * duration
     names, wheels = robot.joint_names, wheels_of(robot)
-    gimbals = [names.index(gyro.gimbal) for gyro in gyros_of(robot)]
-    turning = [k for k, name in enumerate(names) if name in wheels and not steady[k]]
+    turning = [k for k, name in enumerate(names) if name in wheels]
     angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
     b, q, v = (ca.SX.sym("z", size) for size in (pair.base_size, len(joints), len(joints)))
     held = ca.mtimes(pair.momentum_matrices(b, q)[1], v)[angular]
-    slopes = ca.horzcat(ca.jacobian(held, v)[:, turning], ca.jacobian(held, q)[:, gimbals])
-    look = ca.Function("look", [b, q, v], [held, slopes])
-    last, turned = np.where(steady, rates, 0.0), np.zeros(len(joints))
+    look = ca.Function("look", [b, q, v], [held, ca.jacobian(held, v)[:, turning]])
+    last = np.zeros(len(joints))
     step = _stepper(pair)
     for _ in range(ROUNDS if wheels else 1):
-        speeds = last + slowing * (rates - last) + QUINTIC.deriv()(share) / duration * turned
-        angles = joints + last * times[:, None] + way * (rates - last) + QUINTIC(share) * turned
+        speeds = last + slowing * (rates - last)
+        angles = joints + last * times[:, None] + way * (rates - last)
         found = [base]
         for k in range(STEPS):
             middle = (angles[k] + angles[k + 1]) / 2, (speeds[k] + speeds[k + 1]) / 2
             found.append(step(times[1], found[-1], *middle))
         have, matrix = (np.array(part) for part in look(found[-1], angles[-1], last))
-        more = np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - have.ravel())
-        last[turning] += more[: len(turning)]
-        turned[gimbals] += more[len(turning) :]
+        last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - have.ravel())
     tell(problem, duration, _motion(times, angles, speeds, np.array(found)))
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from models import Machine
 from ocp.builders.clearance import Clear, Kept, keeping_clear, of_clearance, touching_error
-from ocp.builders.dynamics import AskedOfDrives, Motors, dynamics_problem
+from ocp.builders.drives import Motors
+from ocp.builders.dynamics import AskedOfDrives, dynamics_problem
 from ocp.builders.legs import Leg, checked_legs, dynamics_phases
 from ocp.builders.standing.problem import FreeTime
 from ocp.console import interruptible

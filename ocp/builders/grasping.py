@@ -121,17 +121,14 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         raise ProblemError(f"capture: {error}", name="target", value=error.value) from error
 
 
-def pair_momentum(
-    chaser: FreeFloating, target: FreeFloating, base: Any, target_base: Any, joints: Any, momentum: Any = None
-) -> Expression:
+def pair_momentum(chaser: FreeFloating, target: FreeFloating, base: Any, target_base: Any, joints: Any) -> Expression:
     """Of both together, in the order of `FreeFloating.conserved_momentum`, about their common centre of mass.
 
     Args:
         base, target_base: Configurations of both. Shape (base_size,). joints: Of the chaser. Shape (n,).
-        momentum: Of the chaser, where it is not the conserved one.
     """
     rows = ca.DM.eye(6)[:, chaser.twist_rows]
-    own = rows @ ca.vertcat(chaser.conserved_momentum if momentum is None else momentum)
+    own = rows @ ca.vertcat(chaser.conserved_momentum)
     other = rows @ ca.vertcat(target.conserved_momentum)
     one, two = chaser.robot.total_mass, target.robot.total_mass
     arm = center_of_mass(target.robot, ca.DM(0, 1), target.world_from_base(target_base))
@@ -141,10 +138,9 @@ def pair_momentum(
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
-    """Base, with the momentum where that is a state, joints and velocities."""
-    states = {name: variable.symbol for name, variable in problem.declared.states.items()}
-    base = states["base"] if "momentum" not in states else ca.vertcat(states["base"], states["momentum"])
-    return base, states["joints"], states["velocities"]
+    """Symbols of base, joints and velocities."""
+    states = problem.declared.states
+    return states["base"].symbol, states["joints"].symbol, states["velocities"].symbol
 
 
 def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
@@ -157,9 +153,8 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
     middle = with_tip(pair, body.name, body.center_of_mass)
     center, twist = middle.tip_pose(base, joints), middle.tip_twist(base, joints, rates)
     inertia = ca.mtimes([center.rotation, ca.DM(np.asarray(body.inertia)), center.rotation.T])
-    names = [name for name in ("base", "momentum", "joints", "velocities") if name in problem.declared.states]
-    at = ca.vertcat(*(problem.declared.states[name].symbol for name in names))
-    along = ca.vertcat(*(problem.declared.dynamics[name] for name in names))
+    at = ca.vertcat(base, joints, rates)
+    along = ca.vertcat(*(problem.declared.dynamics[name] for name in ("base", "joints", "velocities")))
     rate = ca.jtimes(ca.vertcat(ca.mtimes(inertia, twist[0:3]), body.mass * twist[3:6]), at, along)
     arm = center.position - pair.tip_pose(base, joints).position
     return rate[3:6], rate[0:3] + cross(arm, rate[3:6])

@@ -4,9 +4,6 @@ Each leg is a phase of its own, `dynamics_problem` with the machine that moves o
 What goes on from one into the next are the joints and how the base lies, the velocities where the machine does not rest
 there, and the accelerations where the jerk is the control.
 
-Thrusters that are either full on or off burn on some legs and not on others, for times that are free: the order of the
-legs is told, when they switch is planned.
-
 A load that is picked up or put down changes the machine. It does so at rest: then nothing has to be brought to speed,
 joints and base stay where they are, and the momentum of a machine that floats, which is zero before, is zero after,
 too. A load that is grasped while it moves jumps in velocity, as after an impact; that is a join of `Phases` to be said
@@ -21,18 +18,10 @@ from typing import Any, Literal, Unpack
 
 import numpy as np
 
-from models import FreeFloating, Thruster
-from models.arrays import Array
+from models import FreeFloating
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import (
-    AskedOfDrives,
-    Motors,
-    checked_motors,
-    checked_steady,
-    dynamics_problem,
-    rates_at,
-    told_or,
-)
+from ocp.builders.drives import Motors, checked_motors
+from ocp.builders.dynamics import AskedOfDrives, dynamics_problem
 from ocp.builders.standing.problem import FreeTime
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, checked_text
@@ -53,8 +42,6 @@ class Leg:
         end: Whether the joints are at rest at its end, or free to move on through it.
         machine: What moves on it, `with_load` or without; None: as on the leg before.
         tasks: What the tips do on it, of the time since its beginning, which is at joints that are told.
-        firing: Thrusters that are full on all along it, () if all are off. None: there are none but those that give any
-            force; then of all legs, for they keep no momentum otherwise.
         name: Of its phase; "leg 1", "leg 2", ... if "".
     """
 
@@ -63,7 +50,6 @@ class Leg:
     end: Literal["rest", "free"] = "rest"
     machine: Motors | None = None
     tasks: TipTask | Sequence[TipTask] = ()
-    firing: Sequence[Thruster] | None = None
     name: str = ""
 
 
@@ -85,8 +71,8 @@ def dynamics_phases(
         legs: At least one; all have the joints of the machine.
         total: Time of all legs together, s, where theirs are free; None: as long as is best.
         clear: What the motion has to stay clear of, on legs whose machine is that of its surroundings.
-        asked: Of all legs, as of `dynamics_problem`; `start` and `start_base` where the first begins, `end_base` and
-            `end_momentum` where the last ends.
+        asked: Of all legs, as of `dynamics_problem`; `start` and `start_base` where the first begins, `end_base`
+            where the last ends.
 
     Raises:
         ProblemError: As `dynamics_problem`; no legs, another number of joints or another kind of base, a machine that
@@ -96,39 +82,35 @@ def dynamics_phases(
     given = checked_legs(legs)
     if clear is not None:
         checked_instance("dynamics_phases: clear", clear, Clear)
-    for what in ("end_joints", "tasks", "end", "firing"):
+    for what in ("end_joints", "tasks", "end"):
         if what in asked:
             raise ProblemError(f"{what}: legs say it themselves, Leg({what}=...)", name=what, value=asked.get(what))
     names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(given)]
     if len(set(names)) < len(names):
         raise ProblemError(f"legs: names {names} are not all different", name="legs", value=names)
     movers, problems = _machines(machine, given, names), {}
-    ends = {name: value for name, value in asked.items() if name in ("end_base", "end_momentum")}
     options: dict[str, Any] = {
-        name: value for name, value in asked.items() if name not in ("start", "start_base", *ends)
+        name: value for name, value in asked.items() if name not in ("start", "start_base", "end_base")
     }
     begin: Any = start_joints
-    steady = np.full(movers[0].joint_size, np.nan)
-    if len(given) > 1:
-        steady = _steady_rates(movers[0], asked.get("steady", ()), asked.get("start", "rest"))
     for k, (name, leg) in enumerate(zip(names, given, strict=True)):
         known = begin is not None and not np.isnan(np.asarray(begin, dtype=float)).any()
         if k and not known and not (isinstance(leg.tasks, Sequence) and not leg.tasks):
             words = f"{name}: its tasks begin where the leg before ends; tell all joints there"
             raise ProblemError(words, name=name, value=begin)
-        own: dict[str, Any] = {"start": asked.get("start", "rest") if k == 0 else _begin(given[k - 1], steady)}
+        own: dict[str, Any] = {"start": asked.get("start", "rest") if k == 0 else given[k - 1].end}
         own["start_base"] = asked.get("start_base") if k == 0 else np.full(movers[k].base_size, np.nan)
         if k == len(given) - 1:
-            own |= ends
+            own["end_base"] = asked.get("end_base")
         kept = clear if clear is not None and clear.surroundings.machine is movers[k] else None
         problems[name] = dynamics_problem(
-            movers[k], begin, leg.horizon, end_joints=leg.joints, tasks=leg.tasks, end=leg.end, firing=leg.firing,
-            clear=kept, **own, **options,
+            movers[k], begin, leg.horizon, end_joints=leg.joints, tasks=leg.tasks, end=leg.end, clear=kept,
+            **own, **options,
         )  # fmt: skip
         begin = leg.joints
     phases = Phases("legs", problems)
     for k in range(1, len(given)):
-        _join(phases, names[k - 1], names[k], given[k - 1], steady)
+        _join(phases, names[k - 1], names[k], given[k - 1])
     if total is not None:
         duration = checked_horizon(total)
         if not any(isinstance(leg.horizon, FreeTime) for leg in given):
@@ -148,9 +130,6 @@ def checked_legs(legs: Any) -> tuple[Leg, ...]:
     given = checked_each("legs", legs, Leg)
     if not given:
         raise ProblemError("legs: at least one is needed", name="legs", value=legs)
-    if len({leg.firing is None for leg in given}) > 1:
-        words = "legs: thrusters switch, and some legs do not tell which are on; Leg(firing=()) if none"
-        raise ProblemError(words, name="firing", value=[leg.firing for leg in given])
     for leg in given:
         checked_choice("leg: end", leg.end, ("rest", "free"))
         checked_text("leg: name", leg.name)
@@ -179,32 +158,13 @@ def _machines(machine: Motors, legs: Sequence[Leg], names: Sequence[str]) -> lis
     return found[1:]
 
 
-def _steady_rates(machine: Motors, names: Any, start: Any) -> Array:
-    """Velocities of joints that keep theirs, nan of all others. Shape (n,)."""
-    keeps = checked_steady(machine.robot, names)
-    rates = np.where(keeps, rates_at("start", start, machine.joint_size), np.nan)
-    if np.isnan(rates[keeps]).any():
-        words = "steady: joints that keep their speed through several legs have to be told it; say start=velocities"
-        raise ProblemError(words, name="steady", value=names)
-    return rates
-
-
-def _begin(before: Leg, steady: Array) -> Any:
-    """How a leg starts after another: at rest, but for what is steady, or free, to be joined."""
-    if before.end != "rest" or np.isnan(steady).all():
-        return before.end
-    return np.nan_to_num(steady)
-
-
-def _join(phases: Phases, before: str, after: str, leg: Leg, steady: Array) -> None:
+def _join(phases: Phases, before: str, after: str, leg: Leg) -> None:
     """What of one leg goes on in the next: all that is not told at both ends already."""
     told: dict[str, Any] = {}
     if leg.joints is not None and not np.isnan(np.asarray(leg.joints, dtype=float)).any():
         told["joints"] = None
     if leg.end == "rest":
         told |= {"velocities": None, "accelerations": None}
-    elif not np.isnan(steady).all():
-        told["velocities"] = told_or(steady, phases[before].at_end("velocities"))
     states = [name for name in phases.of(after) if f"{after}.{name}" in phases.declared.states and name != DURATION]
     if any(told.get(name, "joined") is not None for name in states):
         phases.join(before, after, {name: value for name, value in told.items() if name in states})

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from models import Machine
 from models.arrays import Array
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import checked_motors, joint_torques
+from ocp.builders.drives import checked_motors, joint_torques
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.following import Followed

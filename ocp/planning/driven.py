@@ -15,7 +15,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import checked_motors, joint_torques
+from ocp.builders.drives import checked_motors, joint_torques
 from ocp.builders.dynamics_plan import within_limits
 from ocp.builders.tool_motion import ToolMotion
 from ocp.direct.guess import Samples

@@ -17,7 +17,7 @@ import numpy as np
 from models import Machine, ModelError, Standing, Surroundings
 from models.arrays import Array
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import checked_motors
+from ocp.builders.drives import checked_motors
 from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.errors import (

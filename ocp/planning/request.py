@@ -39,7 +39,8 @@ from models import (
 from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.builders.clearance import Clear
-from ocp.builders.dynamics import Effort, JointFriction, dynamics_problem
+from ocp.builders.drives import Effort, JointFriction
+from ocp.builders.dynamics import dynamics_problem
 from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.errors import ProblemError

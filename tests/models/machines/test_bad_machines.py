@@ -22,16 +22,12 @@ from models import (
     Standing,
     Support,
     Surroundings,
-    Thruster,
     footprint,
-    gyro_matrix,
-    gyros_of,
     planar_chain,
     rectangle,
     scara_along,
     smooth,
     wheels_of,
-    with_gyros,
     with_wheels,
 )
 from models.machines.machine import with_tip
@@ -172,7 +168,6 @@ FLOATING_CASES = [
     method(
         floating, "momentum", {**MOVING, "base_twist": [0, 0, 1]}, **PLACED, joint_rates=array(2), base_twist=array(3)
     ),
-    method(floating, "momentum_rate", {**AT, "wrench": np.ones(6)}, **PLACED, wrench=array(6)),
     method(
         floating,
         "momentum_residual",
@@ -200,44 +195,6 @@ ACTUATOR_CASES = [
         },
     ),
     Case("wheels_of", wheels_of, {"robot": CHAIN}, {"robot": INSTANCE}),
-    Case(
-        "with_gyros",
-        with_gyros,
-        {
-            "robot": CHAIN,
-            "gimbals": np.eye(3),
-            "rotors": np.roll(np.eye(3), 1, axis=0),
-            "momentum": 2.0,
-            "inertia": 0.02,
-        },
-        {
-            "robot": INSTANCE,
-            "gimbals": but(array(3, 3), "wrong shape") | {"of two": np.eye(2), "zero": np.zeros((3, 3))},
-            "rotors": array(3, 3) | {"zero": np.zeros((3, 3)), "along the gimbals": np.eye(3)},
-            "momentum": POSITIVE,
-            "inertia": POSITIVE,
-            "gimbal_inertia": POSITIVE,
-            "rate": LIMIT,
-            "torque": LIMIT,
-            "mass": NONNEGATIVE,
-            "translations": array(3, 3),
-            "link": but(UNKNOWN, "None"),
-            "prefix": but(NAME, "empty"),
-        },
-    ),
-    Case("gyros_of", gyros_of, {"robot": CHAIN}, {"robot": INSTANCE}),
-    Case(
-        "gyro_matrix",
-        gyro_matrix,
-        {"robot": CHAIN, "q": np.zeros(CHAIN.dof)},
-        {"robot": INSTANCE, "q": array(CHAIN.dof)},
-    ),
-    Case(
-        "Thruster",
-        Thruster,
-        {"link": "hull", "direction": (1, 0, 0), "force": 2.0},
-        {"link": NAME, "direction": array(3) | {"zero": (0, 0, 0)}, "force": POSITIVE, "point": array(3)},
-    ),
 ]
 STANDING_CASES = [
     Case(

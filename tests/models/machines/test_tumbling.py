@@ -95,15 +95,6 @@ def test_a_body_tumbles_as_in_mujoco() -> None:
     assert tip[:3] == pytest.approx(data.xmat[1].reshape(3, 3) @ data.qvel[3:], abs=1e-8)
 
 
-def test_the_momentum_may_be_a_state_of_a_body_without_joints() -> None:
-    machine = body()
-    momentum = np.arange(6.0)
-    given = np.concatenate([machine.base_home(), momentum])
-    same = FreeFloating(machine.robot, conserved_momentum=momentum)
-    found = np.array(ca.DM(machine.base_rate(given, (), ()))).ravel()
-    assert found == pytest.approx(np.array(ca.DM(same.base_rate(same.base_home(), (), ()))).ravel())
-
-
 def test_what_has_no_joints_is_asked_for_none() -> None:
     machine = body()
     task = TipTask(position=(0.5, 0.0, 0.1))

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import mujoco
 import numpy as np
 
-from models import (
-    CollisionShape,
-    FreeFloating,
-    Joint,
-    Link,
-    Robot,
-    Thruster,
-    gyros_of,
-    planar_chain,
-    with_gyros,
-    with_wheels,
-)
+from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.spatial import quaternion_about
 from ocp import Cone, Effort, FreeTime, Grasp, Solution
 from ocp.builders.grasping import joined, pair_momentum
-from tests.models.machines.test_actuators import pyramid_axes
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 
@@ -55,32 +42,6 @@ def planar_capture() -> dict[str, Any]:
         "detumble": FREE, "target_base": [1.9, 0.3, 0.0], "cone": CONE, "grasp": GRASP,
         "effort": Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }  # fmt: skip
-
-
-def with_bodies(asked: dict[str, Any], antenna: Any, size: float = 0.04) -> dict[str, Any]:
-    """The same in the plane with bodies: capsules of 5 cm, boxes, and before the target an antenna, a small box."""
-    along_x = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    one, other = asked["chaser"], asked["target"]
-    shapes = {"hub": CollisionShape("box", (0.5, 0.5, 0.3))}
-    for name, length in (("link1", 0.8), ("link2", 0.7), ("link3", 0.3)):
-        place: dict[str, Any] = {"translation": (length / 2, 0, 0), "rotation": along_x}
-        shapes[name] = CollisionShape("capsule", (0.05, length), **place)
-    links = [
-        replace(link, collisions=(shapes[link.name],)) if link.name in shapes else link for link in one.robot.links
-    ]
-    parts = CollisionShape("box", (0.78, 0.78, 0.3)), CollisionShape("box", (size, size, 0.3), translation=antenna)
-    body = replace(other.robot.links[0], collisions=parts)
-    return asked | {
-        "chaser": replace(one, robot=replace(one.robot, links=tuple(links))),
-        "target": replace(other, robot=replace(other.robot, links=(body,))),
-    }
-
-
-def thruster_capture() -> dict[str, Any]:
-    """In the plane, with a wheel that holds two thirds of what the target has, and thrusters of a couple each way."""
-    couples = [Thruster("hub", (0, side, 0), 0.2, (arm, 0, 0)) for arm in (0.3, -0.3) for side in (1, -1)]
-    effort = Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], fuel=1.0, time=0.05)
-    return planar_capture() | {"chaser": planar_chaser(0.3), "thrusters": couples, "effort": effort}
 
 
 def chaser(momentum: float = 4.0) -> FreeFloating:
@@ -123,36 +84,6 @@ def capture(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def gyro_chaser(momentum: float = 3.0, rate: float = 0.8) -> FreeFloating:
-    """The same arm on a hub with a pyramid of four gyros instead of wheels, N m s each."""
-    robot = chaser().robot
-    kept = [link for link in robot.links if "wheel" not in link.name]
-    joints = [joint for joint in robot.joints if "wheel" not in joint.name]
-    plain = replace(robot, links=tuple(kept), joints=tuple(joints))
-    gimbals, rotors = pyramid_axes()
-    found = with_gyros(plain, gimbals, rotors, momentum, 0.05, gimbal_inertia=0.02, rate=rate, torque=8.0, mass=0.5)
-    links = [replace(link, mass=0.2) if link.name.endswith("gimbal") else link for link in found.links]
-    return FreeFloating(replace(found, links=tuple(links)))
-
-
-GYRO_START = np.concatenate([START[:6], np.zeros(8)])
-
-
-def spinning(machine: FreeFloating, momentum: float) -> Array:
-    """Velocities with all rotors of gyros at their speed. Shape (n,)."""
-    return np.array([momentum / 0.05 if name.endswith("rotor") else 0.0 for name in machine.robot.joint_names])
-
-
-def gyro_capture(spin: Any) -> dict[str, Any]:
-    """What is asked of it in space."""
-    one = gyro_chaser()
-    effort = Effort(torque=[1.0] * 6 + [1.0, 0.0] * 4, acceleration=[1.0] * 6 + [50.0, 0.0] * 4, time=0.05)
-    return capture(spin) | {
-        "chaser": one, "start_joints": GYRO_START, "start_velocities": spinning(one, 3.0), "effort": effort,
-        "steady": [gyro.rotor for gyro in gyros_of(one.robot)],
-    }  # fmt: skip
-
-
 def turned(axis: Any, angle: float) -> Array:
     """Unit quaternion. Shape (4,)."""
     return np.array(ca.DM(quaternion_about(axis / np.linalg.norm(axis), angle))).ravel()
@@ -169,14 +100,11 @@ def replayed_momentum(asked: dict[str, Any], plan: Solution, samples: int = 41) 
     carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
     pair = FreeFloating(joined(one.robot, other.robot), one.base, conserved_momentum=carried)
     nothing = np.zeros((samples, 0))
-    poses = [
-        np.hstack([each["base"], each["momentum"]]) if "momentum" in each else each["base"] for each in (begin, after)
-    ]
     parts = [
-        _momenta(one, poses[0], begin["joints"], begin["velocities"]),
+        _momenta(one, begin["base"], begin["joints"], begin["velocities"]),
         _momenta(other, begin["target"], nothing, nothing),
     ]
-    return _together(parts), _together([_momenta(pair, poses[1], after["joints"], after["velocities"])])
+    return _together(parts), _together([_momenta(pair, after["base"], after["joints"], after["velocities"])])
 
 
 def _together(parts: list[tuple[Array, Array, float]]) -> Array:

@@ -1,36 +1,27 @@
-"""Spacecraft planned by what drives them: closed forms of wheels and thrusters, attitudes, momentum that changes."""
+"""Spacecraft planned by what drives them: closed forms of wheels, attitudes, momentum that is kept."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
-import mujoco
 import numpy as np
 import pytest
 
-from models import FreeFloating, Link, Robot, Thruster, Wrench, gyros_of, mass_matrix, planar_chain, with_wheels
-from models.machines.machine import with_tip
-from models.robot.dynamics import external_wrench
+from models import FreeFloating, Link, Robot, Wrench, mass_matrix, planar_chain, with_wheels
 from models.spatial import quaternion_about
 from ocp import (
     Collocation,
     Effort,
-    FreeTime,
-    Leg,
     ProblemError,
     Solution,
     TipTask,
-    dynamics_phases,
     dynamics_problem,
     joint_torques,
     minimum_velocity_problem,
-    plan_dynamics,
     solve,
 )
-from ocp.problem.values import constant
-from tests.models.machines.test_actuators import SPINNING, moving, pyramid, satellite, state, wheeled
-from tests.models.robot.oracles import mujoco_model
+from tests.models.machines.test_actuators import satellite, state, wheeled
 from tests.models.robot.trees import Array
 
 nan = np.nan
@@ -64,107 +55,6 @@ def test_a_wheel_turns_its_carrier_at_the_least_effort_that_is_known() -> None:
     assert plan.audit().passed
 
 
-def test_thrusters_burn_coast_and_brake() -> None:
-    """From rest to rest over d in T: both burns take t, (F / m) t (T - t) = d; least fuel is 2 F t, full on and off."""
-    machine, force, way, horizon = hub(), 5.0, 2.775, 20.0
-    thrusters = [Thruster("hub", (1, 0, 0), force), Thruster("hub", (-1, 0, 0), force)]
-    problem = dynamics_problem(
-        machine, [0.0], horizon, end_base=[way, 0.0, 0.0], end_momentum=np.zeros(3), thrusters=thrusters,
-        effort=Effort(torque=1e-3, fuel=1.0),
-    )  # fmt: skip
-    plan = solve(problem, Collocation(40, 2))
-    burn = (horizon - np.sqrt(horizon**2 - 4 * way * MASS / force)) / 2
-    least = 2 * force * burn
-    assert burn == pytest.approx(1.5)  # three intervals
-    assert plan.cost == pytest.approx(least, rel=1e-5)
-    assert plan["momentum"][:, 1].max() == pytest.approx(force * burn, rel=1e-4)
-    assert np.abs(plan["momentum"][:, [0, 2]]).max() < 1e-6
-    assert plan["thrust"].max() <= force * (1 + 1e-6)
-
-
-def switched(*firing: list[Thruster]) -> list[Leg]:
-    """Legs on which thrusters are full on, or off, the wheel at rest between them."""
-    return [Leg(None, FreeTime(0.01, 40.0, 5.0), firing=each) for each in firing]
-
-
-def test_thrusters_that_are_on_or_off_switch_when_it_is_best() -> None:
-    """Rest to rest over d: in a fixed time T, (F / m) t (T - t) = d; in a free one that costs w a second,
-
-    t = sqrt(w m d / F / (2 F + w)) for least 2 F t + w T, from T = t + m d / (F t).
-    """
-    machine, force, way, horizon, worth = hub(), 5.0, 2.775, 20.0, 0.5
-    on, back = (Thruster("hub", (side, 0, 0), force) for side in (1, -1))
-    asked: dict[str, Any] = {
-        "method": Collocation(2, 3, scheme="legendre"), "end_base": [way, 0.0, 0.0], "end_momentum": np.zeros(3)
-    }  # fmt: skip
-    legs = switched([on], [], [back])
-    for total, weight in ((horizon, 0.0), (None, worth)):
-        effort = Effort(torque=1e-3, fuel=1.0, time=weight)
-        plan = plan_dynamics(machine, [0.0], legs, total=total, effort=effort, **asked)
-        burn = (horizon - np.sqrt(horizon**2 - 4 * way * MASS / force)) / 2
-        burn = burn if total else np.sqrt(worth * way * MASS / force / (2 * force + worth))
-        whole = burn + way * MASS / (force * burn)
-        times = [plan.phase(f"leg {k}").horizon for k in (1, 2, 3)]
-        assert times == pytest.approx([burn, whole - 2 * burn, burn], rel=1e-6)
-        assert plan.cost == pytest.approx(2 * force * burn + weight * whole, rel=1e-8)
-        assert plan.audit().passed
-    with pytest.raises(ProblemError, match="switch") as caught:
-        dynamics_phases(machine, [0.0], [*legs, Leg(None, 1.0)])
-    assert caught.value.name == "firing"
-
-
-def test_a_turn_by_thrusters_that_switch_is_that_of_mujoco() -> None:
-    """Couples burn and brake, a wheel helps: MuJoCo, told when they switch and the wheel's torque, ends there, too."""
-    machine, force, arm, angle = hub(0.1), 0.4, 0.5, 0.8
-    turns, stops = (
-        [Thruster("hub", (0, way * side, 0), force, (way * arm, 0, 0)) for way in (1, -1)] for side in (1, -1)
-    )
-    push = Thruster("hub", (1, 0, 0), 0.1)
-    fired = [*turns, push], [push], stops
-    plan = plan_dynamics(
-        machine, [0.0], switched(*fired), total=6.0, end_base=[nan, nan, angle], end_momentum=[0.0, nan, nan],
-        effort=Effort(torque=100.0, fuel=1.0), method=Collocation(4, 4, scheme="legendre"),
-    )  # fmt: skip
-    assert plan.audit().feasible
-    model = mujoco_model(machine.robot)
-    model.opt.gravity[:] = 0.0
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    data, carrier, wheel = mujoco.MjData(model), model.body("hub").id, model.joint("wheel1").dofadr[0]
-    count = 200
-    for k, burning in enumerate(fired):
-        leg = plan.phase(f"leg {k + 1}")
-        assert leg.horizon > 0.1
-        model.opt.timestep = leg.horizon / count
-        for torque in wheel_torques(machine, leg, burning, count):
-            mujoco.mj_kinematics(model, data)
-            turn = data.xmat[carrier].reshape(3, 3)
-            forces = [turn @ each.direction * each.force for each in burning]
-            moments = [np.cross(turn @ each.point, push) for each, push in zip(burning, forces, strict=True)]
-            data.xfrc_applied[carrier] = np.concatenate([np.sum(forces, axis=0), np.sum(moments, axis=0)])
-            data.qfrc_applied[wheel] = torque
-            mujoco.mj_step(model, data)
-    last = plan.phase("leg 3").at_fraction(1.0)
-    assert data.qpos[:2] == pytest.approx(last["base"][:2], abs=1e-4)
-    assert 2 * np.arctan2(data.qpos[6], data.qpos[3]) == pytest.approx(angle, abs=1e-5)
-    assert machine.robot.total_mass * data.qvel[:2] == pytest.approx(last["momentum"][1:], abs=1e-3)
-    assert data.qvel[wheel] == pytest.approx(0.0, abs=1e-4)
-
-
-def wheel_torques(machine: FreeFloating, leg: Solution, burning: list[Thruster], count: int) -> Array:
-    """Of a wheel in the middle of so many steps. Shape (count,)."""
-    base, joints, rates, second = (ca.SX.sym("z", size) for size in (6, 1, 1, 1))
-    frames = {"hub": machine.world_from_base(base)}
-    wrenches = [each.wrench(frames, each.force) for each in burning]
-    torque = ca.Function(
-        "torque",
-        [base, joints, rates, second],
-        [joint_torques(machine, base, joints, rates, second, wrenches=wrenches)],
-    )
-    at = leg.at_fraction((np.arange(count) + 0.5) / count)
-    poses = np.hstack([at["base"], at["momentum"]])
-    return np.array(torque(poses.T, at["joints"].T, at["velocities"].T, at["accelerations"].T)).ravel()
-
-
 def test_momentum_that_is_given_is_kept_by_wheels() -> None:
     """A base that tumbles is stopped by its wheels, which then hold the momentum; nothing else has it."""
     momentum = np.array([1.0, -2.0, 1.5, 0.0, 0.0, 0.0])
@@ -179,85 +69,24 @@ def test_momentum_that_is_given_is_kept_by_wheels() -> None:
     assert plan.audit().feasible
 
 
-def gyro_slew(rate: float, horizon: float) -> dict[str, Any]:
-    """Half a radian about an axis between, from rest to rest."""
-    goal = np.array(ca.DM(quaternion_about((0.6, 0.0, 0.8), 0.5))).ravel()
-    robot = pyramid(rate=rate, torque=8.0)
-    return {
-        "machine": FreeFloating(robot), "start_joints": np.zeros(8), "horizon": horizon, "start": SPINNING,
-        "end_base": [nan, nan, nan, *goal], "steady": [gyro.rotor for gyro in gyros_of(robot)],
-        "effort": Effort(torque=[1.0, 0.0] * 4, acceleration=[1.0, 0.0] * 4),
-        "method": Collocation(8, degree=4, scheme="legendre"),
-    }  # fmt: skip
-
-
-def test_a_pyramid_of_gyros_turns_a_body_within_the_rates_of_its_gimbals() -> None:
-    """The rotors' speed stays, and the momentum of all in MuJoCo is zero wherever one looks."""
-    asked = gyro_slew(0.55, 6.0)
-    plan, machine = plan_dynamics(**asked), asked["machine"]
-    audit = plan.audit()
-    assert audit.passed, audit
-    assert plan["base"][-1] == pytest.approx([*plan["base"][-1, :3], *asked["end_base"][3:]], abs=1e-8)
-    fine = plan.at_fraction(np.linspace(0, 1, 31))
-    assert fine["velocities"][:, 1::2] == pytest.approx(100.0, abs=1e-9)
-    assert 0.54 < np.abs(fine["velocities"][:, ::2]).max() < 0.55 + 1e-5
-    for base, joints, rates in zip(fine["base"], fine["joints"], fine["velocities"], strict=True):
-        model, data = moving(machine, base, joints, rates)
-        mujoco.mj_forward(model, data)
-        mujoco.mj_subtreeVel(model, data)
-        assert np.abs(data.subtree_angmom[1]).max() < 1e-8
-
-
-@pytest.mark.parametrize("end", ["rest", "free"])
-def test_rotors_of_gyros_keep_their_speed_through_all_legs(end: Literal["rest", "free"]) -> None:
-    """Two legs, with a stop between them or none: nothing is asked for that stops a rotor, nor twice."""
-    robot = pyramid(rate=0.8, torque=8.0)
-    asked: dict[str, Any] = {"start": SPINNING, "steady": [gyro.rotor for gyro in gyros_of(robot)]}
-    legs = [Leg(None, 3.0, end=end), Leg(None, 3.0)]
-    problem = dynamics_phases(FreeFloating(robot), np.zeros(8), legs, **asked)
-    begins = problem.of("leg 2")["velocities"].initial
-    rotors = slice(1, None, 2)
-    if end == "rest":
-        assert constant(begins) == pytest.approx(SPINNING)
-        assert "leg 1 to leg 2: velocities" not in problem.declared.end
-    else:
-        assert begins is None or np.isnan(constant(begins)).all()
-        joined = problem.declared.end["leg 1 to leg 2: velocities"].expression
-        before, after = (problem[f"leg {k}"] for k in (1, 2))
-        gaps = ca.Function("gaps", [after.at_start("velocities"), before.at_end("velocities")], [joined])
-        told = np.array(gaps(SPINNING, np.zeros(8))).ravel()
-        assert told[rotors] == pytest.approx(np.zeros(4))
-        assert np.array(gaps(np.zeros(8), np.ones(8))).ravel()[::2] == pytest.approx(-1.0)
-    with pytest.raises(ProblemError, match="keep their speed") as caught:
-        dynamics_phases(FreeFloating(robot), np.zeros(8), legs, **(asked | {"start": "free"}))
-    assert caught.value.name == "steady"
-
-
 # ---- laws ----------------------------------------------------------------------------------------------------------
 
 
 def test_what_the_drives_give_is_kinetic_energy() -> None:
-    """Power of motors and of what pushes is the rate of the energy of joints and base together, in any motion."""
-    machine = FreeFloating(wheeled(2))
+    """Power of motors is the rate of the energy of joints and base together, in any motion, whatever the momentum."""
+    carried = np.random.default_rng(9).normal(size=6)
+    machine = FreeFloating(wheeled(2), conserved_momentum=carried)
     n = machine.joint_size
-    push = Wrench("arm1_link1", (0.5, 2.0, -1.0), (0.3, 0.1, -0.4), (0.4, 0.0, 0.1))
-    b, q, v, a = (ca.SX.sym("z", size) for size in (13, n, n, n))
+    b, q, v, a = (ca.SX.sym("z", size) for size in (7, n, n, n))
     twist = machine.base_twist(b, q, v)
     locked, coupled = machine.momentum_matrices(b, q)
     at_origin = ca.vertcat(twist[:3], twist[3:] - ca.cross(twist[:3], b[:3]))
     energy = ca.dot(v, ca.mtimes(mass_matrix(machine.robot, q), v)) + ca.dot(at_origin, ca.mtimes(locked, twist))
     energy = energy / 2 + ca.dot(at_origin, ca.mtimes(coupled, v))
-    outside = external_wrench(machine.robot, q, [push], machine.world_from_base(b))
-    moving = ca.vertcat(machine.base_rate(b, q, v), machine.momentum_rate(b, q, outside), v, a)
-    rate = ca.jtimes(energy, ca.vertcat(b, q, v), moving)
-    carrier = with_tip(machine, push.link, np.array(push.point).ravel())
-    power = ca.dot(joint_torques(machine, b, q, v, a, wrenches=[push]), v)
-    power += ca.dot(ca.vertcat(push.moment, push.force), carrier.tip_twist(b, q, v))
-    both = ca.Function("both", [b, q, v, a], [rate, power])
+    rate = ca.jtimes(energy, ca.vertcat(b, q, v), ca.vertcat(machine.base_rate(b, q, v), v, a))
+    both = ca.Function("both", [b, q, v, a], [rate, ca.dot(joint_torques(machine, b, q, v, a), v)])
     for seed in range(5):
-        pose, joints, rates, accelerations = state(machine, seed)
-        momentum = np.random.default_rng(seed).normal(size=6)
-        found, given = (float(value) for value in both(np.concatenate([pose, momentum]), joints, rates, accelerations))
+        found, given = (float(value) for value in both(*state(machine, seed)))
         assert found == pytest.approx(given, rel=1e-9, abs=1e-9)
 
 
@@ -335,13 +164,9 @@ def test_an_attitude_is_held_at_the_end_whatever_the_sign_of_its_quaternion() ->
 def test_what_does_not_fit_a_spacecraft_is_refused_by_name() -> None:
     machine = hub()
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"end_momentum": np.zeros(3)}, "end_momentum"),
         ({"end_base": [0.0, 0.0]}, "end_base"),
-        ({"thrusters": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
+        ({"wrenches": [Wrench("hub", (1, 0, 0))]}, "wrenches"),
         ({"start": [0.0, 1.0]}, "start"),
-        ({"steady": "wheel1"}, "steady"),
-        ({"steady": ["wheel2"]}, "wheel2"),
-        ({"firing": [Thruster("bus", (1, 0, 0), 1.0)]}, "thrusters"),
     ]
     for told, name in wrong:
         with pytest.raises(ProblemError) as caught:
