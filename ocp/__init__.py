@@ -46,6 +46,7 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
 from ocp.solution import Sensitivity, Solution
+from ocp.status import SolverStatus
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
@@ -88,6 +89,7 @@ __all__ = [
     "Sensitivity",
     "Solution",
     "SolveError",
+    "SolverStatus",
     "Stabiliser",
     "StancePhase",
     "StepWeights",

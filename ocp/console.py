@@ -23,10 +23,10 @@ import casadi as ca
 import numpy as np
 from tqdm import tqdm
 
+from ocp.status import SolverStatus
+
 __all__ = [
-    "INTERRUPTED",
     "LOG",
-    "OUT_OF_TIME",
     "OutOfTime",
     "Progress",
     "Watch",
@@ -41,8 +41,6 @@ __all__ = [
 
 LOG = logging.getLogger("ocp")
 GRACE = 0.5  # s after Ctrl-C in which a call may end by itself, with what it has found
-INTERRUPTED = "User_Requested_Stop"
-OUT_OF_TIME = "Maximum_WallTime_Exceeded"
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -152,13 +150,13 @@ def listening() -> Iterator[None]:
         call.listeners -= 1
 
 
-def reason_to_stop() -> str:
-    """Why the work at hand should end, in ipopt's words for it; "" where it need not."""
+def reason_to_stop() -> SolverStatus | None:
+    """Why the work at hand should end, INTERRUPTED or TIME_LIMIT; None where it need not."""
     call = _CALL.get()
     if call is not None and call.stop:
         call.heard = True
-        return INTERRUPTED
-    return OUT_OF_TIME if time_left() <= 0 else ""
+        return SolverStatus.INTERRUPTED
+    return SolverStatus.TIME_LIMIT if time_left() <= 0 else None
 
 
 # ---- time limits -------------------------------------------------------------------------------------------------
@@ -187,7 +185,7 @@ class OutOfTime(Exception):
 def check_time() -> None:
     """Raise OutOfTime behind the time limit."""
     if time_left() <= 0:
-        raise OutOfTime(OUT_OF_TIME)
+        raise OutOfTime(str(SolverStatus.TIME_LIMIT))
 
 
 # ---- progress ----------------------------------------------------------------------------------------------------
@@ -200,14 +198,15 @@ class Progress(ca.Callback):  # type: ignore[misc]
         ca.Callback.__init__(self)
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
         self.title, self.show = title, show
-        self.stopped, self.iterate, self.iterations = "", np.zeros(n), 0
+        self.stopped: SolverStatus | None = None
+        self.iterate, self.iterations = np.zeros(n), 0
         self.bar: Any = None
         self.construct("progress", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
         """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
         self.lower, self.upper = lower, upper
-        self.stopped, self.iterations = "", 0
+        self.stopped, self.iterations = None, 0
         disable = None if self.show else True
         form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
         self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
@@ -234,7 +233,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
                 self.bar.update()
             self.stopped = reason_to_stop()
         except KeyboardInterrupt:  # CasADi would make another error of it
-            self.stopped = INTERRUPTED
+            self.stopped = SolverStatus.INTERRUPTED
         self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
         return [int(bool(self.stopped))]
 
@@ -251,13 +250,14 @@ class Watch(ca.Callback):  # type: ignore[misc]
 
     def __init__(self, n: int, title: str) -> None:
         ca.Callback.__init__(self)
-        self.n, self.title, self.stopped = n, title, ""
+        self.n, self.title = n, title
+        self.stopped: SolverStatus | None = None
         self.iterate, self.iterations = np.zeros(n), 0
         self.construct("watch", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
         """Begin a solve."""
-        self.stopped, self.iterations = "", 0
+        self.stopped, self.iterations = None, 0
 
     def close(self) -> None:
         """The solve has ended."""
@@ -275,7 +275,7 @@ class Watch(ca.Callback):  # type: ignore[misc]
         try:
             self.stopped = self.stopped or reason_to_stop()
         except KeyboardInterrupt:
-            self.stopped = INTERRUPTED
+            self.stopped = SolverStatus.INTERRUPTED
         self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
         return [float(not self.stopped)]
 

@@ -15,6 +15,7 @@ from ocp.errors import ProblemError, SolveError, checked_flag, checked_time_limi
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
+from ocp.status import SolverStatus
 from ocp.tolerances import FLAT_SHARE
 
 __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
@@ -157,11 +158,11 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
         plans = [other for other in others if other.success]
         if not plans and found.upwards is False:
             words = f"no minimum: the cost falls along a variation from {found.time or 0.0:.4g} s on"
-            beyond = "; ".join(other.status for other in others)
+            beyond = "; ".join(other.message for other in others)
             raise SolveError(
                 f"problem {form.name!r}: the plan found, of cost {solution.cost:.6g}, is stationary but {words}; from "
                 f"beside it the solver ended with {beyond}",
-                replace(solution, success=False, status=words),
+                replace(solution, success=False, status=SolverStatus.REJECTED, message=words),
                 name="cost",
                 value=solution.cost,
                 time=found.time,

@@ -12,7 +12,7 @@ import numpy as np
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
-from ocp.console import OUT_OF_TIME, OutOfTime, limited, time_left
+from ocp.console import OutOfTime, limited, time_left
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import (
     ProblemError,
@@ -29,6 +29,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Refinement, Solution, stack
+from ocp.status import SolverStatus
 
 __all__ = ["refine", "refined", "split"]
 
@@ -196,10 +197,10 @@ def _first(
     try:
         return solution, judge(problem, solution, **settings)
     except OutOfTime as error:
-        words = f"{OUT_OF_TIME}: raise time_limit"
+        words = f"{SolverStatus.TIME_LIMIT}: raise time_limit"
         raise SolveError(
             f"refinement of {problem.name!r} ended in the audit of its first plan with {words}",
-            dataclasses.replace(solution, success=False, status=words),
+            dataclasses.replace(solution, success=False, status=SolverStatus.TIME_LIMIT, message=words),
             name="time_limit",
             value=time_limit,
         ) from error
@@ -218,7 +219,7 @@ def _next(
     try:
         solution = solve(problem, method, **given)
         if not solution.success:
-            raise SolveError(f"refinement of {problem.name!r} failed: {solution.status.split(':')[0]}", solution)
+            raise SolveError(f"refinement of {problem.name!r} failed: {solution.status}", solution)
         return solution, judge(problem, solution, **settings)
     except (SolveError, OutOfTime) as error:
         if isinstance(error, SolveError) and time_left() > 0:

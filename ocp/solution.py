@@ -20,6 +20,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.phases import own_of
 from ocp.problem.problem import Problem
 from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
+from ocp.status import SolverStatus
 from ocp.storage import read_arrays, write_arrays
 
 __all__ = [
@@ -48,7 +49,8 @@ HEAD = {
     "method": dict,
     "solver": str,
     "success": bool,
-    "status": str,
+    "status": SolverStatus,
+    "message": str,
     "cost": float,
     "iterations": int,
     "horizon": float,
@@ -142,7 +144,8 @@ class Solution:
         method: What solved it, as a dictionary of its settings.
         solver: What solved it: ``ipopt``, ``fatrop``, ..., ``newton`` beside an earlier plan.
         success: Whether the solver reports an optimum within its tolerance.
-        status: The solver's word, with what to try where it failed.
+        status: How the solver ended. message: What to try where it failed, or what
+            else it says; may be "".
         cost: Value of the cost. iterations: of the solver. horizon: Final time, s.
         t: Reported times, s; first 0, last the horizon. Shape (M,).
         states, controls, costates: Values at the reported times by name, each (M, n). Costates are
@@ -170,7 +173,7 @@ class Solution:
     method: dict[str, Any]
     solver: str
     success: bool
-    status: str
+    status: SolverStatus
     cost: float
     iterations: int
     horizon: float
@@ -193,6 +196,7 @@ class Solution:
     tightening_cost: float = 0.0
     start: str = "guess"
     regularised: bool = False
+    message: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
@@ -224,7 +228,7 @@ class Solution:
 
     @property
     def _verdict(self) -> str:
-        return "solved" if self.success else self.status
+        return "solved" if self.success else self.message or str(self.status)
 
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
         """States and controls over time, with their bounds; see :func:`ocp.app.plots.plot_solution`.
@@ -445,7 +449,7 @@ class Solution:
             arrays |= {f"{kind}/{name}": values for name, values in getattr(self, kind).items()}
         for kind in INTERPOLANTS:
             arrays |= {f"{kind}/{part}": getattr(getattr(self, kind), part) for part in PARTS}
-        head = {"version": VERSION, **{key: getattr(self, key) for key in HEAD}}
+        head = {"version": VERSION, **{key: getattr(self, key) for key in HEAD}, "status": self.status.value}
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
@@ -511,6 +515,7 @@ class Solution:
             if parts:
                 words = f"{path} holds {', '.join(parts)}, which no plan has"
                 raise ProblemError(words, name=parts[0], value=str(path))
+            head["status"] = read_status(path, head["status"])
             solution = cls(**head, **fields)
             check_structure(solution)
             check_finite(solution)
@@ -559,6 +564,13 @@ def read_head(path: Any, text: np.ndarray) -> Any:
         words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MOST_HEAD:.3g} at most"
         raise ProblemError(words, name="head", value=text.nbytes, limit=MOST_HEAD)
     return json.loads(text.tobytes().decode())
+
+
+def read_status(path: Any, word: Any) -> SolverStatus:
+    """Return the status that stands in the head of a file; ProblemError where it is none."""
+    if word not in [status.value for status in SolverStatus]:
+        raise ProblemError(f"{path}: {word!r} is no status of a solver", name="status", value=word)
+    return SolverStatus(word)
 
 
 def by_name(kind: str, name: Any, pool: Mapping[str, T]) -> T:
@@ -665,6 +677,7 @@ def check_structure(solution: Solution) -> None:
         kinds: Any = {bool: bool | np.bool_, int: int | np.integer, float: int | float | np.number}.get(kind, kind)
         if not isinstance(value, kinds) or (kind is not bool and isinstance(value, bool)):
             no = {bool: "is neither True nor False", str: "is no text", dict: "is no dictionary"}
+            no[SolverStatus] = "is no SolverStatus"
             raise refuse(name, f"{no.get(kind, 'is no number')}: {value!r}")
     if not isinstance(solution.method.get("type"), str):
         raise refuse("method", f"has no type: {solution.method!r}")

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import OUT_OF_TIME, interruptible, limited, time_left
+from ocp.console import interruptible, limited, time_left
 from ocp.direct.fragment import Fragment
 from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution
+from ocp.status import SolverStatus
 
 __all__ = ["exceeded", "tighten"]
 
@@ -101,8 +102,8 @@ def _tightened(
             if best is None or time_left() > 0:
                 raise
             plan, remains, _ = best
-            words = f"{OUT_OF_TIME}: raise time_limit"
-            plan = replace(plan, success=False, status=words)
+            words = f"{SolverStatus.TIME_LIMIT}: raise time_limit"
+            plan = replace(plan, success=False, status=SolverStatus.TIME_LIMIT, message=words)
             told = f"problem {form.name!r}: tightening ended with {words}; {remains}"
             raise SolveError(told, plan, name="time_limit", value=time_limit) from error
         beyond, times = _excess(form, solution, p, low, high)

@@ -32,7 +32,8 @@ FLOORS = {
         ["papers"],
     ],
     "ocp": [
-        ["errors", "curves", "console", "tolerances"],
+        ["errors", "curves", "status", "tolerances"],
+        ["console"],
         ["storage", "libraries", "tables"],
         ["problem", "schedule", "tasks"],
         ["solution"],

@@ -266,7 +266,7 @@ def audit(
     findings += optimality_findings(form, found, over, lost, costates, stationarity, drift)
     undecided = found.curvature.flat
     if not solution.success:
-        undecided = f"the solver says {solution.status}"
+        undecided = f"the solver says {solution.message or solution.status}"
     return Audit(
         form.name,
         tuple(findings),

@@ -39,6 +39,7 @@ from ocp.local.rates import LocalSolution, least_rates, resolve
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.status import SolverStatus
 from ocp.tasks.checks import (
     check_closed,
     checked_configuration,
@@ -444,9 +445,9 @@ def _outcome(
     except SolveError as error:
         return _Outcome(attempt, error.solution, error)
     if not solution.success:
-        if "User_Requested_Stop" in solution.status:
+        if solution.status is SolverStatus.INTERRUPTED:
             raise SolveError(f"interrupted in the solve with {attempt}", solution, name=str(attempt))
-        ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
+        ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
         return _Outcome(attempt, solution, ended)
     audit = solution.audit()
     if not audit.passed and audit.failures:  # what is not decided to be a minimum may be run; its audit says so

@@ -22,6 +22,7 @@ from ocp.direct.fragment import Fragment
 from ocp.direct.kkt import Sides, corrected
 from ocp.direct.nlp import ROUNDING, Outcome
 from ocp.direct.scaling import Scales
+from ocp.status import SolverStatus
 
 __all__ = ["Newton"]
 
@@ -83,7 +84,7 @@ class Newton:
             if at is None:
                 return None
             steps += at.steps
-            start = Outcome(at.v, 0.0, at.rows, at.lam, True, "Solve_Succeeded", steps, 0.0, False, "newton")
+            start = Outcome(at.v, 0.0, at.rows, at.lam, SolverStatus.SOLVED, "", steps, 0.0, False, "newton")
             after = corrected(self._program, start, arguments, scales, sides, ROOM)
             if after is None:
                 return None
@@ -93,7 +94,9 @@ class Newton:
                 if self._matrix(at.v, arguments["p"], at.lam, which, scales, local=True) is None:  # it is a saddle
                     return None
                 seconds = time.monotonic() - began
-                return Outcome(at.v, cost, at.rows, at.lam, True, start.status, steps, seconds, False, "newton")
+                return Outcome(
+                    at.v, cost, at.rows, at.lam, start.status, str(start.status), steps, seconds, False, "newton"
+                )
             sides = after
         return None
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from ocp.console import INTERRUPTED, Progress, listening, time_left
+from ocp.console import Progress, listening, time_left
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
@@ -23,6 +23,7 @@ from ocp.direct.scaling import USUAL, Scales
 from ocp.errors import Interrupted, SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
+from ocp.status import SolverStatus
 
 __all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan"]
 
@@ -67,13 +68,13 @@ def diagnosis(
         attempts: What became of every start, one line each. badly_scaled: What is, or "".
     """
     labels, at, value, miss = residuals(built, outcome.variables, arguments)
-    status = outcome.status
+    message = outcome.message
     found = () if elastic is None or badly_scaled else elastic.conflicts
     if badly_scaled:
-        status = f"{status.partition(':')[0]}: badly scaled: {badly_scaled}; {REMEDY}"
+        message = f"{outcome.status}: badly scaled: {badly_scaled}; {REMEDY}"
     elif elastic is not None and not found:  # it is not the constraints
-        status = status.partition(":")[0]
-    lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {status}"]
+        message = str(outcome.status)
+    lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {message}"]
     if found:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
         lines += [f"  {conflict}" for conflict in found[:WORST]]
@@ -267,7 +268,7 @@ def elastic_plan(
         return None
     finally:
         progress.close()
-    if progress.stopped == INTERRUPTED:
+    if progress.stopped is SolverStatus.INTERRUPTED:
         raise Interrupted(f"problem {built.problem.name!r}: interrupted while looking for what is in conflict")
     if not solver.stats()["success"]:
         return None

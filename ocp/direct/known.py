@@ -13,8 +13,9 @@ import numpy as np
 
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Fragment
-from ocp.direct.nlp import ADVICE, ROUNDING, Outcome
+from ocp.direct.nlp import ROUNDING, Outcome
 from ocp.problem.formulation import Formulation
+from ocp.status import SolverStatus
 
 __all__ = ["Known"]
 
@@ -68,8 +69,7 @@ class Known:
         beyond = np.where(self.declared, beyond, 0.0) / (scales["g"] + np.abs(outcome.rows))
         if not outcome.success or max(miss.max(initial=0.0), beyond.max(initial=0.0)) <= ROUNDING:
             return replace(outcome, variables=inside) if outcome.success else outcome
-        word = "Infeasible_Problem_Detected"
-        return replace(outcome, success=False, status=f"{word}: {ADVICE[word]}")
+        return replace(outcome, status=SolverStatus.INFEASIBLE, message=SolverStatus.INFEASIBLE.message)
 
 
 def self_running(form: Formulation) -> np.ndarray:

@@ -15,9 +15,9 @@ from ocp.console import LOG, Progress, Watch, listening, quiet
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Stages
 from ocp.errors import ProblemError, SolveError
+from ocp.status import SolverStatus
 
 __all__ = [
-    "ADVICE",
     "DEFAULTS",
     "ROUNDING",
     "SOLVERS",
@@ -50,31 +50,27 @@ DEFAULTS: dict[str, dict[str, Any]] = {"ipopt": IPOPT, "fatrop": FATROP, "sleqp"
 SOLVERS = tuple(DEFAULTS)
 """What may be asked for."""
 
-ADVICE = {
-    "Infeasible_Problem_Detected": "no point near the guess meets all constraints; relax the ones named below, "
-    "lengthen the horizon or start from another guess",
-    "Maximum_Iterations_Exceeded": "raise options={'max_iter': ...}, or start from a better guess",
-    "Restoration_Failed": "start from a better guess, or scale states and constraints nearer to 1",
-    "Diverging_Iterates": "the cost may be unbounded below; bound the controls or add a term to the cost",
-    "Invalid_Number_Detected": "a function is not finite at an iterate; keep the states away from where it is singular",
-    "Search_Direction_Becomes_Too_Small": "the problem may be badly scaled or its constraints redundant",
-    "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns; drop redundant constraints",
-    "User_Requested_Stop": "interrupted",
-    "Maximum_WallTime_Exceeded": "raise time_limit, or start from a better guess",
-    "Error_In_Step_Computation": "constraints may be redundant or a function not smooth",
-}
-FATROP_WORDS = {0: "Solve_Succeeded", 1: "Maximum_Iterations_Exceeded", 2: "Solved_To_Acceptable_Level"}
+FATROP_FLAGS = {0: SolverStatus.SOLVED, 1: SolverStatus.ITERATION_LIMIT, 2: SolverStatus.ACCEPTABLE}
 FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
+WORDS = {
+    "optimal": SolverStatus.SOLVED,
+    "unbounded": SolverStatus.DIVERGING,
+    "deadpoint": SolverStatus.STEP_FAILED,
+    "iteration limit": SolverStatus.ITERATION_LIMIT,
+    "Feasible_Point_Found": SolverStatus.ACCEPTABLE,
+}
+"""What SLEQP says, and IPOPT of as many equations as variables."""
 KINDS = {"IpoptInterface": "ipopt", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
 """Names of solvers by the class that calls them."""
 HUGE = 1e20
 ROUNDING = 1e-8  # of the residuals at which ipopt cannot move any more, relative to variables and multipliers
-SUCCESSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and its word.
+    """What a solver returned: variables, cost, constraint values, multipliers of the rows, and how it ended.
+
+    ``message``: the status with what to try, or with the error that ended the solver.
 
     ``regularised``: whether the cost did not curve upwards where it ended, as far as the solver saw: its last step was
     made with a Hessian that it had changed, or it made none. ``solver``: Its name.
@@ -84,12 +80,17 @@ class Outcome:
     cost: float
     rows: np.ndarray
     multipliers: np.ndarray
-    success: bool
-    status: str
+    status: SolverStatus
+    message: str
     iterations: int
     seconds: float
     regularised: bool = False
     solver: str = ""
+
+    @property
+    def success(self) -> bool:
+        """Whether the solver reports an optimum."""
+        return self.status.is_success
 
 
 def build_solver(
@@ -218,38 +219,33 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
         progress.close()
     stats = solver.stats()
     word = str(stats.get("return_status", ""))
+    status = WORDS.get(word) or SolverStatus.of_word(word)
     if "fatrop" in stats:
-        word = FATROP_WORDS.get(int(stats["fatrop"]["return_flag"]), "Error_In_Step_Computation")
-    if word == "Search_Direction_Becomes_Too_Small" and as_good_as_rounding_allows(stats, result):
-        word = "Solved_To_Acceptable_Level"
-    word = progress.stopped or word
-    success = not progress.stopped and (bool(stats["success"]) or word in SUCCESSES)
+        status = FATROP_FLAGS.get(int(stats["fatrop"]["return_flag"]), SolverStatus.STEP_FAILED)
+    if status is SolverStatus.SMALL_STEP and as_good_as_rounding_allows(stats, result):
+        status = SolverStatus.ACCEPTABLE
+    status = progress.stopped or status
     values = {key: np.asarray(result[key], dtype=float).reshape(-1) for key in ("x", "f", "g", "lam_g")}
-    if success and not all(np.all(np.isfinite(v)) for v in values.values()):
-        success, word = False, "Invalid_Number_Detected"
-    if word == "Solved_To_Acceptable_Level" and missed(values, arguments) > ROUNDING:
-        success, word = False, "Error_In_Step_Computation"
+    if status.is_success and not all(np.all(np.isfinite(v)) for v in values.values()):
+        status = SolverStatus.NOT_FINITE
+    if status is SolverStatus.ACCEPTABLE and missed(values, arguments) > ROUNDING:
+        status = SolverStatus.STEP_FAILED
     iterations, seconds = int(stats.get("iter_count", 0)), time.monotonic() - began
-    cost, status = float(values["f"][0]), word if success else advised(word)
-    tell(f"solved {progress.title!r}: {word}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
+    cost, message = float(values["f"][0]), word if status is SolverStatus.FAILED else status.message
+    tell(f"solved {progress.title!r}: {status}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
     found = values["x"], cost, values["g"], values["lam_g"]
-    return Outcome(*found, success, status, iterations, seconds, regularised(stats), kind)
+    return Outcome(*found, status, message, iterations, seconds, regularised(stats), kind)
 
 
 def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
     """The iterate at which a solver stopped, or was stopped, that returned nothing; its multipliers are not known."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(at.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
-    word = at.stopped or "Error_In_Step_Computation"
-    tell(f"stopped {at.title!r}: {word}, {at.iterations} iterations, {seconds:.3g} s")
+    status = at.stopped or SolverStatus.STEP_FAILED
+    tell(f"stopped {at.title!r}: {status}, {at.iterations} iterations, {seconds:.3g} s")
     kind = KINDS[solver.class_name()]
-    return Outcome(at.iterate, float(cost[0]), rows, unknown, False, advised(word), at.iterations, seconds, False, kind)
-
-
-def advised(word: str) -> str:
-    """A solver's word with what to try."""
-    advice = ADVICE.get(word, "")
-    return f"{word}: {advice}" if advice else word
+    found = at.iterate, float(cost[0]), rows, unknown
+    return Outcome(*found, status, status.message, at.iterations, seconds, False, kind)
 
 
 def tell(words: str) -> None:
@@ -267,8 +263,9 @@ def regularised(stats: dict[str, Any]) -> bool:
 def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
     """The outcome of a solver that a function of the program threw out, as an integrator does: its start."""
     rows = np.full(arguments["lbg"].shape, np.nan)
-    word = f"Invalid_Number_Detected: {last_line(error)}"
-    return Outcome(arguments["x0"], np.nan, rows, rows, False, word, 0, 0.0, False, KINDS[solver.class_name()])
+    status = SolverStatus.NOT_FINITE
+    found = arguments["x0"], np.nan, rows, rows
+    return Outcome(*found, status, f"{status}: {last_line(error)}", 0, 0.0, False, KINDS[solver.class_name()])
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ocp.console import INTERRUPTED, OUT_OF_TIME, interruptible, limited
+from ocp.console import interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
@@ -46,6 +46,7 @@ from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
+from ocp.status import SolverStatus
 from ocp.storage import checked_path
 
 __all__ = ["DirectMethod", "Prepared", "check_meshed"]
@@ -363,7 +364,7 @@ class Prepared:
             v, lam = guess.variables, guess.multipliers
             scales = self._scales(v, {*form.states, *form.controls, "horizon"}, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
-            start = Outcome(v, cost, rows, lam, True, guess.status, 0, 0.0)
+            start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
             sides = held_by(self.program, start, before, scales)
             if ahead:
                 of_x, of_g = later(self.fragment, ahead)
@@ -415,10 +416,10 @@ class Prepared:
         try:
             solution = self._solution(outcome, p, start)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
-            if outcome.status.startswith(INTERRUPTED):
+            if outcome.status is SolverStatus.INTERRUPTED:
                 raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
             return Attempt(start, arguments, told, scales, outcome, None, error)
-        if outcome.status.startswith(INTERRUPTED):
+        if outcome.status is SolverStatus.INTERRUPTED:
             words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
             raise Interrupted(words, solution)
         return Attempt(start, arguments, told, scales, outcome, solution)
@@ -466,6 +467,7 @@ class Prepared:
             solver=outcome.solver,
             success=outcome.success,
             status=outcome.status,
+            message=outcome.message,
             cost=outcome.cost,
             iterations=outcome.iterations,
             horizon=horizon,
@@ -553,16 +555,15 @@ class Attempt:
     @property
     def is_final(self) -> bool:
         """Whether no other start is to be tried: it succeeded, or there is no time left."""
-        return self.found is not None or self.outcome.status.startswith(OUT_OF_TIME)
+        return self.found is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
     def is_broken(self) -> bool:
         """Whether a function was not finite, or an integrator broke down."""
-        return self.outcome.status.startswith("Invalid_Number_Detected")
+        return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:
-        word = self.outcome.status.partition(":")[0]
-        return f"from the {self.start}: {word} after {self.outcome.iterations} iterations"
+        return f"from the {self.start}: {self.outcome.status} after {self.outcome.iterations} iterations"
 
 
 def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:

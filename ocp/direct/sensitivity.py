@@ -79,7 +79,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     scales = fitting_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
     a, b, c = scales.variables, scales.rows, scales.cost
     rows = np.asarray(built.program.values(v, p)[1].full()).ravel()
-    outcome = Outcome(v, solution.cost, rows, lam, True, "", 0, 0.0)
+    outcome = Outcome(v, solution.cost, rows, lam, solution.status, solution.message, 0, 0.0)
     at = conditions(built.program, outcome, arguments, scales)
 
     slope, change = by_parameters(fragment, v, p, lam, columns)
@@ -155,7 +155,7 @@ def program_of(solution: Solution) -> Built:
         raise ProblemError(words, name="method", value=kind)
     if not solution.success or solution.drawn_in is not None:
         words = f"{what}: it is no optimum under the bounds of its problem"
-        raise ProblemError(words, name="solution", value=solution.status)
+        raise ProblemError(words, name="solution", value=solution.message)
     form = Formulation.of(solution.problem)
     method = METHODS[kind](**settings)
     for staged in (False, True):

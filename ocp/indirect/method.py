@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import INTERRUPTED, interruptible, limited
+from ocp.console import interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
@@ -40,6 +40,7 @@ from ocp.problem.formulation import Bounds, Formulation, at_samples
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution, check_belongs
+from ocp.status import SolverStatus
 
 __all__ = ["Indirect", "PreparedIndirect"]
 
@@ -169,12 +170,12 @@ class PreparedIndirect:
         found = newton(system, start, data, float(max(1.0, np.max(np.abs(start)))), self.method.residual)
         found = self._check_order(found, arcs, bounds)
         solution = self._solution(found, arcs, data, p, bounds, note, time.monotonic() - began)
-        if found.status == INTERRUPTED:
+        if found.status is SolverStatus.INTERRUPTED:
             words = f"problem {self.problem.name!r}: interrupted after {found.steps} Newton steps"
             raise Interrupted(words, solution)
         if check and not solution.success:
             raise SolveError(
-                f"problem {self.problem.name!r}: the indirect method failed: {solution.status} after {found.steps} "
+                f"problem {self.problem.name!r}: the indirect method failed: {solution.message} after {found.steps} "
                 f"Newton steps, residual {found.residual:.2e}\n  try a finer direct solution as guess, more segments, "
                 "or a direct method",
                 solution,
@@ -190,7 +191,8 @@ class PreparedIndirect:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             told = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
             raise SolveError(words, seed, error.conflicts, **told) from error
-        return dataclasses.replace(seed, success=False, status=f"{why}{error}")
+        status = seed.status if not seed.success else SolverStatus.REJECTED
+        return dataclasses.replace(seed, success=False, status=status, message=f"{why}{error}")
 
     # ---- before and after ------------------------------------------------------------------------------------
 
@@ -205,17 +207,17 @@ class PreparedIndirect:
             place = self.formulation.bounds.places["horizon"][0]
             low, high = bounds[0][place], bounds[1][place]
             if not low * (1 - SLACK) <= horizon <= high * (1 + SLACK):
-                status = (
+                words = (
                     f"the horizon comes out as {horizon:.6g} s, beyond its bounds {low:g} .. {high:g} s; where a bound "
                     "holds it, fix it there"
                 )
-                return dataclasses.replace(found, success=False, status=status)
+                return dataclasses.replace(found, status=SolverStatus.REJECTED, message=words)
         switches = found.unknowns[at["switches"]]
         knots = np.concatenate([[0.0], switches, [horizon]])
         if np.all(np.diff(knots) > -SLACK * np.max(np.abs(switches), initial=0.0)):  # two controls may switch at once
             return found
-        status = f"the switches are not in order within the horizon: {np.round(knots[1:], 6).tolist()} s"
-        return dataclasses.replace(found, success=False, status=status)
+        words = f"the switches are not in order within the horizon: {np.round(knots[1:], 6).tolist()} s"
+        return dataclasses.replace(found, status=SolverStatus.REJECTED, message=words)
 
     def _solution(
         self,
@@ -254,7 +256,7 @@ class PreparedIndirect:
         if found.success:
             reason = not_least(ham, extremal, p, bounds)
             if reason:
-                found = dataclasses.replace(found, success=False, status=reason)
+                found = dataclasses.replace(found, status=SolverStatus.REJECTED, message=reason)
         by_parameter = cost_gradient(ham, extremal, p, bounds) if form.np else np.zeros(0)
         breaks = np.concatenate([q[0], [horizon]]) / horizon
         own = np.ones(shape, dtype=bool)
@@ -269,7 +271,8 @@ class PreparedIndirect:
             method={"type": "Indirect", **settings, "control": ham.how, "switches": switches.tolist()},
             solver="newton",
             success=found.success and bool(np.isfinite(cost)),
-            status=found.status + note,
+            status=found.status,
+            message=found.message + note,
             cost=cost,
             iterations=found.steps,
             horizon=horizon,

@@ -10,6 +10,7 @@ import numpy as np
 
 from ocp.console import listening, quiet, reason_to_stop
 from ocp.errors import ProblemError
+from ocp.status import SolverStatus
 
 __all__ = ["Found", "newton"]
 
@@ -24,8 +25,13 @@ class Found:
     unknowns: np.ndarray
     residual: float
     steps: int
-    success: bool
-    status: str
+    status: SolverStatus
+    message: str
+
+    @property
+    def success(self) -> bool:
+        """Whether it converged, and no check refused what it found."""
+        return self.status.is_success
 
 
 def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: float, tolerance: float) -> Found:
@@ -43,14 +49,14 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
     if value.size != start.size:
         words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
-    polished, stopped = False, ""
+    polished, stopped = False, None
     with listening():
         for steps in range(MOST_STEPS + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
-                return Found(z, size, steps, False, "the integration broke down at the seed")
+                return Found(z, size, steps, SolverStatus.NOT_FINITE, "the integration broke down at the seed")
             if size <= tolerance * scale and polished:
-                return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
+                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step: it costs little and gains digits
             stopped = reason_to_stop()
             if stopped or steps == MOST_STEPS:
@@ -59,15 +65,17 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
                 with quiet():
                     slopes = jacobian(z, data)
             except RuntimeError:
-                return Found(z, size, steps, polished, "the integration of the sensitivities broke down")
+                status = SolverStatus.SOLVED if polished else SolverStatus.NOT_FINITE
+                return Found(z, size, steps, status, "the integration of the sensitivities broke down")
             try:
                 step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
             except RuntimeError:
                 step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
                 word = "Newton's matrix is singular: the plan is not determined"
-                status = f"Converged in {steps} Newton steps; {word}" if polished else word
-                return Found(z, size, steps, polished, status)
+                if polished:
+                    return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}")
+                return Found(z, size, steps, SolverStatus.STEP_FAILED, word)
             length = 1.0
             for _ in range(HALVINGS):
                 trial = z + length * step
@@ -76,8 +84,11 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
                     break
                 length *= 0.5
             else:
-                return Found(z, size, steps, False, "no step along Newton's direction makes the residual smaller")
+                words = "no step along Newton's direction makes the residual smaller"
+                return Found(z, size, steps, SolverStatus.STEP_FAILED, words)
             if polished and np.max(np.abs(new)) > size:
-                return Found(z, size, steps, True, f"Converged in {steps} Newton steps")
+                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             z, value = trial, new
-    return Found(z, size, steps, False, stopped or f"not converged in {MOST_STEPS} Newton steps")
+    if stopped is not None:
+        return Found(z, size, steps, stopped, str(stopped))
+    return Found(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {MOST_STEPS} Newton steps")

@@ -146,7 +146,7 @@ def coarse_motions(
             least = min(least, solution.cost)
             found.append(Candidate(joints, solution.cost, "", solution))
         else:
-            found.append(Candidate(joints, np.nan, f"no motion was found: {solution.status.split(':')[0]}"))
+            found.append(Candidate(joints, np.nan, f"no motion was found: {solution.status}"))
     found.sort(key=lambda one: np.inf if np.isnan(one.cost) else one.cost)
     return _once(motion, found)
 
@@ -436,7 +436,7 @@ class Maker:
             named = clear is not None and bool(clear.margins)  # then what is in the way is named already
             solution = prepared.solve(guess=guess, check=thorough and not named)
             if not solution.success:
-                return Candidate(start, np.nan, f"no motion was found: {solution.status.split(':')[0]}"), None
+                return Candidate(start, np.nan, f"no motion was found: {solution.status}"), None
             if solution.cost >= most * (1 - SAME):
                 return Candidate(start, solution.cost, DEARER), None
             touching = [touch for touch in self.touches(solution) if clear and touch.pair not in clear.margins]
@@ -504,7 +504,7 @@ class Maker:
             options = _options(motion, finer, solution.cost, SOLVER)
             found = solve(motion.problem, finer, guess=solution, options=options, check=check)
             if not found.success:
-                raise SolveError(f"no motion was found on a finer mesh: {found.status.split(':')[0]}", found)
+                raise SolveError(f"no motion was found on a finer mesh: {found.status}", found)
             before, strays = strays.max(), self._strays(motion, found)
             if strays.max() > max(OUT_OF_REACH, NEARER * before):
                 break

@@ -34,6 +34,7 @@ from ocp import (
 from ocp.console import OutOfTime, check_time, interruptible, limited, quiet, time_left
 from ocp.direct.prepared import Prepared
 from ocp.errors import Interrupted
+from ocp.status import SolverStatus
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
 from tests.ocp.test_tightening import beyond, walled
 
@@ -235,7 +236,7 @@ def test_a_solve_ends_at_its_time_limit_and_says_so(solver: str) -> None:
     assert time.monotonic() - began < 2.0
     for plan in (solution, caught.value.solution):
         assert not plan.success
-        assert plan.status.startswith("Maximum_WallTime_Exceeded")
+        assert plan.status is SolverStatus.TIME_LIMIT
         assert plan["x"].shape == (1201, 2)
         assert np.all(np.isfinite(plan["x"]))
         assert np.isfinite(plan.cost)
@@ -245,7 +246,7 @@ def test_sleqp_ends_at_its_time_limit_and_works_again() -> None:
     prepared = prepare(van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0), Collocation(60), solver="sleqp")
     stopped = prepared.solve(check=False, time_limit=0.05)
     assert not stopped.success
-    assert stopped.status.startswith("Maximum_WallTime_Exceeded")
+    assert stopped.status is SolverStatus.TIME_LIMIT
     assert np.all(np.isfinite(stopped["x"]))
     assert np.isfinite(stopped.cost)
     assert prepared.solve(check=False).success
@@ -255,7 +256,7 @@ def test_where_sleqp_fails_is_no_foreign_exception() -> None:
     """Its interface raises where it gives up."""
     problem = van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
     plan = prepare(problem, Collocation(100, 4), solver="sleqp").solve(check=False)
-    assert plan.success or plan.status.startswith("Error_In_Step_Computation")
+    assert plan.success or plan.status is SolverStatus.STEP_FAILED
     assert np.all(np.isfinite(plan["x"]))
 
 
@@ -280,7 +281,7 @@ def test_one_time_limit_covers_all_starts() -> None:
     assert next(line for line in told if line.startswith("from the ")).startswith("from the guess: Invalid_Number")
     assert "from the roll-out" not in str(caught.value)
     assert caught.value.solution.start == "zeros"
-    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+    assert caught.value.solution.status is SolverStatus.TIME_LIMIT
 
 
 def test_the_time_limit_holds_for_all_of_a_solve() -> None:
@@ -376,7 +377,7 @@ def test_refinement_keeps_the_last_audited_plan_whatever_the_limit_meets(
 def test_refinement_without_a_plan_at_its_time_limit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         refine(long(), Collocation(200), time_limit=1e-6)
-    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+    assert caught.value.solution.status is SolverStatus.TIME_LIMIT
     overtaken(monkeypatch, ocp.refinement, "judge", 1)
     with pytest.raises(
         SolveError, match="audit of its first plan with Maximum_WallTime_Exceeded: raise time"
@@ -385,7 +386,7 @@ def test_refinement_without_a_plan_at_its_time_limit_says_so(monkeypatch: pytest
     assert (caught.value.name, caught.value.value) == ("time_limit", 100.0)
     plan = caught.value.solution
     assert not plan.success
-    assert plan.status.startswith("Maximum_WallTime_Exceeded")
+    assert plan.status is SolverStatus.TIME_LIMIT
     assert plan.cost == pytest.approx(solve(van_der_pol(), Collocation(3)).cost)
 
 
@@ -399,7 +400,7 @@ def test_a_failure_within_the_time_limit_is_no_matter_of_time() -> None:
 def test_tightening_ends_at_its_time_limit_with_its_best_plan() -> None:
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         tighten(long(), Collocation(200), time_limit=1e-6)
-    assert caught.value.solution.status.startswith("Maximum_WallTime_Exceeded")
+    assert caught.value.solution.status is SolverStatus.TIME_LIMIT
 
 
 @pytest.mark.parametrize("rounds", [1, 2])
@@ -413,7 +414,7 @@ def test_tightening_carries_its_best_plan_and_says_what_remains(rounds: int, mon
     assert (told.value.name, told.value.value) == ("time_limit", 100.0)
     plan = told.value.solution
     assert not plan.success
-    assert plan.status.startswith("Maximum_WallTime_Exceeded")
+    assert plan.status is SolverStatus.TIME_LIMIT
     assert (plan.drawn_in is None) == (rounds == 1)  # under the bounds of its own round
     monkeypatch.undo()
     plain, tight = solve(walled(), method), tighten(walled(), method, tolerance=1e-10)

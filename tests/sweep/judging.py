@@ -147,7 +147,7 @@ def _solved(problem: Any, method: Any, **how: Any) -> tuple[Solution | None, str
     """A plan that the solver calls optimal, or what it says."""
     try:
         plan = solve(problem, method, **how)
-        return (plan, "") if plan.success else (None, plan.status)
+        return (plan, "") if plan.success else (None, plan.message)
     except (SolveError, ProblemError) as error:
         return None, str(error).splitlines()[0][:160]
 

@@ -25,6 +25,7 @@ from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import DURATION, Phases
 from ocp.solution import Solution
+from ocp.status import SolverStatus
 
 __all__ = ["guess_in_time"]
 
@@ -139,10 +140,8 @@ def _too_fast(problem: Phases, found: Solution, seconds: Mapping[str, float], sp
     ]
     words = "too fast: the quickest steps that were found take longer; give them more time, or ask for shorter ones"
     worst = late[0]
-    return SolveError(
-        "\n".join([words, *lines]), replace(found, success=False, status="too fast"), name=worst, value=spans[worst],
-        limit=seconds[worst],
-    )  # fmt: skip
+    slow = replace(found, success=False, status=SolverStatus.REJECTED, message="too fast")
+    return SolveError("\n".join([words, *lines]), slow, name=worst, value=spans[worst], limit=seconds[worst])
 
 
 def _met(problem: Phases, found: Solution, phase: str) -> str:

@@ -24,6 +24,7 @@ from ocp.errors import ProblemError, SolveError, checked_instance, checked_mappi
 from ocp.methods import solve
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.status import SolverStatus
 from ocp.tasks.checks import checked_horizon
 from ocp.tasks.equations import bind, task_errors
 from ocp.tasks.limits import Limits
@@ -296,9 +297,9 @@ class _Judge:
         except SolveError as error:
             return Attempt(name, error.solution, error)
         if not solution.success:
-            if "User_Requested_Stop" in solution.status:
+            if solution.status is SolverStatus.INTERRUPTED:
                 raise SolveError(f"interrupted in the solve with {name}", solution, name=name)
-            ended = SolveError(f"ipopt ended with {solution.status.split(':')[0]}", name="ipopt", value=solution.status)
+            ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
             return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
         if not audit.passed and audit.failures:  # what is not decided to be a minimum may be run; its audit says so

@@ -94,7 +94,7 @@ def trials(problem: Problem, start_base: Array, start_joints: Array) -> Iterator
         yield Trial(
             guess=kind,
             seed=seed,
-            status=first.status.split(":")[0],
+            status=str(first.status),
             cost=first.cost,
             jump_deg_s=_jump(first),
             integration_error=audit.integration_error,

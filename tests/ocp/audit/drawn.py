@@ -11,6 +11,7 @@ import numpy as np
 from ocp import Audit, Problem, Solution
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
+from ocp.status import SolverStatus
 from tests.ocp.problems import Array
 
 Curve: TypeAlias = Any
@@ -73,7 +74,8 @@ def drawn(
         method={"type": "drawn by hand"},
         solver="none",
         success=True,
-        status="drawn by hand",
+        status=SolverStatus.SOLVED,
+        message="drawn by hand",
         cost=cost,
         iterations=0,
         horizon=horizon,

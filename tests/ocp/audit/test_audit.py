@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from ocp import Audit, Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
 from ocp.curves import PiecewisePolynomial
+from ocp.status import SolverStatus
 from tests.ocp.problems import (
     SWING,
     Array,
@@ -239,7 +240,7 @@ def test_wrong_costates_fail(method: str, factor: float) -> None:
 
 @every_method
 def test_a_plan_that_its_solver_does_not_call_solved_is_not_decided(method: str) -> None:
-    audit = replace(plan(method), success=False, status="Restoration_Failed").audit()
+    audit = replace(plan(method), success=False, status=SolverStatus.RESTORATION_FAILED).audit()
     assert failed(audit) == set()
     assert audit.feasible
     assert audit.optimal is None
@@ -427,7 +428,7 @@ def test_the_table_shows_every_finding_under_its_verdict() -> None:
     [
         (lambda s: s.audit(), set(), ("yes", "yes"), "may be run; a local minimum; at most"),
         (
-            lambda s: replace(s, success=False, status="Restoration_Failed").audit(),
+            lambda s: replace(s, success=False, status=SolverStatus.RESTORATION_FAILED).audit(),
             set(),
             ("yes", "not decided"),
             "may be run; whether it is a local minimum is not decided: the solver says Restoration_Failed.",

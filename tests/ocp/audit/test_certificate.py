@@ -24,6 +24,7 @@ from ocp import (
     solve,
 )
 from ocp.curves import PiecewisePolynomial
+from ocp.status import SolverStatus
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, plant, van_der_pol
 
@@ -218,7 +219,7 @@ def test_an_extremal_of_another_branch_is_found_out_though_it_passes_its_audit()
 
 def test_solutions_that_agree_on_a_failed_audit_are_not_certified() -> None:
     problem, solutions = three()
-    wrong = replace(solutions["Collocation"], success=False, status="Maximum_Iterations_Exceeded")
+    wrong = replace(solutions["Collocation"], success=False, status=SolverStatus.ITERATION_LIMIT)
     found = certificate(problem, {"Indirect": solutions["Indirect"], "wrong": wrong})
     assert row(found, "wrong").worst < 1e-3
     assert not row(found, "wrong").passed

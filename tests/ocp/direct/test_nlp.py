@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
+from ocp.status import SolverStatus
 from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, plant, relative, swing, van_der_pol
 
 FINE: dict[str, Method] = {
@@ -132,7 +133,7 @@ def test_options_that_a_solver_does_not_take_are_named(solver: str, options: Any
 def test_options_reach_the_solver(solver: str) -> None:
     solution = solve(van_der_pol(), Collocation(5), solver=solver, options={"max_iter": 2}, check=False)
     assert not solution.success
-    assert solution.status.startswith("Maximum_Iterations_Exceeded: raise options={'max_iter'")
+    assert solution.message.startswith("Maximum_Iterations_Exceeded: raise options={'max_iter'")
     assert solution.iterations <= 3
     assert solve(van_der_pol(), Collocation(5), solver=solver, options={"max_iter": 50}).success
 
@@ -170,7 +171,7 @@ def test_an_infeasible_problem_does_not_blame_the_number_of_iterations(solver: s
     solution = solve(too_far(), Collocation(4), solver=solver, check=False)
     assert not solution.success
     assert solution.iterations < 200
-    assert "Maximum_Iterations" not in solution.status
+    assert solution.status is not SolverStatus.ITERATION_LIMIT
 
 
 def test_conflicting_constraints_are_named() -> None:
@@ -283,7 +284,7 @@ for check in (False, True):
         prepared.solve(check=check)
         print("returned")
     except KeyboardInterrupt as error:
-        print(error.solution.success, error.solution.status, error.solution["x"].shape)
+        print(error.solution.success, error.solution.message, error.solution["x"].shape)
     assert time.monotonic() - began < 2
     stop.wait()
     print("restored", signal.getsignal(signal.SIGINT) is before)

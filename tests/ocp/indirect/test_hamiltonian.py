@@ -347,7 +347,7 @@ def test_singular_arcs_and_chattering_are_named(build: Callable[[], Problem]) ->
     assert caught.value.solution is not None
     unsolved = solve(build(), Indirect(), check=False)
     assert not unsolved.success
-    assert "singular arc" in unsolved.status
+    assert "singular arc" in unsolved.message
 
 
 def test_chattering_is_told_from_the_switches_of_the_seed() -> None:
@@ -499,7 +499,7 @@ def test_newton_from_a_bad_guess_says_so_and_returns_what_it_has(
     assert caught.value.solution is not None
     unsolved = solve(stiff(8.0), by, guess=guess, check=False)
     assert not unsolved.success
-    assert not unsolved.status.startswith("Converged")
+    assert not unsolved.message.startswith("Converged")
     assert capfd.readouterr().err == ""
 
 
@@ -523,7 +523,7 @@ def test_a_failure_of_its_own_seed_is_named_as_such() -> None:
         solve(unreachable(), Indirect())
     unsolved = solve(unreachable(), Indirect(), check=False)
     assert not unsolved.success
-    assert "seed" in unsolved.status
+    assert "seed" in unsolved.message
 
 
 def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
@@ -534,4 +534,4 @@ def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
     problem.minimize(running=u**2 / 2)
     solution = solve(problem, Indirect())
     assert solution.cost == pytest.approx(0, abs=1e-12)
-    assert "not determined" in solution.status
+    assert "not determined" in solution.message

@@ -378,10 +378,10 @@ def oscillation() -> Array:
 def test_the_status_says_that_it_seeded_itself() -> None:
     problem = energy()
     own = solve(problem, Indirect(seed=Collocation(7)))
-    assert "seeded by its own direct solution (Collocation, 7 intervals)" in own.status
+    assert "seeded by its own direct solution (Collocation, 7 intervals)" in own.message
     given = solve(problem, Indirect(), guess=solve(problem, Collocation(7)))
-    assert "seeded" not in given.status
-    assert "seeded" in solve(problem, Indirect(), guess={"q": 0.3}).status
+    assert "seeded" not in given.message
+    assert "seeded" in solve(problem, Indirect(), guess={"q": 0.3}).message
 
 
 def test_an_indirect_solution_seeds_another() -> None:
@@ -409,7 +409,8 @@ def test_a_saved_solution_loads_whole_and_passes_its_audit(name: str, tmp_path: 
     loaded = Solution.load(tmp_path / "plan.npz")
     assert loaded.method == solution.method
     assert loaded.cost == solution.cost
-    assert loaded.status == solution.status
+    assert loaded.status is solution.status
+    assert loaded.message == solution.message
     for mine, other in ((loaded.costates, solution.costates), (loaded.cost_gradients, solution.cost_gradients)):
         assert list(mine) == list(other)
         for key in mine:
