@@ -28,7 +28,6 @@ from ocp.indirect.method import Indirect
 from ocp.local.accelerations import resolve_accelerations
 from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.local.laws import Layer, Stabiliser
-from ocp.local.pair_gradients import compiled_distances
 from ocp.local.rates import resolve
 from ocp.methods import prepare, solve
 from ocp.planning import (
@@ -103,7 +102,6 @@ __all__ = [
     "capture_problem",
     "certificate",
     "chained_capture",
-    "compiled_distances",
     "dynamics_phases",
     "dynamics_problem",
     "inverse_kinematics",

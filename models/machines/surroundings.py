@@ -19,7 +19,7 @@ from models.arrays import MOST, Array, checked_flag, checked_indices, checked_no
 from models.errors import ModelError
 from models.machines.machine import Machine
 from models.machines.moving import Moving
-from models.machines.pair_gradients import WORLD, PairGradients, Placed, pair_gradients
+from models.machines.pair_gradients import WORLD, Placed, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
@@ -278,20 +278,15 @@ class Surroundings:
 
         Distances have shape (n, 1), m, gradients by base and joints shape (n, base_size + joint_size). It takes all
         pairs of two kinds of shapes at once, and no derivatives but those of frames: a distance of rigid bodies changes
-        with the twist of one seen from the other alone, by its wrench. Interpreted it is some fifteen times faster than
-        `distances` and its Jacobian; `ocp.compiled_distances` is the same compiled. Of a base with a quaternion,
-        gradients hold along rates that keep it a unit.
+        with the twist of one seen from the other alone, by its wrench. That is some fifteen times faster than
+        `distances` and its Jacobian. Of a base with a quaternion, gradients hold along rates that keep it a unit.
 
         Args, Raises: As of `distances`.
         """
-        return self.pair_gradients(pairs=pairs, rounding=rounding).function()
-
-    def pair_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> PairGradients:
-        """What `distance_gradients` is put together from."""
         chosen, rounding = self._asked(pairs, rounding)
         groups = [self._held.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in chosen]
         softness = rounding / 4 + FINEST
-        return pair_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
+        return distance_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
 
     def _asked(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Pairs by their places, and a rounding, checked."""

@@ -173,7 +173,7 @@ def pair_columns(one: type[Shape], other: type[Shape], rounding: float, count: i
     return _pair_columns((one, other), float(rounding), count)
 
 
-def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int | None = None) -> Any:
+def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int) -> Any:
     """Function (columns of ones, columns of others) -> distances of n pairs side by side, and their wrenches.
 
     Of the columns, one pair a row, shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6): (moment about
@@ -183,7 +183,7 @@ def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: 
     columns as wholes, which an interpreter does several times faster than pair after pair.
 
     Args:
-        one, other, rounding: As of `pair_function`. count: n; None for one pair, written out in scalars.
+        one, other, rounding: As of `pair_function`. count: n.
 
     Raises:
         ModelError: As of `pair_function`.
@@ -193,10 +193,9 @@ def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: 
 
 
 @cache
-def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int | None) -> Any:
+def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
     one, other = kinds
-    new = ca.SX.sym if count is None else ca.MX.sym
-    given = [new(kind.__name__, count or 1, COLUMNS[kind]) for kind in kinds]
+    given = [ca.MX.sym(kind.__name__, count, COLUMNS[kind]) for kind in kinds]
     # the derivative by the shape of fewer numbers tells the wrench
     side = 0 if COLUMNS[one] <= COLUMNS[other] else 1
     points, directions = VECTORS[kinds[side]]

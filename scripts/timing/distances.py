@@ -1,4 +1,4 @@
-"""Distances of a Panda from itself and from ten boxes, with their gradients: interpreted and compiled."""
+"""Distances of a Panda from itself and from ten boxes, with their gradients."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ import casadi as ca
 import numpy as np
 
 from models import Box, FixedBase, Robot, Surroundings
-from ocp import compiled_distances
 from ocp.builders.clearance import ROUNDING
 from scripts import drawing
 from scripts.papers.run import text_table
-from scripts.timing.measure import has_compiler
 from scripts.timing.robots import ROBOTS, urdf_file
 
 BOXES = 10
 SEED = 3
-GOALS = {"interpreted": 60.0, "compiled": 3.0}
+GOAL = 60.0
 """us, of distances with gradients."""
 CALLS = 20
 HAND = ("hand", "finger")
@@ -60,7 +58,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
     around = surroundings()
     rows: list[dict[str, Any]] = []
     if around is None:
-        return {"rows": rows, "goals_us": GOALS}
+        return {"rows": rows, "goal_us": GOAL}
     labels = around.labels
     arm = [k for k, pair in enumerate(labels) if not any(part in name for name in pair for part in HAND)]
     at = 0.3 * np.ones(around.machine.joint_size)
@@ -70,12 +68,8 @@ def run(repeats: int = 5) -> dict[str, Any]:
         check(made["and gradients, by wrenches"].call([at]), expected)
         for what, function in made.items():
             row = {"shapes": name, "pairs": len(pairs), "function": what}
-            rows.append({**row, "by": "interpreted", "us": 1e6 * least_of(function, at, repeats)})
-        if has_compiler():
-            function = compiled_distances(around, pairs=pairs, rounding=ROUNDING)
-            check(function.call([ca.DM(0, 1), at, 0.0]), expected)
-            rows.append({**row, "by": "compiled", "us": 1e6 * least_of_buffered(function, at, repeats)})
-    return {"rows": rows, "goals_us": GOALS}
+            rows.append({**row, "us": 1e6 * least_of(function, at, repeats)})
+    return {"rows": rows, "goal_us": GOAL}
 
 
 def least_of(function: Any, at: np.ndarray, repeats: int) -> float:
@@ -89,24 +83,6 @@ def least_of(function: Any, at: np.ndarray, repeats: int) -> float:
     return found
 
 
-def least_of_buffered(function: Any, at: np.ndarray, repeats: int) -> float:
-    """The same of a function (base, q, time) that reads and writes arrays, as others than Python call it, s."""
-    buffer, called = function.buffer()
-    given: list[Any] = [at, np.zeros(1)]
-    told: list[Any] = [np.zeros(function.nnz_out(k)) for k in range(function.n_out())]
-    for k, array in enumerate(given, 1):
-        buffer.set_arg(k, memoryview(array))
-    for k, array in enumerate(told):
-        buffer.set_res(k, memoryview(array))
-    found = np.inf
-    for _ in range(20 * repeats):
-        began = time.process_time()
-        for _ in range(CALLS):
-            called()
-        found = min(found, (time.process_time() - began) / CALLS)
-    return found
-
-
 def check(found: list[Any], expected: list[np.ndarray]) -> None:
     """RuntimeError where two ways to the same differ by more than rounding."""
     error = max(float(np.abs(np.array(one) - other).max()) for one, other in zip(found, expected, strict=True))
@@ -116,8 +92,7 @@ def check(found: list[Any], expected: list[np.ndarray]) -> None:
 
 def report(numbers: dict[str, Any]) -> str:
     """The times, and what is asked."""
-    asked = ", ".join(f"{by} {goal:g} us" for by, goal in GOALS.items())
-    return f"{text_table(numbers['rows'], 4)}\nasked of distances with gradients: {asked}"
+    return f"{text_table(numbers['rows'], 4)}\nasked of distances with gradients: {GOAL:g} us"
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:
@@ -125,26 +100,24 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
     note = (
         f"A Panda as its URDF describes it, from itself and {BOXES} boxes, distances rounded by {ROUNDING * 1e3:g} mm "
         "as planners hold them; one call, forward kinematics included, processor time, least of many. "
-        "Black ticks: the goals."
+        "Black ticks: the goal."
     )
     rows = numbers["rows"]
-    by = {(row["pairs"], row["function"], row["by"]): row["us"] for row in rows}
+    by = {(row["pairs"], row["function"]): row["us"] for row in rows}
     most = max((row["pairs"] for row in rows), default=0)
     title = "Distances and gradients of a Panda and ten boxes"
     if rows:
-        before, after = (by[most, f"and gradients, {how}", "interpreted"] for how in ("differentiated", "by wrenches"))
+        before, after = (by[most, f"and gradients, {how}"] for how in ("differentiated", "by wrenches"))
         title += f": by wrenches {before / after:.0f} times faster"
-        if told := by.get((most, "and gradients, by wrenches", "compiled")):
-            title += f", compiled {before / told:.0f}"
     with drawing.sheet(path, (1, 1), (7.6, 3.4), note, title=title) as (_, axes):
         axis = np.ravel(axes)[0]
-        names = [f"{row['shapes']}, {row['pairs']} pairs: {row['function']}, {row['by']}" for row in reversed(rows)]
+        names = [f"{row['shapes']}, {row['pairs']} pairs: {row['function']}" for row in reversed(rows)]
         shades = ["green" if "wrenches" in row["function"] else "blue" for row in reversed(rows)]
         drawing.dots(axis, [row["us"] for row in reversed(rows)], names, shades)
         for k, row in enumerate(reversed(rows)):
             axis.text(row["us"] * 1.2, k, f"{row['us']:.{1 if row['us'] < 100 else 0}f}", va="center", fontsize=7)
             if "wrenches" in row["function"]:
-                axis.plot([GOALS[row["by"]]] * 2, [k - 0.3, k + 0.3], color="black", lw=1)
+                axis.plot([GOAL] * 2, [k - 0.3, k + 0.3], color="black", lw=1)
         axis.set(xlabel="μs a call")
         if rows:
             axis.set_xlim(1.0, 4 * max(row["us"] for row in rows))

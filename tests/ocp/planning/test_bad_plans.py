@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
-from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, compiled_distances, inverse_kinematics
+from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.files import log_rerun, write_mcap
 from ocp.planning import Plan, plan, plan_in_pieces, plan_waypoints
 from ocp.schedule import LineLimits, schedule
@@ -144,16 +144,6 @@ CASES = [
         inverse_kinematics,
         {"machine": AROUND.machine, "task": TipTask(position=(0.5, 0.2, 0.6)), "surroundings": AROUND},
         {"surroundings": but(INSTANCE, "None") | {"another's": Surroundings(FixedBase(armoured_arm()))}},
-    ),
-    Case(
-        "compiled_distances",
-        compiled_distances,
-        {"surroundings": AROUND},
-        {
-            "surroundings": INSTANCE,
-            "pairs": but(SEQUENCE, "numbers") | {"beyond": [99], "negative": [-1], "half": [0.5]},
-            "rounding": NONNEGATIVE,
-        },
     ),
     Case(
         "TipTask.along",
