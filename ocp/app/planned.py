@@ -67,7 +67,9 @@ def run_task(
         "duration": made.horizon,
         "joints": made.names,
         "start": made.at(0.0)["joints"],
-        "candidates": [{"cost": one.cost, "why": one.why} for one in made.candidates],
+        "candidates": [
+            {"cost": one.cost, "reason": None if one.reason is None else str(one.reason)} for one in made.candidates
+        ],
         "audit": [
             {
                 "name": f.name,

@@ -1,7 +1,8 @@
 """The front door: a machine and its tasks in, the cheapest motion out that passes its audit."""
 
+from ocp.planning.candidate import Candidate, Reason, Rejection
 from ocp.planning.dead_end import DeadEnd
-from ocp.planning.motion import Candidate, Plan, PlanSample
+from ocp.planning.motion import Plan, PlanSample
 from ocp.planning.piecewise import PlanInPieces, Reconfiguration, plan_in_pieces
 from ocp.planning.planner import plan
 from ocp.planning.waypoints import WaypointPlan, plan_waypoints
@@ -12,7 +13,9 @@ __all__ = [
     "Plan",
     "PlanInPieces",
     "PlanSample",
+    "Reason",
     "Reconfiguration",
+    "Rejection",
     "WaypointPlan",
     "plan",
     "plan_in_pieces",

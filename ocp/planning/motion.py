@@ -18,11 +18,10 @@ from models import Machine, ModelError
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
 from ocp.audit.audit import Finding
-from ocp.audit.clearance import Nearest
 from ocp.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, StorageWarning, checked_positive, floats, unknown_name
-from ocp.local.touching import Touch
+from ocp.errors import NOT_NUMBERS, ProblemError, StorageWarning, checked_positive, floats, unknown_name
+from ocp.planning.candidate import Candidate
 from ocp.planning.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
 from ocp.schedule.trajectory import JointTrajectory
@@ -32,43 +31,19 @@ from ocp.tables import table_head
 from ocp.tasks.targets import Target, targets_along
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["Candidate", "Part", "Plan", "PlanSample", "failed", "parts_of"]
+__all__ = ["CHECKED_TIMES", "Part", "Plan", "PlanSample", "parts_of"]
 
 RATES = ("rates", SLOPES, "velocities")
 MOST_LINES = 15
 """Of a plan that is printed."""
-HALVINGS = 52
-ASKED = 401
-"""Times at which it is kept what tasks ask for."""
+TARGET_TIMES = 401
+"""At which a plan keeps what its tasks ask for."""
 ACCURACY = 1e-3
 """Share of its limit by which a joint may pass it, as in the audit."""
 CHECKED_TIMES = 2001
-"""Times, beside those of the plan, at which joints are held against the limits of their machine."""
-SLACK = 1e-9
-"""Of the horizon: times beyond it by less are its ends."""
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A motion that was found, or looked for.
-
-    Attributes:
-        start: Joints that the search began with, rad or m. Shape (n,).
-        cost: Of the motion; nan where none was found, and where `solution` is None an estimate on a coarse mesh.
-        why: Why it is not the plan; "" for the plan itself.
-        solution: Of the motion, where it was solved on the fine mesh.
-        touch: The two bodies that come too near, how near and when, where that is why; None in a plan that was loaded.
-    """
-
-    start: Array
-    cost: float
-    why: str = ""
-    solution: Solution | None = None
-    touch: Touch | Nearest | None = None
-
-    def __repr__(self) -> str:
-        start = np.array2string(self.start, precision=3, separator=", ", max_line_width=200)
-        return f"<Candidate from {start}: cost {self.cost:.6g}, {self.why or 'the plan'}>"
+"""At which joints are held against limits, beside the times of the plan."""
+SAME_TIME = 1e-9
+"""Share of the horizon: times beyond it by less are its ends."""
 
 
 class Part(NamedTuple):
@@ -194,7 +169,7 @@ class Plan:
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
         return PlanSample(
-            t, at["joints"], at["rates"], self._over(t, self._accelerations), self._tips(bases, at["joints"])
+            t, at["joints"], at["rates"], self._over(t, self.accelerations), self._tips(bases, at["joints"])
         )
 
     @property
@@ -259,13 +234,13 @@ class Plan:
         lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._found}"]
         told: dict[str, list[float]] = {}
         for one in self.candidates:
-            told.setdefault(one.why, []).append(one.cost)
+            told.setdefault(str(one.reason or "the plan"), []).append(one.cost)
         for why, costs in list(told.items())[: MOST_LINES - 2]:
             found = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
             low, high = min(found), max(found)
             span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
             several = "" if len(costs) == 1 else f"{len(costs)} motions: "
-            lines.append(f"  {span:<23}  {several}{why or 'the plan'}")
+            lines.append(f"  {span:<23}  {several}{why}")
         if len(told) > MOST_LINES - 2:
             rest = sum(len(costs) for costs in list(told.values())[MOST_LINES - 2 :])
             lines.append(f"  {rest} more: `candidates` of the plan")
@@ -303,13 +278,13 @@ class Plan:
     # ---- what was asked -----------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> Plan:
-        """The same plan, which tells what the tasks that it does ask for at ASKED times."""
-        times = np.linspace(0.0, self.horizon, ASKED)
+        """The same plan, which tells what the tasks that it does ask for at TARGET_TIMES times."""
+        times = np.linspace(0.0, self.horizon, TARGET_TIMES)
         clock = times
         if CLOCK in self.solution.states:
             clock = self.task_share(times) * self.solution.horizon
         at = self.at(times)
-        base = at["base"] if "base" in at else np.zeros((ASKED, 0))
+        base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
         return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
 
     # ---- files -------------------------------------------------------------------------------------------------
@@ -344,7 +319,7 @@ class Plan:
                 "request": request,
                 "parts": self.parts,
                 "bound": self.bound,
-                "candidates": [[c.start.tolist(), c.cost, c.why] for c in self.candidates],
+                "candidates": [[c.start.tolist(), c.cost, c.reason and c.reason.record()] for c in self.candidates],
                 "targets": [np.column_stack([o.t, o.position, o.rotation.reshape(-1, 9)]) for o in self.targets],
             }
         )
@@ -374,8 +349,7 @@ class Plan:
                 solution = solution.tied_to(request.problem())
             parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in told["parts"])
             candidates = tuple(
-                Candidate(np.array(start, dtype=float), float(cost), str(why), None if why else solution)
-                for start, cost, why in told["candidates"]
+                Candidate.of_record(start, cost, reason, solution) for start, cost, reason in told["candidates"]
             )
             bound = None if told["bound"] is None else float(told["bound"])
             targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in told["targets"])
@@ -447,7 +421,7 @@ class Plan:
         except NOT_NUMBERS as error:
             words = f"a time or an array of times is expected, not {time!r}"
             raise ProblemError(words, name="time", value=time) from error
-        slack = SLACK * self.horizon
+        slack = SAME_TIME * self.horizon
         if not ((times >= -slack) & (times <= self.horizon + slack)).all():
             words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
@@ -459,7 +433,7 @@ class Plan:
         told = {**self.solution.states, **self.solution.controls}
         return next(name for name in RATES if name + self.parts[0].suffix in told)
 
-    def _accelerations(self, part: Part, fraction: Array) -> Array:
+    def accelerations(self, part: Part, fraction: Array) -> Array:
         """Of the joints, at fractions (M,) of a part. Shape (M, n)."""
         sample, name, long = self.solution.at_fraction(fraction), self.rated + part.suffix, part.end - part.begin
         if "accelerations" + part.suffix in sample:
@@ -483,7 +457,7 @@ class Plan:
         if CLOCK not in self.solution.states:
             return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
         low, high = np.zeros(len(times)), np.ones(len(times))
-        for _ in range(HALVINGS):  # the clock never stands still
+        for _ in range(np.finfo(float).nmant):  # the clock never stands still
             middle = (low + high) / 2
             late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
             low, high = np.where(late, low, middle), np.where(late, middle, high)
@@ -515,19 +489,3 @@ class Plan:
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
     """The parts of a plan made of stretches."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
-
-
-def failed(told: list[Candidate], cause: SolveError | None = None) -> SolveError:
-    """That no motion passes, with the reasons, the most frequent first, and what a last solve says of them."""
-    reasons: dict[str, int] = {}
-    for one in told:
-        reasons[one.why] = reasons.get(one.why, 0) + 1
-    listed = "\n".join(
-        f"  {count} of {len(told)} postures: {why}" for why, count in sorted(reasons.items(), key=lambda item: -item[1])
-    )
-    last = next((one.solution for one in told if one.solution is not None), None)
-    words = f"no motion passes its audit:\n{listed}"
-    if cause is None:
-        return SolveError(words, last, name="plan")
-    details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
-    return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)

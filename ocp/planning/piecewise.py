@@ -7,8 +7,8 @@ to the beginning of the next, clear of everything, while the tasks wait.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -24,7 +24,8 @@ from ocp.errors import ProblemError, SolveError, checked_instance
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import distances_along
 from ocp.methods import solve
-from ocp.planning.motion import Candidate, Part, Plan
+from ocp.planning.candidate import Candidate, Stage
+from ocp.planning.motion import Part, Plan
 from ocp.planning.planner import checked_asked, clear_of, planned
 from ocp.planning.postures import Asked, followed_from, postures_at_the_start, settled
 from ocp.planning.task_search import TaskSearch
@@ -35,18 +36,28 @@ from ocp.tasks.tip_task import TipTask, timed
 
 __all__ = ["PlanInPieces", "Reconfiguration", "plan_in_pieces"]
 
-MESH = Collocation(12, 3)
-SOLVER = {"max_iter": 200}
-SLOWER = 3.0
-"""Times as long as straight: so long a way round something takes."""
-ROUND, SEEN = 4, 256
-"""Postures by which it is tried to go round what is in the way, of so many that are looked at."""
-BESIDE = np.pi / 2
-"""rad or m: how far these are from what lies between, at most."""
-UNLIMITED = 1.0
-"""rad/s or m/s: of joints whose rate has no limit."""
-SLACK = 1e-9
-"""Of the limit of a rate."""
+
+@dataclass(frozen=True)
+class ReconfigurationSettings:
+    """Settings of the motions between pieces.
+
+    Attributes:
+        mesh: Of their problem. options: Of IPOPT.
+        slowness: Times as long as the straight way takes one round an obstacle.
+        detours, sampled: Configurations by which it is tried to go round, of so many that are sampled.
+        reach: rad or m: how far these are from what lies between, at most.
+        unlimited_rate: rad/s or m/s: of joints whose rate has no limit.
+        rate_slack: Share of its limit that a rate may exceed: a joint that goes straight is at its limit all the time.
+    """
+
+    mesh: Collocation = field(default_factory=lambda: Collocation(12, 3))
+    options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 200})
+    slowness: float = 3.0
+    detours: int = 4
+    sampled: int = 256
+    reach: float = np.pi / 2
+    unlimited_rate: float = 1.0
+    rate_slack: float = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +198,7 @@ def plan_in_pieces(
             if (begin, end) in known:
                 continue
             try:
-                known[begin, end] = _piece(asked, limits, begin, end)
+                known[begin, end] = _piece(asked, begin, end)
             except (SolveError, Unreachable) as failed:
                 if isinstance(failed.__cause__, KeyboardInterrupt):
                     raise
@@ -205,7 +216,7 @@ def plan_in_pieces(
     return PlanInPieces(machine, tuple(pieces), begins, tuple(between), fewest - 1)
 
 
-def _piece(asked: Asked, limits: Limits | None, begin: float, end: float) -> Plan:
+def _piece(asked: Asked, begin: float, end: float) -> Plan:
     """The plan of the tasks from one time to another.
 
     Raises:
@@ -213,9 +224,9 @@ def _piece(asked: Asked, limits: Limits | None, begin: float, end: float) -> Pla
     """
     tasks = [part for task in asked.tasks if (part := _part(task, begin, end)) is not None]
     start = asked.start if begin == 0 else None
-    told = (limits, "global", asked.seed, 1.0)
+    told = (asked.drives or asked.limits, "global", asked.seed, 1.0)
     own = checked_asked(asked.machine, tasks, end - begin, start, None, False, asked.weights, *told)
-    return planned(replace(own, clear=asked.clear), "global", limits)
+    return planned(replace(own, clear=asked.clear))
 
 
 def _part(task: TipTask, begin: float, end: float) -> TipTask | None:
@@ -231,40 +242,51 @@ def _part(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Reconfiguration:
     """A motion from one posture to another, straight or round what is in the way."""
-    fastest = np.where(np.isfinite(asked.bounds.velocity), asked.bounds.velocity, UNLIMITED)
+    settings, limits = ReconfigurationSettings(), asked.bounds.velocity
+    fastest = np.where(np.isfinite(limits), limits, settings.unlimited_rate)
     straight = float((np.abs(after - before) / fastest).max())
     middle, why = (before + after) / 2, ""
     ways = [(middle, straight)]
     if asked.clear is not None:
-        ways += [(via, SLOWER * straight) for via in (middle, *_round(asked, asked.clear, before, after))]
+        ways += [
+            (via, settings.slowness * straight)
+            for via in (middle, *_round(asked, asked.clear, before, after, settings))
+        ]
     for via, duration in ways:
         try:
-            solution = _way(asked, before, via, after, duration, fastest, apart=duration > straight)
+            solution = _way(asked, before, via, after, duration, fastest, duration > straight, settings)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             why = why or str(error).split("\n")[0]
             continue
-        candidate = Candidate(before, solution.cost, "", solution)
+        candidate = Candidate(before, solution.cost, None, Stage.AUDITED, solution)
         return Reconfiguration(
             time, before, after, Plan(asked.machine, solution, (Part(0.0, duration, ""),), (candidate,))
         )
     return Reconfiguration(time, before, after, None, why)
 
 
-def _round(asked: Asked, clear: Clear, before: Array, after: Array) -> Array:
+def _round(asked: Asked, clear: Clear, before: Array, after: Array, settings: ReconfigurationSettings) -> Array:
     """Postures that are clear, the nearest to the middle between two others. Shape (K, n)."""
     bounds, least = asked.bounds, clear.surroundings.clearance
-    low = np.maximum(np.minimum(before, after) - BESIDE, bounds.lower)
-    high = np.minimum(np.maximum(before, after) + BESIDE, bounds.upper)
-    some = low + (high - low) * np.random.default_rng(asked.seed).random((SEEN, len(before)))
-    apart = distances_along(clear.surroundings, np.zeros(0), some, np.zeros(SEEN), least)
+    low = np.maximum(np.minimum(before, after) - settings.reach, bounds.lower)
+    high = np.minimum(np.maximum(before, after) + settings.reach, bounds.upper)
+    some = low + (high - low) * np.random.default_rng(asked.seed).random((settings.sampled, len(before)))
+    apart = distances_along(clear.surroundings, np.zeros(0), some, np.zeros(settings.sampled), least)
     free = some[(apart >= least).all(axis=1)]
-    return np.asarray(free[np.argsort(((free - (before + after) / 2) ** 2).sum(axis=1))[:ROUND]])
+    return np.asarray(free[np.argsort(((free - (before + after) / 2) ** 2).sum(axis=1))[: settings.detours]])
 
 
 def _way(
-    asked: Asked, before: Array, via: Array, after: Array, duration: float, fastest: Array, apart: bool
+    asked: Asked,
+    before: Array,
+    via: Array,
+    after: Array,
+    duration: float,
+    fastest: Array,
+    apart: bool,
+    settings: ReconfigurationSettings,
 ) -> Solution:
     """The motion of least squared rates from one posture to another that begins from a way by a third.
 
@@ -282,13 +304,13 @@ def _way(
         problem.horizon(duration)
         told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit()}
         joints = problem.state("joints", n, initial=before, terminal=after, **told)
-        most = (1 + SLACK) * fastest  # a joint that goes straight is as fast as it may be all the time
+        most = (1 + settings.rate_slack) * fastest
         rates = problem.control("rates", n, lower=-most, upper=most, unit=machine.robot.unit("/s"))
         problem.dynamics(joints, rates)
         if clear is not None:
             clear.declare(problem, machine.base_home(), joints, horizon=duration)
         problem.minimize(running=ca.dot(rates, ca.DM(asked.weights) * rates) / 2)
-        solution = solve(problem, MESH, guess=guess, options=SOLVER)
+        solution = solve(problem, settings.mesh, guess=guess, options=settings.options)
         audit = solution.audit()
         if not audit.feasible:
             worst = audit.failures[0]

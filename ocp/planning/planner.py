@@ -1,28 +1,26 @@
 """One call from a machine and its tasks to the cheapest motion that passes its audit, or the reasons why there is none.
 
 Where the start is not given it is searched: inverse kinematics finds postures at the start, in every branch and spread
-over the self-motion. Each is followed through the tasks by its local motion, which is the guess of a solve on a coarse
-mesh, the start free along its self-motion. Those that lead to the same motion are one; the others are solved on a mesh
-with nodes where the tasks' pieces meet, the cheapest first, until none is left that may be cheaper than what was found.
+over the self-motion. Each is followed through the tasks by its local motion, which is the seed of a candidate, the
+start free along its self-motion (`ocp.planning.seeds`). Candidates are advanced from stage to stage, the cheapest first
+(`ocp.planning.candidate_queue`), until none is left that may be cheaper than what was found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from models import Machine, ModelError, Standing, Surroundings
-from models.arrays import Array
 from ocp.builders.clearance import Clear
 from ocp.builders.drives import checked_motors
 from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.errors import (
     ProblemError,
-    SolveError,
     checked_choice,
     checked_count,
     checked_each,
@@ -30,41 +28,20 @@ from ocp.errors import (
     checked_instance,
     checked_positive,
 )
-from ocp.local.following import Followed
 from ocp.local.inverse_kinematics import LARGEST_SEED
-from ocp.planning.candidates import TOUCHES, Maker, closer_motions, coarse_motions, fine_motions
-from ocp.planning.cells import CellSearch, follows
-from ocp.planning.dead_end import DeadEnd
-from ocp.planning.driven import driven_plan, limits_drives, without_drives
-from ocp.planning.motion import Candidate, Plan
-from ocp.planning.postures import (
-    Asked,
-    clear_postures,
-    followed_from,
-    others_told,
-    postures_at_the_start,
-    settled,
-    touches_at_the_start,
-)
+from ocp.planning.actuators import limits_actuators, without_actuators
+from ocp.planning.candidate_solver import CandidateSolver
+from ocp.planning.motion import Plan
+from ocp.planning.postures import Asked, SearchKind, check_clear_start, postures_at_the_start, settled
 from ocp.planning.search import checked_bound
+from ocp.planning.seeds import plan_from_seeds
 from ocp.planning.standing import plan_to_stand
-from ocp.planning.task_search import TaskSearch
 from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, inside_limits
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
 
-__all__ = ["SearchKind", "checked_asked", "clear_of", "plan", "planned"]
-
-SearchKind: TypeAlias = Literal["start", "postures", "global"]
-
-ENOUGH = 1.05
-"""Of a plan that costs so many times the bound, the search's own motions are solved as they are, beside it."""
-TRIED = 8
-"""Postures that are taken one after the other, the best conditioned first, before all of them are compared; and ways of
-each search through cells, the cheapest first. There are hundreds of these, and each takes seconds."""
-AT_ONCE = 4
-"""Ways through cells that are solved before the best of them is audited, where one that passes is enough."""
+__all__ = ["checked_asked", "clear_of", "plan", "planned"]
 
 
 @interruptible
@@ -101,8 +78,8 @@ def plan(
         weights: Of the squared joint rates, shape (n,); all 1 if None.
         limits: Of the joints' positions and rates; the robot's own if None. Where accelerations, jerks, torques or
             power are given, they hold at all times, and the robot's own torques with them, at the same cost (see
-            `ocp.planning.driven`). Rates are then continuous, but as free at both ends as without: a machine that is to
-            start from rest is asked to by its tasks, and what these leave free may move there.
+            `ocp.planning.actuators`). Rates are then continuous, but as free at both ends as without: a machine that is
+            to start from rest is asked to by its tasks, and what these leave free may move there.
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
             finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
@@ -128,131 +105,28 @@ def plan(
             all motions says from where on none goes on, what stops it, and how far the tasks would have to give way, or
             in how few pieces they may be done (`plan_in_pieces`).
     """
+    around = (machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
     if isinstance(machine, Standing):
-        return plan_to_stand(
-            machine,
-            tasks,
-            horizon,
-            start=start,
-            cyclic=cyclic,
-            weights=weights,
-            limits=limits,
-            search=search,
-            seed=seed,
-            clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits),
-        )
+        given = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits, "search": search, "seed": seed}
+        return plan_to_stand(machine, tasks, horizon, clear=clear_of(*around), **given)
     asked = checked_asked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
-    asked = replace(asked, clear=clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits))
-    return planned(asked, search, limits)
+    return planned(replace(asked, clear=clear_of(*around)))
 
 
-def planned(asked: Asked, search: SearchKind, limits: Limits | None) -> Plan:
-    """As `plan`, of what is asked, under the `limits` that it was given.
-
-    Raises:
-        ProblemError, SolveError: As `plan`.
-    """
-    maker, made = _planned(asked, search)
-    if limits is not None and limits_drives(limits):
-        made = driven_plan(asked, maker.start, maker.reference, made, limits)
-    return made if made.bound is None else replace(made, bound=checked_bound(made.bound, made.cost))
-
-
-def _planned(asked: Asked, search: SearchKind) -> tuple[Maker, Plan]:
-    """The plan under limits of positions and rates, and what made it.
+def planned(asked: Asked) -> Plan:
+    """As `plan`, of what is asked.
 
     Raises:
         ProblemError, SolveError: As `plan`.
     """
-    machine = asked.machine
     postures = postures_at_the_start(asked)
-    if asked.start is not None and (touch := touches_at_the_start(asked, postures)[0]) is not None:
-        assert asked.clear is not None
-        around, name = asked.clear.surroundings, " and ".join(touch.bodies)
-        ignored = [around.told_as(touch.pair)]
-        words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
-        words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
-        raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)
-    given = asked.start
-    if given is None:
-        given, postures = settled(asked, postures)
-    maker = Maker(asked, given, postures[0])
-    told: list[Candidate] = []
-    floats = machine.base_size > 0
-    if search == "start" or (search == "postures" and len(postures) == 1):
-        for joints in postures[:TRIED]:
-            followed = followed_from(asked, joints[None])
-            if floats and not follows(asked, followed)[0]:
-                continue  # what such a guess leads to takes long, and fails
-            alone = len(postures) == 1 and not floats
-            told.append(maker.solved(joints, maker.motion.guess(followed, 0), thorough=alone))
-            if not told[-1].why or alone:
-                return maker, maker.plan(told)
-    followed = followed_from(asked, postures)
-    if floats and (search == "global" or len(postures) == 1):
-        return maker, maker.plan(told + _through_cells(maker, followed, postures, every=search == "global"))
-    searched = TaskSearch(asked, followed) if search == "global" else None
-    if searched is not None:
-        if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
-            raise end
-        for every in (False, True):
-            found = searched.followed(every)
-            if found[0].cost.size:
-                told += fine_motions(maker, coarse_motions(maker, found, found[0].joints[:, 0]), first=False)
-                told += closer_motions(maker, found, told, ENOUGH * searched.bound)
-            if any(not one.why for one in told):
-                return maker, replace(maker.plan(told), bound=searched.bound)
-        while searched.looked_closer():
-            if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
-                raise end
-    told += fine_motions(maker, coarse_motions(maker, followed, postures), first=search == "start")
-    if all(one.why and not one.why.startswith(TOUCHES) for one in told):  # whatever helps a solver, and what conflicts
-        if floats:
-            return maker, maker.plan(told + _through_cells(maker, followed, postures, every=False))
-        told.append(maker.solved(postures[0], maker.motion.guess(followed, 0), thorough=True))
-    try:
-        made = maker.plan(told)
-    except SolveError as error:
-        if searched is not None and (end := searched.dead_end()) is not None:
-            raise end from error
-        raise
-    return maker, made if searched is None else replace(made, bound=searched.bound)
-
-
-def _through_cells(maker: Maker, followed: list[Followed], postures: Array, every: bool) -> list[Candidate]:
-    """The motions of a floating machine that a search over exact states leads to, with those that local ones do.
-
-    Raises:
-        Unreachable, DeadEnd: As of `CellSearch`, where no local motion leads on either.
-    """
-    sound = np.flatnonzero(follows(maker.asked, followed))
-    local, found = list[Candidate](), list[list[Followed]]()
-    stuck: DeadEnd | None = None
-    try:
-        found = CellSearch(maker.asked, postures).followed()
-    except DeadEnd as error:
-        stuck = error
-    if sound.size and (every or stuck):
-        local = coarse_motions(maker, [part.of(sound) for part in followed], postures[sound], fine=every)
-    if stuck:
-        if all(one.why for one in local):
-            raise stuck
-        return fine_motions(maker, local, first=False, every=every)
-    if every:
-        least = [float(np.sum([part.cost for part in ways], axis=0).min()) for ways in found]
-        for ways, cost in zip(found, least, strict=True):
-            if ways is found[0] or cost < least[0]:
-                local = coarse_motions(maker, ways, ways[0].joints[:, 0], True, local)
-        return fine_motions(maker, local, first=False, every=True)
-    told, maker.brief = list[Candidate](), True
-    for begin in range(0, TRIED, AT_ONCE):
-        for some in ([part.of(slice(begin, begin + AT_ONCE)) for part in ways] for ways in found):
-            if some[0].cost.size:
-                told += fine_motions(maker, coarse_motions(maker, some, some[0].joints[:, 0], True), first=True)
-            if any(not one.why for one in told):
-                return told
-    why = f"not tried, for the {TRIED} cheapest of its search fail"
-    return told + [Candidate(one, np.nan, why) for ways in found for one in ways[0].joints[TRIED:, 0]]
+    start = asked.start
+    if start is None:
+        start, postures = settled(asked, postures)
+    else:
+        check_clear_start(asked, postures)
+    made, bound = plan_from_seeds(asked, postures, CandidateSolver(asked, start, postures[0]))
+    return made if bound is None else replace(made, bound=checked_bound(bound, made.cost))
 
 
 def clear_of(
@@ -319,8 +193,8 @@ def checked_asked(
             words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
-    told.bounds(machine, ("velocity", "torque") if limits_drives(told) else ("velocity",))
-    if limits_drives(told):
+    told.bounds(machine, ("velocity", "torque") if limits_actuators(told) else ("velocity",))
+    if limits_actuators(told):
         checked_motors("plan: limits of drives", machine)
         if free:
             words = "a free horizon knows no limits of drives; give it in s, or limit the rates alone"
@@ -354,9 +228,10 @@ def checked_asked(
         joints,
         place,
         heavy,
-        without_drives(told),
+        without_actuators(told),
         cyclic,
         int(seed),
         float(time_cost) if free else None,
-        holds_idle=search == "global",
+        search=search,
+        drives=told if limits_actuators(told) else None,
     )

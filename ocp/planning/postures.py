@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +17,19 @@ from ocp.errors import ProblemError
 from ocp.local.following import Followed, follow
 from ocp.local.inverse_kinematics import Unreachable, at_rest, distinct, inverse_kinematics, starts_of
 from ocp.local.touching import Touch, distances_along
+from ocp.planning.settings import PlannerSettings
 from ocp.tasks.checks import ignorable_joints
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 
 __all__ = [
-    "Asked", "clear_postures", "followed_from", "misfits_of", "others_told", "placed", "postures_at_the_start",
-    "settled", "touches_at_the_start",
+    "OUT_OF_REACH", "Asked", "SearchKind", "check_clear_start", "clear_postures", "followed_from", "misfits_of",
+    "others_told", "placed", "postures_at_the_start", "settled", "touches_at_the_start",
 ]  # fmt: skip
 
-LEAST_INTERVALS = 8
-"""Of a motion, where its pieces are fewer."""
-FOLLOWED = 64
-"""Steps of the local motions, beside the breaks of the tasks."""
-DAMPINGS = (0.01, 0.1, 1.0)
-"""Of the local motions, relative to the singular values; the next is tried where no posture follows with one."""
-STARTS = 64
-"""Random starts of inverse kinematics."""
+SETTINGS = PlannerSettings()
+SearchKind: TypeAlias = Literal["start", "postures", "global"]
 OUT_OF_REACH = 1e-4
 """m or rad: a pose missed by more may be out of reach."""
 
@@ -47,8 +42,10 @@ class Asked:
         machine, tasks, horizon: As of `plan`.
         start: Joints at the start, or None. base: Base there. weights: Of the joint rates.
         limits: Of the joints.
+        search: How the start is searched.
+        drives: Limits with those of actuators, or None where these are not limited.
         clear: What the motion has to stay clear of, or None.
-        holds_idle: Whether joints that move no task's frame stand still: what else they may do is not searched.
+        settings: Of the planner.
     """
 
     machine: Machine
@@ -62,8 +59,10 @@ class Asked:
     cyclic: bool
     seed: int
     time_cost: float | None
+    search: SearchKind = "postures"
+    drives: Limits | None = None
     clear: Clear | None = None
-    holds_idle: bool = False
+    settings: PlannerSettings = SETTINGS
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
@@ -72,8 +71,13 @@ class Asked:
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Which joints stand still. Shape (n,)."""
-        return self.idle & self.holds_idle
+        """Which joints stand still: where all motions are searched, those that move no task's frame. Shape (n,)."""
+        return self.idle & (self.search == "global")
+
+    @property
+    def ik_options(self) -> dict[str, Any]:
+        """Of inverse kinematics."""
+        return {"seed": self.seed, "limits": self.limits.joints, "starts": self.settings.ik_starts}
 
     @cached_property
     def bounds(self) -> JointBounds:
@@ -89,7 +93,12 @@ def postures_at_the_start(asked: Asked) -> Array:
     if not first:
         words = "start is missing: no task says by a pose where the tip is at the start; give plan(..., start=...)"
         raise ProblemError(words, name="start")
-    options: dict[str, Any] = {"base": asked.base, "seed": asked.seed, "limits": asked.limits.joints, "starts": STARTS}
+    options: dict[str, Any] = {
+        "base": asked.base,
+        "seed": asked.seed,
+        "limits": asked.limits.joints,
+        "starts": asked.settings.ik_starts,
+    }
     try:
         found = inverse_kinematics(asked.machine, first, **options)
     except Unreachable as error:
@@ -111,6 +120,17 @@ def touches_at_the_start(asked: Asked, postures: Array) -> list[Touch | None]:
     nearest, labels = apart.argmin(axis=1).tolist(), around.labels
     found = [Touch(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
     return [touch if touch.distance < around.clearance else None for touch in found]
+
+
+def check_clear_start(asked: Asked, postures: Array) -> None:
+    """Raise ProblemError where bodies come too near at the start that is given."""
+    if (touch := touches_at_the_start(asked, postures)[0]) is not None:
+        assert asked.clear is not None
+        around, name = asked.clear.surroundings, " and ".join(touch.bodies)
+        ignored = [around.told_as(touch.pair)]
+        words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
+        words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
+        raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)
 
 
 def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
@@ -158,7 +178,7 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
         return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
 
     if ignorable.any() and not clear(start):
-        others = starts_of(asked.machine, bounds.lower, bounds.upper, STARTS, None, asked.seed)
+        others = starts_of(asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed)
         start[ignorable] = max((start, *postures, *others), key=clear)[ignorable]
     return start, np.where(ignorable, start, postures)
 
@@ -169,9 +189,9 @@ def followed_from(asked: Asked, postures: Array) -> list[Followed]:
     Raises:
         Unreachable: A place on the way that no posture reaches.
     """
-    bounds = asked.bounds
+    bounds, settings = asked.bounds, asked.settings
     best: list[Followed] = []
-    for damping in DAMPINGS:
+    for damping in settings.dampings:
         found: list[Followed] = []
         base, joints = np.tile(asked.base, (len(postures), 1)), postures
         for stretch in asked.stretches:
@@ -179,7 +199,8 @@ def followed_from(asked: Asked, postures: Array) -> list[Followed]:
                 joints = _begun(asked, stretch, base, joints)
                 if asked.stretches[len(found) - 1].equations is None:
                     found[-1] = _straight(found[-1], joints)
-            share = max(int(np.ceil(FOLLOWED * stretch.duration / asked.horizon)), LEAST_INTERVALS)
+            share = int(np.ceil(settings.local_steps * stretch.duration / asked.horizon))
+            share = max(share, settings.min_intervals)
             times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
             equations = stretch.equations
             if equations is None:
@@ -205,7 +226,12 @@ def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
     if not any(begins):
         return joints
     tasks = [asked.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
-    options: dict[str, Any] = {"near": joints, "seed": asked.seed, "limits": asked.limits.joints, "starts": STARTS}
+    options: dict[str, Any] = {
+        "near": joints,
+        "seed": asked.seed,
+        "limits": asked.limits.joints,
+        "starts": asked.settings.ik_starts,
+    }
     try:
         found = inverse_kinematics(asked.machine, tasks, time=stretch.begin, base=base[0], **options)
     except Unreachable as error:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import casadi as ca
-import numpy as np
 
 from models import Standing
 from models.arrays import Array
@@ -15,7 +15,10 @@ from ocp.builders.standing.plan import Asked, plan_standing
 from ocp.builders.standing.problem import Weights
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance, checked_positive
 from ocp.local.inverse_kinematics import inverse_kinematics
-from ocp.planning.motion import Candidate, Part, Plan, failed
+from ocp.planning.candidate import Candidate, Reason, Rejection, Stage
+from ocp.planning.candidate_queue import CandidateQueue, Solver
+from ocp.planning.motion import Part, Plan
+from ocp.planning.settings import PlannerSettings
 from ocp.tasks.checks import check_rest
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.limits import Limits
@@ -74,28 +77,49 @@ def plan_to_stand(
     equations = bind(machine, given)
     asked: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
     asked["start"], asked["end"] = _rest(equations, 0.0), _rest(equations, duration)
-    told: list[Candidate] = []
-    for joints in _postures(machine, given, start, limits, seed):
-        try:
-            solution = plan_standing(machine, given, joints, duration, clear=clear, **asked)
-        except (ProblemError, SolveError) as error:
-            if start is not None:
-                raise
-            told.append(Candidate(joints, np.nan, str(error).split("\n")[0]))
-            continue
-        told.append(Candidate(joints, solution.cost, "", solution))
-        if search == "start":
+    queue = CandidateQueue(
+        _StandingSolver(machine, given, duration, clear, asked, start is not None), PlannerSettings()
+    )
+    seeds = [Candidate(joints) for joints in _postures(machine, given, start, limits, seed)]
+    for batch in [[one] for one in seeds] if search == "start" else [seeds]:
+        queue.run(batch)
+        if queue.passed:
             break
-    solved = [one for one in told if not one.why]
-    if not solved:
-        raise failed(told)
-    best = min(solved, key=lambda one: one.cost)
-    ranked = sorted(told, key=lambda one: (one is not best, np.inf if one.why else one.cost))
-    ranked = [
-        one if one is best or one.why else Candidate(one.start, one.cost, "dearer", one.solution) for one in ranked
-    ]
-    assert best.solution is not None
-    return Plan(machine, best.solution, (Part(0.0, duration, ""),), tuple(ranked)).with_targets(given)
+    return queue.plan()
+
+
+@dataclass
+class _StandingSolver(Solver):
+    """Advances candidates of a standing machine, all in one stage: `plan_standing` solves, refines and audits."""
+
+    machine: Standing
+    tasks: list[TipTask]
+    duration: float
+    clear: Clear | None
+    asked: Asked
+    start_given: bool
+
+    def advance(self, candidate: Candidate) -> list[Candidate]:
+        """The candidate, audited or rejected.
+
+        Raises:
+            ProblemError, SolveError: Of the start that was given.
+        """
+        try:
+            start = candidate.start
+            solution = plan_standing(self.machine, self.tasks, start, self.duration, clear=self.clear, **self.asked)
+        except (ProblemError, SolveError) as error:
+            if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
+                raise
+            return [candidate.rejected(Reason.of_error(Rejection.INFEASIBLE, error))]
+        return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
+
+    def plan(self, candidates: Sequence[Candidate]) -> Plan:
+        """The plan of which the first one is the motion."""
+        best = candidates[0].solution
+        assert best is not None
+        parts = (Part(0.0, self.duration, ""),)
+        return Plan(self.machine, best, parts, tuple(candidates)).with_targets(self.tasks)
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:

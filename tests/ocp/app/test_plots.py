@@ -32,7 +32,7 @@ from ocp import (
 )
 from ocp.app.colors import COMPARED, LIMIT, PLAN
 from ocp.local.rates import LocalSolution
-from ocp.planning import Candidate
+from ocp.planning import Candidate, Reason, Rejection
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))
@@ -229,7 +229,7 @@ def test_what_a_notebook_shows_is_one_sound_element_that_asks_no_host() -> None:
 def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_one() -> None:
     kept = motion().candidates[0]
     for reasons in (1, 12, 13, 14, 60):
-        others = [Candidate(START, 2.0 + k, f"reason {k % reasons}") for k in range(180)]
+        others = [Candidate(START, 2.0 + k, Reason(Rejection.AUDIT, f"row {k % reasons}")) for k in range(180)]
         told = str(replace(motion(), candidates=(kept, *others))).splitlines()
         assert len(told) == min(2 + reasons, 15)
         assert told[0].endswith("1 of 181 motions solved")
@@ -240,10 +240,10 @@ def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_
 
 
 def test_what_was_not_found_has_no_cost_in_print() -> None:
-    lost = [Candidate(START, cost, "lost") for cost in (np.nan, 3.0, np.nan, 4.5)]
+    lost = [Candidate(START, cost, Reason(Rejection.INFEASIBLE, "lost")) for cost in (np.nan, 3.0, np.nan, 4.5)]
     told = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
     assert "3 to 4.5" in told
-    assert "4 motions: lost" in told
+    assert "4 motions: no motion was found: lost" in told
     assert "nan" in str(replace(motion(), candidates=tuple(lost[:1])))
 
 

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from models import FreeFloating, center_of_mass
-from models.arrays import Array
 from models.papers import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
-from ocp.local.following import Followed
-from ocp.planning import planner
-from ocp.planning.candidates import Maker
+from ocp.planning.candidate import Reason, Rejection, Stage
+from ocp.planning.candidate_solver import CandidateSolver
 from ocp.planning.cells import CellSearch
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.planner import checked_asked
@@ -46,9 +44,13 @@ def test_from_the_start_alone_every_extremal_known_of_the_paper_is_found(horizon
     for cost in known:
         assert np.abs(costs / cost - 1).min() < 5e-5  # those told last are of one mesh
     assert found.bound is None  # exact states in cells prove nothing
-    passing = np.sort([one.cost for one in found.candidates if one.why in ("", "dearer")])
+    passing = np.sort([one.cost for one in found.candidates if one.stage is Stage.AUDITED and not is_duplicate(one)])
     assert (np.diff(passing) > 1e-5 * passing[:-1]).all()
     assert found.audit().passed
+
+
+def is_duplicate(candidate: Candidate) -> bool:
+    return candidate.reason is not None and candidate.reason.kind is Rejection.DUPLICATE
 
 
 def farthest_from_center() -> float:
@@ -149,24 +151,18 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
 def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    machine, task, brief = paper_example(), example(4.0), list[bool]()
+    machine, task, tried = paper_example(), example(4.0), list[float]()
     asked = checked_asked(machine, task, None, START, None, False, None, None, "postures", 0, 1.0)
     sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).followed()]
 
-    def coarse(maker: Maker, followed: list[Followed], postures: Array, fine: bool) -> list[Candidate]:
-        return [Candidate(at, float(cost)) for at, cost in zip(postures, followed[0].cost, strict=True)]
+    def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
+        tried.append(solver.settings.max_refinements)
+        return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
 
-    def fails(maker: Maker, start: Array, *_: Any, **options: Any) -> Candidate:
-        brief.append(maker.brief)
-        return Candidate(start, np.nan, "fails")
-
-    monkeypatch.setattr(planner, "coarse_motions", coarse)
-    monkeypatch.setattr(Maker, "solved", fails)
+    monkeypatch.setattr(CandidateSolver, "advance", fails)
     with pytest.raises(SolveError, match="fails") as caught:
         plan(machine, task, start=START, clearance=None)
-    tried = sum(min(size, 8) for size in sizes)
-    assert brief in ([True] * tried, [False] + [True] * tried)  # the local motion at first
-    rest = sum(sizes) - tried
-    assert f"{rest} of {len(brief) + rest} postures: not tried, for the 8 cheapest of its search fail" in str(
-        caught.value
-    )
+    count = sum(min(size, 8) for size in sizes)
+    assert tried in ([2] * count, [6] + [2] * count)  # the local motion at first
+    rest = sum(sizes) - count
+    assert f"{rest} of {len(tried) + rest} postures: not tried: the 8 cheapest of its search fail" in str(caught.value)

@@ -43,7 +43,9 @@ from ocp import (
     solve,
 )
 from ocp.local.touching import distances_along
-from ocp.planning.candidates import Maker
+from ocp.planning import seeds
+from ocp.planning.candidate import Candidate, Rejection
+from ocp.planning.candidate_solver import CandidateSolver
 from ocp.planning.planner import checked_asked
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.planning.motions import DOWN, bent_seam
@@ -185,16 +187,17 @@ def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
     around = Surroundings(ARM, [POST])
     asked = checked_asked(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
-    maker = Maker(replace(asked, clear=Clear(around)), START, START)
+    solver = CandidateSolver(replace(asked, clear=Clear(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
-    prepared = maker.made(Clear(around).holding([pair]), fine=False, cost=cost)[2]
+    separated = Candidate(START, clear=Clear(around).holding([pair]))
+    prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
     places = [getattr(prepared.fragment, f"{of}_bounds") for of in ("variable", "row")]
     free = [np.isfinite(side[at][bounds[0][at] < bounds[1][at]]).sum() for at in places for side in bounds]
     begins = prepared._own_options["mu_init"]
     assert_allclose(begins * sum(free), cost, rtol=0.05)  # the nodes at which the motion begins aside
-    assert "mu_init" not in maker.made(None, fine=True)[2]._own_options
+    assert "mu_init" not in solver.prepared(Candidate(START), fine=True)[2]._own_options
 
 
 def space_arm(panel: bool) -> FreeFloating:
@@ -271,10 +274,13 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
     result = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN))
     assert result.audit().passed
     assert result.audit().clearances["clearance"].settled
-    reasons = [one.why for one in result.candidates]
-    assert any(why.startswith("touches: ") and " overlap by " in why and " s" in why for why in reasons)
+    reasons = [one.reason for one in result.candidates if one.reason is not None]
+    collisions = [reason for reason in reasons if reason.kind is Rejection.COLLISION]
+    assert collisions
+    assert all(" overlap by " in str(reason) and " s" in str(reason) for reason in collisions)
+    assert all(reason.value < reason.limit and 0 <= reason.time <= result.horizon for reason in collisions)
     for one in result.candidates:
-        if one.solution is not None and not one.why.startswith("touches"):
+        if one.solution is not None and (one.reason is None or one.reason.kind is not Rejection.COLLISION):
             at = one.solution.at_fraction(np.linspace(0, 1, 2001))
             assert distances_along(around, np.zeros(0), at["joints"], np.zeros(2001)).min() >= -1e-6
     bare = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN), clearance=None)
@@ -322,11 +328,11 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
 
 
-def test_where_no_posture_is_clear_none_is_searched_from_other_sides(monkeypatch: pytest.MonkeyPatch) -> None:
-    def other_sides(*_: object) -> None:
+def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    def alternatives(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("ocp.planning.candidates._other_sides", other_sides)
+    monkeypatch.setattr(seeds, "_alternatives", alternatives)
     with pytest.raises(SolveError, match="; no other posture is clear then: each of the"):
         plan(ARM, line(), obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
 

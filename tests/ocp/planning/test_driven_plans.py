@@ -13,7 +13,7 @@ from models import FixedBase, FreeFloating, Link, Machine, planar_chain
 from models.arrays import Array
 from ocp import Limits, Plan, ProblemError, SolveError, TipTask, plan
 from ocp.app import main
-from ocp.planning.driven import Demand
+from ocp.planning.actuators import Demand
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
 from tests.ocp.builders.test_dynamics import torques_along

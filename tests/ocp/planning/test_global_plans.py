@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -11,8 +10,8 @@ import pytest
 
 from models import FixedBase, planar_chain
 from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
-from ocp.planning import planner
-from ocp.planning.candidates import Maker, fine_motions
+from ocp.planning.candidate import Reason, Rejection
+from ocp.planning.candidate_solver import CandidateSolver
 from ocp.planning.search import Search, checked_bound
 from ocp.planning.task_search import instants_of
 from tests.ocp.planning.test_charts import moved, planar
@@ -66,16 +65,15 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
         asked.append(every)
         return motions(search, most, every)
 
-    def failing(maker: Maker, coarse: list[Candidate], first: bool) -> list[Candidate]:
+    def failing(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
         if asked[-1]:
-            return fine_motions(maker, coarse, first)
-        failed.extend(replace(one, why="fails") for one in coarse)
-        return failed
+            return advance(solver, candidate)
+        failed.append(candidate)
+        return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
 
-    motions = Search.motions
+    motions, advance = Search.motions, CandidateSolver.advance
     monkeypatch.setattr(Search, "motions", followed)
-    monkeypatch.setattr(planner, "fine_motions", failing)
-    monkeypatch.setattr(planner, "closer_motions", lambda *told: [])
+    monkeypatch.setattr(CandidateSolver, "advance", failing)
     found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
     assert asked == [False, True]
     assert failed

@@ -59,9 +59,9 @@ def test_no_posture_leads_to_a_cheaper_seam() -> None:
 def test_every_motion_is_told_with_its_cost_and_why_it_is_not_the_plan() -> None:
     found, one = cheapest(), planned("seam_ur5")
     first, *others = found.candidates
-    assert (first.why, first.cost, first.solution) == ("", found.cost, found.solution)
+    assert (first.reason, first.cost, first.solution) == (None, found.cost, found.solution)
     assert len(others) > 10
-    assert all(other.why for other in others)
+    assert all(other.reason is not None for other in others)
     assert all(np.isnan(other.cost) or other.cost > found.cost * (1 - 1e-5) for other in others)
     assert found.cost <= one.cost * (1 + 1e-6)
-    assert [c.why for c in one.candidates].count("") == 1
+    assert [c.reason for c in one.candidates].count(None) == 1

@@ -59,7 +59,7 @@ def test_a_plan_is_read_as_it_was_written(saved: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[name], found[name])
     np.testing.assert_array_equal(again.t, found.t)
     assert (again.horizon, again.bound, again.parts) == (found.horizon, found.bound, found.parts)
-    assert [repr((c.cost, c.why)) for c in again.candidates] == [repr((c.cost, c.why)) for c in found.candidates]
+    assert [repr((c.cost, c.reason)) for c in again.candidates] == [repr((c.cost, c.reason)) for c in found.candidates]
     np.testing.assert_array_equal(again.candidates[0].start, found.candidates[0].start)
     assert again.candidates[0].solution is again.solution
     assert str(again) == str(found)

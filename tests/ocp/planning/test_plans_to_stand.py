@@ -171,7 +171,7 @@ def test_a_start_that_is_searched_stands_and_does_the_same() -> None:
     tips = bodies(found.at([0.0, SECONDS])["joints"])[2]
     begin = tip_at(planar_machine(SIZE), first())[1:]
     np.testing.assert_allclose(tips, [begin, begin + SHIFT], atol=1e-5)
-    assert found.candidates[0].why == ""
+    assert found.candidates[0].reason is None
 
 
 def test_what_moves_at_its_ends_does_not_begin_at_rest() -> None:
