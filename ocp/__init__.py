@@ -11,7 +11,7 @@ from ocp.builders.dynamics_plan import plan_dynamics
 from ocp.builders.grasping import Cone, Grasp
 from ocp.builders.joint_spline import joint_path
 from ocp.builders.legs import Leg, dynamics_phases
-from ocp.builders.redundancy import minimum_velocity_problem, plan_minimum_velocity
+from ocp.builders.minimum_velocity import minimum_velocity_problem
 from ocp.builders.standing.loads import StepsMotion, steps_motion
 from ocp.builders.standing.plan import plan_standing, plan_steps
 from ocp.builders.standing.postures import standing_posture
@@ -114,7 +114,6 @@ __all__ = [
     "plan_dynamics",
     "plan_in_pieces",
     "plan_minimum_time",
-    "plan_minimum_velocity",
     "plan_standing",
     "plan_steps",
     "plan_waypoints",

@@ -1,9 +1,9 @@
 """Motions whose tools do tasks, each in its own interval of time, with the least joint velocity.
 
-The cost is that of `redundancy`, the integral of half the weighted squared joint rates. The horizon falls into
-stretches in which the same tasks are done. All stretches run at once, each over the whole horizon of the problem at a
-pace of its own, as states side by side; the end of each is tied to the start of the next. So a task that begins or ends
-on the way asks for no more than conditions at both ends, which every method and the audit know.
+The cost is the integral of half the weighted squared joint rates, problem (27) of Kim and Kim 2011. The horizon falls
+into stretches in which the same tasks are done. All stretches run at once, each over the whole horizon of the problem
+at a pace of its own, as states side by side; the end of each is tied to the start of the next. So a task that begins or
+ends on the way asks for no more than conditions at both ends, which every method and the audit know.
 """
 
 from __future__ import annotations
@@ -35,18 +35,32 @@ __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names where the time is free: of the time as a state, of the derivatives of joints and time by the tasks' own."""
-SAMPLES = 3
-"""Configurations in which it is looked at what follows from what."""
 SAME_TIME = 1e-9
 """Share of the horizon: times nearer to each other are one."""
-PIECES = 8
-"""Of a stretch at least, as a mesh has intervals."""
-LEAST_GAP = 1e-6
-"""m and rad: a pose error at the start that is none."""
-SMOOTH = 1e-3
-"""Share of the horizon over which accelerations that are the control go from limit to limit where nothing else asks."""
-STIFFEST = 4.0
-"""Powers of e by which the feedback may lower a pose error over a piece: more only makes the mesh finer."""
+DEPENDENT = 1e-9
+"""Relative size of what is left of a row that is a combination of others."""
+
+
+@dataclass(frozen=True)
+class FeedbackSettings:
+    """How fast the feedback of pose errors may be, and how smooth accelerations are.
+
+    Attributes:
+        stiffest: Powers of e by which the feedback may lower a pose error over an interval of a mesh: a mesh that
+            follows more has to be finer, for errors that are zero where the tasks begin at their poses.
+        intervals: That a mesh has in a stretch at least.
+        closed_gap: m and rad: a pose error that a task has to begin with is no gap to close if it is smaller.
+        smoothing: Share of the horizon over which accelerations that are the control go from limit to limit where
+            nothing else asks: without, they would jump.
+    """
+
+    stiffest: float = 4.0
+    intervals: int = 8
+    closed_gap: float = 1e-6
+    smoothing: float = 1e-3
+
+
+FEEDBACK = FeedbackSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +141,9 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         inside = [tasks[i].begin + np.asarray(tasks[i].breaks) for i in active]
         breaks = np.unique(np.concatenate([np.zeros(0), *inside]))
         breaks = breaks[(breaks > begin + slack) & (breaks < end - slack)]
-        pieces = np.diff([begin, *breaks, end]) if len(breaks) >= PIECES else np.array([(end - begin) / PIECES])
-        most = STIFFEST / float(pieces.max())
+        count = FEEDBACK.intervals
+        pieces = np.diff([begin, *breaks, end]) if len(breaks) >= count else np.array([(end - begin) / count])
+        most = FEEDBACK.stiffest / float(pieces.max())
         equations = bind(machine, [_gentle(tasks[i], most) for i in active]) if active else None
         suffix = f" {len(found) + 1}" if len(bounds) > 2 else ""
         new = tuple(i not in before for i in active)
@@ -138,7 +153,7 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
 
 def _gentle(task: TipTask, most: float) -> TipTask:
     """A task whose feedback is no faster than so many 1/s, but where it has a gap to close as it is told."""
-    return task if task.gain <= most or task.start_gap > LEAST_GAP else replace(task, gain=most)
+    return task if task.gain <= most or task.start_gap > FEEDBACK.closed_gap else replace(task, gain=most)
 
 
 def tool_motion_problem(
@@ -176,125 +191,159 @@ def tool_motion_problem(
         driven: Whether accelerations (jerks where these are limited) are the control, within the limits of the drives:
             states "velocities" (and "accelerations") with the suffix of each stretch take the place of the rates, path
             constraints "torques" and "power" are added, and the tasks are held by their accelerations. Velocities go
-            on from stretch to stretch, and are free at both ends as the rates are. Accelerations (jerks) have the
-            weight SMOOTH squared times the horizon squared (to the fourth) in the cost: without, they would jump.
+            on from stretch to stretch, and are free at both ends as the rates are. Accelerations (jerks) are smoothed
+            by a small weight in the cost, see FeedbackSettings.
         held: Which joints stand still. Shape (joint_size,), bool.
 
     Raises:
         ProblemError: A cyclic motion whose task is not closed, or of several stretches with a task in the last; a task
             faster than the rates allow in any posture. Where the time is free: several stretches, a base that drifts.
     """
-    if time_cost is not None:
-        if driven:
-            words = "a free horizon knows no drives: give a horizon in s, or limits of velocity alone"
-            raise ProblemError(words, name="horizon")
-        return _in_free_time(machine, stretches, base, start, reference, cyclic, weights, bounds, time_cost, clear)
     horizon = stretches[-1].end
-    bounds = bounds if held is None else bounds._replace(velocity=np.where(held, 0.0, bounds.velocity))
+    problem = Problem("tool motion" if time_cost is None else "tool motion in free time")
+    problem.horizon(horizon)
+    if held is not None:
+        bounds = bounds._replace(velocity=np.where(held, 0.0, bounds.velocity))
+    motion = _Motion(problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clear, driven)
+    if time_cost is not None:
+        return _in_free_time(motion, time_cost)
     for stretch in stretches:
         if stretch.equations is not None:
             check_speed(stretch.equations, bounds.velocity, stretch.begin, stretch.end)
-    problem = Problem("tool motion")
-    problem.horizon(horizon)
     running: Any = 0
-    moving: list[list[Any]] = []
-    passed: Array | None = None
+    before, first, known = None, None, None
     for stretch in stretches:
-        begins, ends = stretch is stretches[0], stretch is stretches[-1]
-        pace = stretch.duration / horizon
-        free = not begins or start is None or bool(np.isnan(start).any())
-        told: dict[str, Any] = {"initial": start if begins else None}
-        told["terminal"] = start if cyclic and ends and not free else None
-        place, joints = _declared_states(problem, machine, bounds, stretch.suffix, base if begins else None, told)
-        unit = machine.robot.unit("/s")
-        told = {"size": machine.joint_size, "lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
-        second: Any = None
-        if driven:
-            rates = problem.state(f"velocities{stretch.suffix}", **told)
-            second, smooth = _declare_drives(problem, machine, bounds, stretch, pace, place, joints, rates)
-            running += smooth * pace * horizon**2
-        else:
-            rates = problem.control(f"rates{stretch.suffix}", **told)
-        slack = _closure(problem, stretches, base, reference) if cyclic and ends else 0
-        if stretch.equations is not None:
-            asked = np.ones(stretch.equations.size, dtype=bool)
-            slopes = _slopes(stretch, base, reference)
-            if passed is not None:
-                asked = ~_within(slopes, passed)
-            of_drives = None if second is None else (second, machine.base_rate(place, joints, rates))
-            _declare_tasks(
-                problem, stretch, place, joints, rates, pace, slack, free, (base, reference), asked, of_drives
-            )
-            passed = slopes[:, stretch.equations.posed | (_places(stretch.equations) & (begins | ~asked))]
-        else:
-            passed = None
-        if machine.base_size:
-            problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
-        problem.dynamics(joints, pace * rates)
-        if clear is not None:
-            _declare_clearance(clear, problem, machine, place, joints, stretch, pace, horizon)
-        running += pace * ca.dot(rates, ca.DM(weights) * rates) / 2
-        states = [*([place] if machine.base_size else []), joints]
-        if driven:
-            states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
-        if moving:
+        states, cost, known = _declare_stretch(motion, stretch, known)
+        running += cost
+        if before is not None:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
             unit = "" if machine.base_size or driven else machine.robot.unit()
-            problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*moving[-1]), 0, 0, unit=unit)
-        moving.append(states)
-        if cyclic and ends and free:
-            first = moving[0][1 if machine.base_size else 0]
-            problem.end("cyclic", joints - problem.at_start(first), 0, 0, unit=machine.robot.unit())
+            problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*before), 0, 0, unit=unit)
+        before, first = states, first or states
+    if cyclic and motion.free and before and first:
+        place = 1 if machine.base_size else 0
+        problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
     problem.minimize(running=running)
     inside = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in stretches]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 
 
-def _declared_states(
-    problem: Problem, machine: Machine, bounds: JointBounds, suffix: str, base: Array | None, ends: dict[str, Any]
-) -> tuple[Any, Any]:
-    """Base, where it moves, and joints."""
-    place: Any = np.zeros(0)
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """What all stretches of a motion share; see `tool_motion_problem`."""
+
+    problem: Problem
+    machine: Machine
+    stretches: tuple[Stretch, ...]
+    bounds: JointBounds
+    base: Array
+    start: Array | None
+    reference: Array
+    cyclic: bool
+    weights: Array
+    clear: Clear | None
+    driven: bool
+
+    @property
+    def horizon(self) -> float:
+        """s."""
+        return self.stretches[-1].end
+
+    @property
+    def free(self) -> bool:
+        """Whether joints may start wherever the tips are where their tasks begin."""
+        return self.start is None or bool(np.isnan(self.start).any())
+
+    def pace(self, stretch: Stretch) -> float:
+        """Seconds of a stretch in a second of the problem."""
+        return stretch.duration / self.horizon
+
+    def states(self, stretch: Stretch) -> tuple[Any, Any]:
+        """Declare base, where it moves, and joints."""
+        machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
+        place: Any = np.zeros(0)
+        if machine.base_size:
+            unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
+            initial = self.base if begins else None
+            place = self.problem.state(f"base{stretch.suffix}", machine.base_size, initial=initial, unit=unit)
+        returns = self.cyclic and ends and begins and not self.free
+        told: dict[str, Any] = {"lower": self.bounds.lower, "upper": self.bounds.upper, "unit": machine.robot.unit()}
+        told |= {"initial": self.start if begins else None, "terminal": self.start if returns else None}
+        return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **told)
+
+    def keep_clear(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
+        """Declare what the motion has to stay clear of; no horizon where the time is free."""
+        if self.clear is not None:
+            when = stretch.suffix
+            self.clear.declare(
+                self.problem, base, joints, base_name=f"base{when}" if self.machine.base_size else "",
+                joints_name=f"joints{when}", suffix=when, begin=stretch.begin,
+                pace=1.0 if horizon is None else self.pace(stretch), horizon=horizon,
+            )  # fmt: skip
+
+
+def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
+    """Declare one of several stretches.
+
+    Args:
+        known: Slopes of what the stretch before leads to, see `_slopes`; None where it leads nowhere.
+
+    Returns:
+        States that go on in the next stretch, the running cost, and the slopes of what this one leads to.
+    """
+    problem, machine, bounds, pace = motion.problem, motion.machine, motion.bounds, motion.pace(stretch)
+    begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
+    place, joints = motion.states(stretch)
+    unit = machine.robot.unit("/s")
+    told: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
+    second, smooth = None, 0
+    if motion.driven:
+        rates = problem.state(f"velocities{stretch.suffix}", machine.joint_size, **told)
+        second, smooth = _declare_drives(motion, stretch, place, joints, rates)
+    else:
+        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **told)
+    slack = _closure(motion) if motion.cyclic and ends else 0
+    leads: Array | None = None
+    if stretch.equations is not None:
+        asked = np.ones(stretch.equations.size, dtype=bool)
+        slopes = _slopes(stretch, motion.base, motion.reference)
+        if known is not None:
+            asked = ~_within(slopes, known)
+        of_drives = None if second is None else (second, machine.base_rate(place, joints, rates))
+        free = not begins or motion.free
+        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, asked, of_drives)
+        placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
+        leads = slopes[stretch.equations.posed | (placed & (begins | ~asked))]
     if machine.base_size:
-        unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
-        place = problem.state(f"base{suffix}", machine.base_size, initial=base, unit=unit)
-    told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit(), **ends}
-    return place, problem.state(f"joints{suffix}", machine.joint_size, **told)
+        problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
+    problem.dynamics(joints, pace * rates)
+    motion.keep_clear(stretch, place, joints, motion.horizon)
+    states = [*([place] if machine.base_size else []), joints]
+    if motion.driven:
+        states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
+    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + motion.horizon**2 * smooth)
+    return states, cost, leads
 
 
-def _declare_drives(
-    problem: Problem,
-    machine: Machine,
-    bounds: JointBounds,
-    stretch: Stretch,
-    pace: float,
-    base: Any,
-    joints: Any,
-    rates: Any,
-) -> tuple[Any, Any]:
+def _declare_drives(motion: _Motion, stretch: Stretch, base: Any, joints: Any, rates: Any) -> tuple[Any, Any]:
     """Accelerations of the joints within what the drives give; and half their squares, or those of the jerks (s^2).
 
     In units of squared rates over squared horizons.
     """
-    robot, n, when = machine.robot, machine.joint_size, stretch.suffix
-    horizon = stretch.duration / pace
-    told: dict[str, Any] = {
-        "size": n,
-        "lower": -bounds.acceleration,
-        "upper": bounds.acceleration,
-        "unit": robot.unit("/s^2"),
-    }
+    problem, machine, bounds, when = motion.problem, motion.machine, motion.bounds, stretch.suffix
+    robot, n, pace = machine.robot, machine.joint_size, motion.pace(stretch)
+    told: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    share = FEEDBACK.smoothing**2 / 2
     if np.isfinite(bounds.jerk).any():
-        second = problem.state(f"accelerations{when}", **told)
+        second = problem.state(f"accelerations{when}", n, **told)
         jerks = problem.control(f"jerks{when}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
         problem.dynamics(second, pace * jerks)
-        smooth = SMOOTH**2 * horizon**2 * ca.sumsqr(jerks) / 2
+        smooth = (FEEDBACK.smoothing * motion.horizon) ** 2 * ca.sumsqr(jerks)
     else:
-        second = problem.control(f"accelerations{when}", **told)
-        smooth = ca.sumsqr(second) / 2
+        second = problem.control(f"accelerations{when}", n, **told)
+        smooth = ca.sumsqr(second)
     problem.dynamics(rates, pace * second)
-    limited = np.flatnonzero(np.isfinite(bounds.torque) | np.isfinite(bounds.power)).tolist()
-    if limited:
+    if np.isfinite([bounds.torque, bounds.power]).any():
         torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
         for name, values, low, high, unit in (
             ("torques", torques, -bounds.torque, bounds.torque, robot.effort_unit),
@@ -303,26 +352,19 @@ def _declare_drives(
             rows = np.flatnonzero(np.isfinite(high)).tolist()
             if rows:
                 problem.path(f"{name}{when}", values[rows], lower=low[rows], upper=high[rows], unit=unit)
-    return second, SMOOTH**2 * smooth
+    return second, share * smooth
 
 
-def _in_free_time(
-    machine: Machine,
-    stretches: Sequence[Stretch],
-    base: Array,
-    start: Array | None,
-    reference: Array,
-    cyclic: bool,
-    weights: Array,
-    bounds: JointBounds,
-    time_cost: float,
-    clear: Clear | None,
-) -> ToolMotion:
+def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     """As `tool_motion_problem`, the time being a state over the tasks' own.
 
     With q' = dq/ds and z = dt/ds the cost, the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2 z))
     ds, is convex in both; the tasks, J q' = v(s), and the limits of the rates, |q'| <= v z, are linear in them.
     """
+    machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.bounds
+    if motion.driven:
+        words = "a free horizon knows no drives: give a horizon in s, or limits of velocity alone"
+        raise ProblemError(words, name="horizon")
     if len(stretches) > 1 or stretches[0].equations is None:
         words = "a free horizon is for tasks that begin and end together; give each its time, or one task"
         raise ProblemError(words, name="horizon", value=len(stretches))
@@ -331,17 +373,13 @@ def _in_free_time(
         words = "a free horizon is for a base that rests when the joints do; its momentum carries this one on"
         raise ProblemError(words, name="conserved_momentum", value=momentum)
     (stretch,) = stretches
-    free = start is None or bool(np.isnan(start).any())
-    problem = Problem("tool motion in free time")
-    problem.horizon(stretch.end)
     clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
-    told: dict[str, Any] = {"initial": start, "terminal": start if cyclic and not free else None}
-    place, joints = _declared_states(problem, machine, bounds, "", base, told)
+    place, joints = motion.states(stretch)
     unit = machine.robot.unit("/s")
     slopes = problem.control(SLOPES, machine.joint_size, unit=unit)
     pace = problem.control(PACE, lower=1.0, guess=1.0)
-    slack = _closure(problem, stretches, base, reference) if cyclic else 0
-    _declare_tasks(problem, stretch, place, joints, slopes, 1.0, slack, free, (base, reference))
+    slack = _closure(motion) if motion.cyclic else 0
+    _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free)
     limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
     if limited:
         most = ca.DM(bounds.velocity[limited]) * pace
@@ -350,40 +388,20 @@ def _in_free_time(
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
     problem.dynamics(joints, slopes)
-    if clear is not None:
-        _declare_clearance(clear, problem, machine, place, joints, stretch, 1.0, None)
-    problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(weights) * slopes) / (2 * pace))
-    if cyclic and free:
+    motion.keep_clear(stretch, place, joints, None)
+    problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(motion.weights) * slopes) / (2 * pace))
+    if motion.cyclic and motion.free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
-    return ToolMotion(problem, tuple(stretches), stretch.end, stretch.breaks / stretch.end)
+    return ToolMotion(problem, stretches, stretch.end, stretch.breaks / stretch.end)
 
 
-def _declare_clearance(
-    clear: Clear,
-    problem: Problem,
-    machine: Machine,
-    base: Any,
-    joints: Any,
-    stretch: Stretch,
-    pace: float,
-    horizon: float | None,
-) -> None:
-    when = stretch.suffix
-    clear.declare(
-        problem,
-        base,
-        joints,
-        base_name=f"base{when}" if machine.base_size else "",
-        joints_name=f"joints{when}",
-        suffix=when,
-        begin=stretch.begin,
-        pace=pace,
-        horizon=horizon,
-    )
+def _closure(motion: _Motion) -> Any:
+    """What a closed task gives way by, so that the joints close exactly.
 
-
-def _closure(problem: Problem, stretches: Sequence[Stretch], base: Array, reference: Array) -> Any:
-    """What a closed task gives way by, so that the joints close exactly, see `minimum_velocity_problem`."""
+    Where they return, a closed task returns by itself: asked for twice, both would contradict each other by the error
+    of the discretisation. So the task may be off by a constant velocity, which is about zero.
+    """
+    problem, stretches = motion.problem, motion.stretches
     equations = stretches[-1].equations
     if equations is None:
         return 0
@@ -391,7 +409,7 @@ def _closure(problem: Problem, stretches: Sequence[Stretch], base: Array, refere
         words = "a cyclic motion of several stretches has to end without a task, so that the joints can return"
         raise ProblemError(words, name="cyclic", value=len(stretches))
     check_closed(equations, stretches[-1].end)
-    directions = equations.closing(base, reference)
+    directions = equations.closing(motion.base, motion.reference)
     if not directions.shape[1]:
         return 0
     slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
@@ -400,40 +418,43 @@ def _closure(problem: Problem, stretches: Sequence[Stretch], base: Array, refere
 
 
 def _declare_tasks(
-    problem: Problem,
+    motion: _Motion,
     stretch: Stretch,
-    base: Any,
-    joints: Any,
-    rates: Any,
+    moving: tuple[Any, Any, Any],
     pace: float,
     closure: Any,
     free: bool,
-    reference: tuple[Array, Array],
     asked: NDArray[np.bool_] | None = None,
     of_drives: tuple[Any, Any] | None = None,
 ) -> None:
     """The tasks of a stretch, over the time of the problem; `free`: what begins here has to be at its start.
 
-    But for rows that are not `asked`, (size,), because what came before leads there. `of_drives`: accelerations of the
-    joints and rate of the base, where these hold the tasks: what begins here has to begin with its velocity, too.
+    But for rows that are not `asked`, (size,), because what came before leads there. `moving`: base, joints and their
+    rates. `of_drives`: accelerations of the joints and rate of the base, where these hold the tasks: what begins here
+    has to begin with its velocity, too.
     """
-    equations, when = stretch.equations, stretch.suffix
+    problem, equations, when, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, moving
     assert equations is not None
     targets_at = equations.target_function()
-    targets = problem.signal(f"targets{when}", lambda time: targets_at(stretch.begin + pace * time))
+    constant = targets_at.sparsity_jac(0, 0).nnz() == 0
+    targets: Any = targets_at(0.0)
+    if not constant:
+        targets = problem.signal(f"targets{when}", lambda time: targets_at(stretch.begin + pace * time))
     residual = ca.cse(equations.residual(base, joints, rates, targets))
     begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
     begins &= True if asked is None else asked
     if equations.size and of_drives is not None:
         second, drift = of_drives
-        time = ca.MX.sym("time")
-        change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
-        change = problem.signal(f"target rates{when}", lambda time: change_at(stretch.begin + pace * time))
-        at, moving = [joints, rates, targets], [rates, second, change]
+        at, along = [joints, rates], [rates, second]
+        if not constant:
+            time = ca.MX.sym("time")
+            change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
+            at.append(targets)
+            along.append(problem.signal(f"target rates{when}", lambda t: change_at(stretch.begin + pace * t)))
         if equations.machine.base_size:
-            at, moving = [base, *at], [drift, *moving]
+            at, along = [base, *at], [drift, *along]
         gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
-        gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*moving)) + ca.DM(gains) * (residual - closure)
+        gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{when}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
         if begins.any():
             rows = np.flatnonzero(begins).tolist()
@@ -451,20 +472,15 @@ def _declare_tasks(
         return
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
     # a velocity says nothing of places: at the start of the motion its tip is where the reference has it
-    held = [] if stretch.begin else [equations.holding(base, joints, *reference)]
+    held = [] if stretch.begin else [equations.holding(base, joints, motion.base, motion.reference)]
     if (condition := ca.vertcat(error, *held)).numel():
         problem.start(f"start pose{when}", condition, 0, 0, unit=equations.unit("", ""))
 
 
-def _places(equations: TaskEquations) -> NDArray[np.bool_]:
-    """Which rows say where something is, or have an integral that does. Shape (size,), bool."""
-    return np.concatenate([is_holonomic(part) for part in equations.bound]).astype(bool)
-
-
 def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Derivatives in base and joints of where the rows of a stretch's tasks are, in random configurations.
+    """Derivatives in base and joints of where the rows of a stretch's tasks are, in a random configuration.
 
-    Shape (SAMPLES, size, base_size + joint_size).
+    What holds of them there holds, but for a set of measure zero, everywhere. Shape (size, base_size + joint_size).
     """
     equations = stretch.equations
     assert equations is not None
@@ -476,16 +492,12 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
         at += not posed
     slope = ca.Function("slope", [b, q], [ca.jacobian(ca.vertcat(*rows), ca.vertcat(b, q))])
     rng = np.random.default_rng(0)
-    places = base + rng.normal(size=(SAMPLES, len(base)))
-    places[:, 3:] /= np.linalg.norm(places[:, 3:], axis=1, keepdims=True) if len(base) == 7 else 1.0
-    joints = reference + rng.normal(size=(SAMPLES, len(reference)))
-    return np.array([np.array(slope(place, at)) for place, at in zip(places, joints, strict=True)])
+    place = base + rng.normal(size=len(base))
+    place[3:] /= np.linalg.norm(place[3:]) if len(base) == 7 else 1.0
+    return np.array(slope(place, reference + rng.normal(size=len(reference))))
 
 
 def _within(slopes: Array, known: Array) -> NDArray[np.bool_]:
-    """Which rows are, in every sample, combinations of those that are known. Shapes (S, k, n), (S, m, n) to (k,)."""
-    found = np.ones(slopes.shape[1], dtype=bool)
-    for rows, others in zip(slopes, known, strict=True):
-        left = rows - rows @ np.linalg.pinv(others, rcond=1e-9) @ others
-        found &= np.linalg.norm(left, axis=1) <= 1e-9 * np.linalg.norm(rows, axis=1)
-    return found
+    """Which rows are combinations of those that are known. Shapes (k, n), (m, n) to (k,)."""
+    left = slopes - slopes @ np.linalg.pinv(known, rcond=DEPENDENT) @ known
+    return np.asarray(np.linalg.norm(left, axis=1) <= DEPENDENT * np.linalg.norm(slopes, axis=1))

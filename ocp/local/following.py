@@ -44,6 +44,18 @@ class Followed:
     misfit: Array
     lost_at: Array
 
+    @classmethod
+    def resting(cls, times: Array, base: Array, joints: Array) -> Followed:
+        """Motions in which nothing moves.
+
+        Args:
+            times: Shape (M,), s. base, joints: Shape (K, base_size) and (K, joint_size).
+        """
+        count, many = len(joints), len(times)
+        still, none = np.zeros((count, many, joints.shape[1])), np.zeros(count)
+        places, angles = (np.repeat(each[:, None], many, axis=1) for each in (base, joints))
+        return cls(times, places, angles, still, none, none, none)
+
     def of(self, rows: Any) -> Followed:
         """Some of the motions."""
         kept = (self.base, self.joints, self.rates, self.cost, self.misfit, self.lost_at)

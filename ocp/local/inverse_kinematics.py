@@ -25,7 +25,7 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import pose_in_reference
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["Posture", "Unreachable", "check_reach", "inverse_kinematics", "postures_of"]
+__all__ = ["Posture", "Unreachable", "inverse_kinematics", "postures_of"]
 
 LARGEST_SEED = 2**64
 TOLERANCE, APART, ITERATIONS = 1e-10, 1e-3, 100
@@ -35,7 +35,6 @@ SLIDE_SPREAD = 1.0
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
 GROWTH, SHRINKAGE = 4.0, 0.25
 """Of the damping after a step that fails, and one that succeeds."""
-REACH_TIMES = 9
 """Instants of the horizon at which a task's poses are looked for, the start among them."""
 REACH_TOLERANCE = 1e-4
 """A pose missed by less, m or rad, is not called out of reach."""
@@ -240,35 +239,6 @@ class _Search:
     def _turns(self) -> NDArray[np.bool_]:
         """Which joints turn. Shape (n,)."""
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
-
-
-def check_reach(machine: Machine, tasks: list[TipTask], start: Array, horizon: float, limits: bool, near: Any) -> None:
-    """Raise where poses of the tasks are out of reach, judged at a few times by multi-start inverse kinematics.
-
-    Velocities in the world's axes are summed up to positions, orientations from velocities and tasks in other axes are
-    left out. A floating base may come nearer, so that nothing is said of it.
-
-    Args:
-        machine: On a fixed base; else nothing is checked.
-        tasks: All that are done at once.
-        start: Joints at the start. Shape (joint_size,).
-        horizon: s.
-        limits: Whether the robot's position limits hold.
-        near: Joints to search from first. Shape (k, joint_size).
-
-    Raises:
-        Unreachable: Names the time and the nearest miss.
-    """
-    if machine.base_size:
-        return
-    for time in np.linspace(0.0, horizon, REACH_TIMES)[1:]:
-        poses = [pose for task in tasks if (pose := as_pose(machine, task, start, float(time))) is not None]
-        if not poses:
-            return
-        try:
-            inverse_kinematics(machine, poses, time=float(time), near=near, limits=limits, tolerance=REACH_TOLERANCE)
-        except Unreachable as error:
-            raise Unreachable(f"at {time:.4g} s {error}", **{**vars(error), "time": float(time)}) from error
 
 
 def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:

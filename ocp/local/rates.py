@@ -18,20 +18,11 @@ from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
-from ocp.errors import (
-    MOST,
-    NOT_NUMBERS,
-    ProblemError,
-    checked_flag,
-    checked_nonnegative,
-    checked_positive,
-    floats,
-    real,
-)
+from ocp.errors import MOST, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
 from ocp.local.touching import checked_surroundings, distances_along
-from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, dependent_rows
+from ocp.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.tasks.equations import TaskEquations, bind
-from ocp.tasks.tip_task import TipTask, Velocity, one_of
+from ocp.tasks.tip_task import TipTask
 
 __all__ = ["LocalSolution", "least_rates", "resolve"]
 
@@ -100,18 +91,15 @@ class LocalSolution:
 @interruptible
 def resolve(
     machine: Machine,
-    tip_velocity: Velocity | None = None,
-    rows: Sequence[int] | None = None,
-    start_joints: Any = None,
+    tasks: TipTask | Sequence[TipTask],
+    start_joints: Any,
     horizon: float | None = None,
     *,
-    task: TipTask | Sequence[TipTask] | None = None,
     start_base: Any = None,
     weights: Any = None,
     damping: float = 0.0,
     tolerance: float = 1e-10,
     samples: Any = 501,
-    check_start: bool = True,
     surroundings: Surroundings | None = None,
 ) -> LocalSolution:
     """Simulate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the base that follows.
@@ -120,12 +108,9 @@ def resolve(
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
-        tip_velocity: Velocity v of the tip in the task's rows: a constant of shape (len(rows),), or a
-            function that takes a casadi time (s) and returns a casadi vector or a list of expressions.
-        rows: Which rows of the tip's twist v prescribes: angular 0..2, linear 3..5, world axes.
+        tasks: What its tips do; several are done at once.
         start_joints: Shape (joint_size,).
-        horizon: Final time, s.
-        task: Instead of tip_velocity and rows: a TipTask, or several that are done at once.
+        horizon: Final time, s; that of the tasks if None.
         start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
         weights: Of the squared joint rates that are least, positive. Shape (joint_size,); all 1 if None.
         damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays
@@ -133,7 +118,6 @@ def resolve(
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
         samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
             horizon.
-        check_start: Whether a start away from the pose of its task (see TipTask.start_gap) is refused.
         surroundings: Of the machine; how near its bodies come to each other and to obstacles is reported, at the
             samples, and changes nothing.
 
@@ -144,11 +128,11 @@ def resolve(
     Raises:
         ProblemError: Something does not fit the machine, or the task is singular already at the start.
     """
-    equations = bind(machine, one_of(tip_velocity, rows, task))
-    checked_flag("check_start", check_start)
+    equations = bind(machine, tasks)
     joints, base = checked_configuration(machine, start_joints, start_base)
-    duration, heavy = checked_horizon(horizon), checked_weights(weights, machine.joint_size)
-    checked_tasks(equations, base, joints, duration, start=check_start)
+    duration = horizon_of([part.task for part in equations.bound], horizon)
+    heavy = checked_weights(weights, machine.joint_size)
+    checked_tasks(equations, base, joints, duration)
     checked_nonnegative("damping", damping)
     checked_positive("tolerance", tolerance)
     times = _times(samples, duration)

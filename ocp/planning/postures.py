@@ -204,7 +204,7 @@ def followed_from(asked: Asked, postures: Array) -> list[Followed]:
             times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
             equations = stretch.equations
             if equations is None:
-                found.append(_resting(times, base, joints))
+                found.append(Followed.resting(times, base, joints))
             else:
                 soft: dict[str, Any] = {"weights": asked.weights, "damping": damping}
                 found.append(follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft))
@@ -249,16 +249,6 @@ def _straight(part: Followed, joints: Array) -> Followed:
     way = (joints - part.joints[:, 0])[:, None]
     rates = np.repeat(way / (part.t[-1] - part.t[0]), len(part.t), axis=1)
     return replace(part, joints=part.joints[:, :1] + share * way, rates=rates)
-
-
-def _resting(times: Array, base: Array, joints: Array) -> Followed:
-    """Where nothing is asked for nothing moves."""
-    count, many = len(joints), len(times)
-    still = np.zeros((count, many, joints.shape[1]))
-    none = np.zeros(count)
-    return Followed(
-        times, np.repeat(base[:, None], many, axis=1), np.repeat(joints[:, None], many, axis=1), still, none, none, none
-    )
 
 
 def misfits_of(followed: list[Followed]) -> list[float]:

@@ -27,6 +27,7 @@ __all__ = [
     "checked_tasks",
     "checked_weights",
     "dependent_rows",
+    "horizon_of",
     "ignorable_joints",
     "inside_limits",
     "rates_at_rest",
@@ -50,6 +51,21 @@ def checked_horizon(horizon: Any) -> float:
         words = f"horizon must be a positive number of seconds, not {horizon!r}"
         raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
     return duration
+
+
+def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
+    """The horizon, s, or where it is None the time at which the last task ends.
+
+    Raises:
+        ProblemError: None is given, and no task says how long it lasts; not a positive number.
+    """
+    if horizon is None:
+        ends = [task.end for task in tasks if task.duration is not None]
+        if not ends:
+            words = "horizon is missing: no task says how long it lasts; give horizon=... in s"
+            raise ProblemError(words, name="horizon")
+        horizon = max(ends)
+    return checked_horizon(horizon)
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:

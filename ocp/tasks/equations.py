@@ -112,7 +112,7 @@ class TaskEquations:
         parts = []
         for task in (part.task for part in self.bound):
             if task.velocity is not None:
-                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "tip_velocity", task.begin))
+                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "velocity", task.begin))
             if task.position is not None:
                 value = _whole(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
@@ -490,7 +490,7 @@ def track_expression(
             words = f"{what} gives {value!r}, not numbers or expressions of shape {wanted}"
             raise ProblemError(words, name=what, value=value, limit=allowed) from error
     if value.shape not in allowed:
-        hint = ": one entry for each row of the task" if what == "tip_velocity" else ""
+        hint = ": one entry for each row of the task" if what == "velocity" else ""
         words = f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}"
         raise ProblemError(words, name=what, value=value.shape, limit=allowed)
     if isinstance(value, ca.DM):

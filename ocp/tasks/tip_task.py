@@ -17,11 +17,11 @@ from models import ModelError, SmoothPath
 from models.arrays import Array, ArrayInput, checked_array
 from models.robot.indices import checked_rows
 from models.spatial import expression
-from ocp.errors import ProblemError, checked_choice, checked_each, checked_nonnegative, checked_positive, checked_text
+from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
 from ocp.tasks.tracks import Track, along, run_by
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
-__all__ = ["Axes", "Roll", "TipTask", "Velocity", "one_of", "timed"]
+__all__ = ["Axes", "Roll", "TipTask", "Velocity", "timed"]
 
 Velocity: TypeAlias = Any
 """A track with one entry for each row of the task."""
@@ -225,19 +225,6 @@ class TipTask:
     def end(self) -> float:
         """When the task ends, s; infinite where it lasts to the end of the motion."""
         return np.inf if self.duration is None else float(self.begin + self.duration)
-
-
-def one_of(
-    tip_velocity: Velocity | None, rows: Sequence[int] | None, task: TipTask | Sequence[TipTask] | None
-) -> list[TipTask]:
-    """The tasks, given either as (tip_velocity, rows) or as such; ProblemError when both or neither."""
-    if task is None:
-        if tip_velocity is None:
-            raise ProblemError("a task is missing: give tip_velocity and rows, or task=TipTask(...)", name="task")
-        return [TipTask(rows=rows, velocity=tip_velocity)]
-    if tip_velocity is not None or rows is not None:
-        raise ProblemError("give either tip_velocity and rows, or task, not both", name="task")
-    return [task] if isinstance(task, TipTask) else list(checked_each("task", task, TipTask))
 
 
 def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:

@@ -10,7 +10,7 @@ import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp import Collocation, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
+from ocp import Collocation, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.frames import frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
@@ -50,10 +50,9 @@ def plan(coarse: bool = False) -> Example:
     """Laps by the pseudo-inverse and one lap of the cyclic plan; `coarse` for what a test can afford."""
     machine, task, laps = FixedBase(PANDA.read()), circling(), 3 if coarse else LAPS
     start = inverse_kinematics(machine, task, near=HOME, starts=0)[0].joints
-    local = resolve(machine, task=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
-    method = Collocation(intervals=24 if coarse else 40, degree=4)
-    closed: dict[str, Any] = {"horizon": LAP, "cyclic": True, "free_start": True}
-    solution = plan_minimum_velocity(machine, task=task, start_joints=start, method=method, **closed)
+    local = resolve(machine, tasks=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
+    problem = minimum_velocity_problem(machine, task, horizon=LAP, near=start, cyclic=True)
+    solution = solve(problem, Collocation(intervals=24 if coarse else 40, degree=4))
     drift = drifts(local.joints)
     facts = {
         "laps": laps,

@@ -9,7 +9,7 @@ import numpy as np
 
 from models import FreeFloating
 from models.spatial import rotation_from_rpy
-from ocp import Collocation, TipTask, plan_minimum_velocity, resolve
+from ocp import Collocation, TipTask, minimum_velocity_problem, resolve, solve
 from ocp.app.frames import frames_along
 from ocp.tasks.tracks import pose_line
 from scripts.drawing import COLORS, DASHES
@@ -34,9 +34,9 @@ def plan(coarse: bool = False) -> Example:
     goal = rotation @ np.array(ca.DM(rotation_from_rpy(*TURN))), position + np.array(SHIFT)
     line = pose_line((rotation, position), goal, DURATION)
     task = TipTask(position=line.position, orientation=line.orientation)
-    local = resolve(machine, task=task, start_joints=start, horizon=DURATION, samples=FINE)
-    method = Collocation(intervals=20 if coarse else 50, degree=4)
-    solution = plan_minimum_velocity(machine, task=task, start_joints=start, horizon=DURATION, method=method)
+    local = resolve(machine, tasks=task, start_joints=start, horizon=DURATION, samples=FINE)
+    problem = minimum_velocity_problem(machine, task, start, DURATION)
+    solution = solve(problem, Collocation(intervals=20 if coarse else 50, degree=4))
     facts = {
         "base_turn_local_deg": float(np.degrees(turning_angle(local.base).max())),
         "base_turn_optimal_deg": float(np.degrees(turning_angle(solution["base"]).max())),

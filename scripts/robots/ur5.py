@@ -12,7 +12,7 @@ import numpy as np
 from models import FixedBase, Machine
 from models.arrays import Array
 from models.paths import rest_to_rest
-from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, plan_minimum_velocity, resolve
+from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.frames import TIP, Frames, frames_along
 from ocp.local.inverse_kinematics import Posture
 from ocp.local.rates import LocalSolution
@@ -70,7 +70,7 @@ def plan(coarse: bool = False) -> Example:
     tried: list[tuple[LocalSolution, Solution | None, Solution | None]] = []
     rows: list[dict[str, Any]] = []
     for posture in starts(machine, task)[: 1 if coarse else BRANCHES]:
-        local = resolve(machine, task=task, start_joints=posture.joints, horizon=DURATION, samples=FINE)
+        local = resolve(machine, tasks=task, start_joints=posture.joints, horizon=DURATION, samples=FINE)
         same, free = (_planned(machine, task, posture, method, free_start) for free_start in (False, True))
         tried.append((local, same, free))
         rows.append(
@@ -108,11 +108,12 @@ def starts(machine: Machine, task: TipTask) -> list[Posture]:
 
 
 def _planned(machine: Machine, task: TipTask, start: Posture, method: Collocation, free_start: bool) -> Solution | None:
-    options: dict[str, Any] = {"horizon": DURATION, "free_start": free_start, "method": method}
+    begin: dict[str, Any] = {"near" if free_start else "start_joints": start.joints}
     try:
-        return plan_minimum_velocity(machine, task=task, start_joints=start.joints, **options)
+        found = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)
     except SolveError:
         return None
+    return found if found.audit().feasible else None
 
 
 def roll(frames: Frames) -> Array:

@@ -93,7 +93,7 @@ def local_rows(repeats: int) -> list[dict[str, Any]]:
 
         def work(tolerance: float = tolerance) -> Any:
             settings: Any = {"tolerance": tolerance, "samples": STEPS[0] + 1}
-            return resolve(machine, task=task, start_joints=start, horizon=LAP, **settings)
+            return resolve(machine, tasks=task, start_joints=start, horizon=LAP, **settings)
 
         motion = work()
         rows.append(_local_row("selfmotion", f"tolerance {tolerance:g}", least(work, repeats), motion.joints, motion.t))

@@ -16,7 +16,7 @@ import numpy as np
 
 from ocp import Collocation, MultipleShooting, Problem, prepare
 from scripts import drawing
-from scripts.papers.free_floating.results import problem as free_floating
+from scripts.papers.free_floating.formulations import problem as free_floating
 from scripts.papers.run import progress, text_table
 from scripts.timing.build_and_solve import growth
 from scripts.timing.measure import median, timed

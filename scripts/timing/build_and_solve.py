@@ -15,7 +15,7 @@ from ocp import Collocation, Problem, Solution, prepare
 from ocp.curves import differentiation_matrix, quadrature_weights
 from ocp.problem.formulation import Formulation
 from scripts import drawing
-from scripts.papers.free_floating.results import problem as free_floating
+from scripts.papers.free_floating.formulations import problem as free_floating
 from scripts.papers.run import progress, text_table
 from scripts.timing.measure import median, timed
 

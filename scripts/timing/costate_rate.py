@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Joint, Link, Robot
-from ocp.builders import redundancy
+from ocp import Limits, TipTask, minimum_velocity_problem
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Formulation
 from scripts import drawing
@@ -85,7 +85,9 @@ def costate_function(machine: FreeFloating, rows: list[int]) -> tuple[Any, Any]:
     """Functions (state, costate) -> costate rate and -> H of the redundancy problem, the control eliminated."""
     start = np.linspace(0.3, 0.6, machine.joint_size)
     velocity = np.full(len(rows), 0.05)
-    problem = redundancy.minimum_velocity_problem(machine, velocity, rows, start, 0.1, limits=False)
+    problem = minimum_velocity_problem(
+        machine, TipTask(rows=rows, velocity=velocity), start, 0.1, limits=Limits(velocity=np.inf, joints=False)
+    )
     ham = Hamiltonian.of(Formulation(problem))
     x, lam = ca.SX.sym("x", ham.sizes[0]), ca.SX.sym("lam", ham.sizes[0])
     rest = [0, 1, [], [], np.zeros(ham.sizes[-1])]

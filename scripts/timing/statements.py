@@ -18,9 +18,9 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp import Collocation, Problem, inverse_kinematics, prepare
-from ocp.builders.redundancy import minimum_velocity_problem
+from ocp.builders.minimum_velocity import minimum_velocity_problem
 from ocp.problem.formulation import Formulation
-from scripts.papers.free_floating.results import problem as free_floating
+from scripts.papers.free_floating.formulations import problem as free_floating
 from scripts.robots.panda import HOME, LAP, circling
 from scripts.robots.robots import PANDA
 from tests.conformance import brachistochrone, goddard, van_der_pol
@@ -189,8 +189,7 @@ def _arm() -> Statement:
 def _lap() -> Statement:
     machine = FixedBase(PANDA.read())
     start = inverse_kinematics(machine, circling(), near=HOME, starts=0)[0].joints
-    settings: Any = {"horizon": LAP, "cyclic": True, "free_start": True}
-    return _weighed(minimum_velocity_problem(machine, task=circling(), start_joints=start, **settings))
+    return _weighed(minimum_velocity_problem(machine, circling(), horizon=LAP, near=start, cyclic=True))
 
 
 def with_reference(statement: Statement, intervals: int = 80) -> Statement:

@@ -40,11 +40,11 @@ def read(kind: str = "revolute", xyz: str = "0 0 1", rpy: str = "0 0 0", limit: 
 
 
 def moved(start: Any) -> Any:
-    return resolve(ARM, task=FORWARD, start_joints=start, horizon=0.1, samples=2)
+    return resolve(ARM, tasks=FORWARD, start_joints=start, horizon=0.1, samples=2)
 
 
 def planned(start: Any) -> Any:
-    return minimum_velocity_problem(ARM, task=FORWARD, start_joints=start, horizon=0.1)
+    return minimum_velocity_problem(ARM, tasks=FORWARD, start_joints=start, horizon=0.1)
 
 
 @pytest.mark.parametrize(

@@ -130,11 +130,12 @@ interrupted("indirect with its own seed", lambda: Indirect(seed=Collocation(8000
 
 MACHINES = """
 arm, start = papers.paper_example(), [0.7, 0.6, 0.9]
-interrupted("local", lambda: ocp.resolve(arm, (-1.0, -1.0), (3, 4), start, 1.0, tolerance=1e-12, samples=30000), 0.1)
+task = TipTask(rows=(3, 4), velocity=(-1.0, -1.0))
+interrupted("local", lambda: ocp.resolve(arm, task, start, 1.0, tolerance=1e-12, samples=30000), 0.1)
 pose = TipTask(position=[1.0, 1.0, 0.0], rows=(3, 4))
 base = arm.base_home()
 interrupted("inverse kinematics", lambda: inverse_kinematics(arm, pose, starts=300000))
-interrupted("plan", lambda: plan_minimum_velocity(arm, (-1.0, -1.0), (3, 4), start, 1.0, method=Collocation(2000)))
+interrupted("plan", lambda: ocp.plan(arm, task, 1.0, start=start, search='start'))
 """
 
 

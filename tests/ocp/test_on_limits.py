@@ -48,7 +48,7 @@ def arrived(joints: Array) -> float:
 
 
 def declared(joints: Array) -> float:
-    problem = minimum_velocity_problem(MACHINE, start_joints=joints, horizon=1.0, task=leaving(joints))
+    problem = minimum_velocity_problem(MACHINE, start_joints=joints, horizon=1.0, tasks=leaving(joints))
     return float(np.array(ca.DM(problem.declared.states["joints"].initial)).ravel()[0])
 
 

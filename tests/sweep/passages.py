@@ -114,7 +114,7 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
         task = TipTask(**told)
         if beyond:
             return Passage(machine, task, start, t, joints(t), np.inf)
-        local = resolve(machine, task=task, start_joints=start, horizon=SECONDS, samples=101, tolerance=1e-7)
+        local = resolve(machine, tasks=task, start_joints=start, horizon=SECONDS, samples=101, tolerance=1e-7)
         if local.stopped is None and local.manipulability.min() > local.manipulability[0] / LOSS:
             continue
         cost = float(np.trapezoid((rates(t) ** 2).sum(axis=1) / 2, t))

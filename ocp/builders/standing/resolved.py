@@ -74,7 +74,7 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
         if name in stance.others
     ]
     tasks += [_on_its_way(stance, swing, t[-1], clearance) for swing in swings]
-    found = resolve(stance, task=tasks, start_joints=joints, horizon=t[-1], samples=t)
+    found = resolve(stance, tasks=tasks, start_joints=joints, horizon=t[-1], samples=t)
     if found.stopped is not None:
         words = f"phase {steps.names[k]!r}: the pseudo-inverse breaks down at {found.t[-1]:.4g} s: {found.stopped}"
         raise SolveError(words, name=steps.names[k], time=float(found.t[-1]))

@@ -17,7 +17,7 @@ from ocp import Collocation, Indirect, Problem, Solution, certificate, solve
 from scripts.papers.free_floating.false_optima import INTERVALS, MAX_ITERATIONS, Settled, Solvers, first_guess, settle
 from scripts.papers.run import Row
 
-MakeProblem: TypeAlias = Callable[..., Problem]  # (horizon, guess_damping=...) -> the "rates" formulation
+MakeProblem: TypeAlias = Callable[..., Problem]  # (horizon, guess_damping=...) -> the problem in joint rates
 
 HORIZONS = (3.5, 4.0, 5.0, 6.0)  # s
 DAMPINGS = (0.005, 0.02, 0.03, 0.1, 0.3, 1.0)  # of the local motion to start from; the builder's default is the first

@@ -10,19 +10,24 @@ import numpy as np
 
 from models import FreeFloating, paper_example
 from models.arrays import Array
-from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, minimum_velocity_problem, resolve, solve
+from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, resolve, solve
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating.extremals import Search
 from scripts.papers.free_floating.false_optima import Trial
+from scripts.papers.free_floating.formulations import (
+    HORIZON,
+    ROWS,
+    START_JOINTS,
+    TASK,
+    TIP_VELOCITY,
+    null_space_problem,
+    problem,
+)
 from scripts.papers.free_floating.motion import Laws, Motion, laws, motion_of_local, motion_of_plan
 from scripts.papers.free_floating.optimality import BACKWARD, Agreement, agreement
 from scripts.papers.run import Row, progress
 
-ROWS = (3, 4)  # the task: linear velocity of the tip in the plane, its orientation free
-TIP_VELOCITY = np.array([-1.0, -1.0])  # m/s, printed
-START_JOINTS = np.radians([45.0, 60.0, -60.0])  # printed
 START_BASE = np.zeros(3)  # printed
-HORIZON = 5.0  # s, chosen
 STEP = 1e-3  # s, of the grids that peaks are read from
 START = np.concatenate([START_BASE, START_JOINTS])
 
@@ -94,14 +99,9 @@ class Results:
         return {"pseudo-inverse": self.near_peaks, "optimum": self.optimal}
 
 
-def problem(horizon: float = HORIZON, **settings: Any) -> Problem:
-    """Problem (27) for the paper's example; the settings are those of `minimum_velocity_problem`."""
-    return minimum_velocity_problem(paper_example(), TIP_VELOCITY, ROWS, START_JOINTS, horizon, **settings)
-
-
 def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:
     """Motion (26) with u = 0 at given times."""
-    local = resolve(machine, TIP_VELOCITY, ROWS, START_JOINTS, times[-1], tolerance=1e-12, samples=times)
+    local = resolve(machine, TASK, START_JOINTS, times[-1], tolerance=1e-12, samples=times)
     if local.stopped:
         raise RuntimeError(f"the pseudo-inverse motion ends early: {local.stopped}")
     return motion_of_local(machine, local, TIP_VELOCITY, ROWS)
@@ -114,7 +114,7 @@ def compute() -> Results:
     around = [np.arange(-STEP, STEP, 1e-6) + peak for peak in local.peak_joint_rates()[1]]
     near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([grid(), *around]).round(9)))
 
-    rates, null_space = problem(), problem(formulation="null_space")
+    rates, null_space = problem(), null_space_problem()
     found = agreement(rates, null_space)
     audit = found.plan.audit()
     study = false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS)

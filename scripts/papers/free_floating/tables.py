@@ -10,12 +10,12 @@ import numpy as np
 from scripts.papers.free_floating import extremals
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE
 from scripts.papers.free_floating.false_optima import HORIZON as FALSE_HORIZON
+from scripts.papers.free_floating.formulations import HORIZON
 from scripts.papers.free_floating.optimality import PLAN, SECOND_OPINION, certificate_rows, indirect_summary
 from scripts.papers.free_floating.results import (
     ASSUMED,
     CAVEATS,
     CHOSEN,
-    HORIZON,
     NOTE,
     PAPER_ACCELERATIONS,
     PAPER_PEAKS,

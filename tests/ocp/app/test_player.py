@@ -110,7 +110,7 @@ def plans(machines: dict[str, Machine]) -> dict[str, Plan]:
 
 
 def planned(machine: Machine, **more: Any) -> Plan:
-    problem = minimum_velocity_problem(machine, (0.1, -0.1), (3, 4), START, 1.5, **more)
+    problem = minimum_velocity_problem(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), START, 1.5, **more)
     solution = solve(problem, Collocation(intervals=6, degree=3))
     return Plan(machine, solution, (Part(0.0, 1.5, ""),))
 
@@ -314,7 +314,9 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
     machine = FixedBase(armoured_arm())
     start = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
     clear = Clear(Surroundings(machine, [Sphere(0.05, (0.9, 0.4, 0.2))]))
-    problem = minimum_velocity_problem(machine, (0.0, 0.1, 0.0), (3, 4, 5), start, 1.0, clear=clear)
+    problem = minimum_velocity_problem(
+        machine, TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)), start, 1.0, clear=clear
+    )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     near = shown_plan(plan).near
     assert near is not None
@@ -346,7 +348,9 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
         HalfSpace((0.6, 0.0, 0.8), (0.0, 0.0, -1.5)),
     ]
     clear = Clear(Surroundings(machine, around))
-    problem = minimum_velocity_problem(machine, (0.0, 0.1, 0.0), (3, 4, 5), start, 1.0, clear=clear)
+    problem = minimum_velocity_problem(
+        machine, TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)), start, 1.0, clear=clear
+    )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     shown = shown_plan(plan)
     plane, moved = shown.around
@@ -396,7 +400,7 @@ def test_solutions_local_motions_and_files_are_shown_as_plans_are(
         wanted = shown_plan(plan)
         plan.solution.save(tmp_path / "solution.npz")
         plan.write_csv(tmp_path / "motion.csv", 0.01)
-        local = resolve(machine, (0.1, -0.1), (3, 4), START, 1.5)
+        local = resolve(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), START, 1.5)
         raw = read_trajectory(tmp_path / "motion.csv", joints=plan.names)
         shown = [
             shown_solution(Solution.load(tmp_path / "solution.npz"), machine),

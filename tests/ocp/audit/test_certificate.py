@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import paper_example
 from ocp import (
     Certificate,
     Collocation,
@@ -20,11 +19,12 @@ from ocp import (
     ProblemError,
     Solution,
     certificate,
-    minimum_velocity_problem,
     solve,
 )
 from ocp.curves import PiecewisePolynomial
 from ocp.status import SolverStatus
+from scripts.papers.free_floating.formulations import null_space_problem
+from scripts.papers.free_floating.formulations import problem as paper_problem
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import energy, plant, van_der_pol
 
@@ -41,13 +41,6 @@ NAMES: dict[str, Any] = {
 def three() -> tuple[Problem, dict[str, Solution]]:
     problem = van_der_pol()
     return problem, {name: solve(problem, method) for name, method in NAMES.items()}
-
-
-def paper(damping: float = 0.005, formulation: Any = "rates") -> Problem:
-    start = np.deg2rad([45.0, 60.0, -60.0])
-    return minimum_velocity_problem(
-        paper_example(), [-1, -1], [3, 4], start, 5.0, guess_damping=damping, formulation=formulation
-    )
 
 
 def moved(solution: Solution, which: str, change: float) -> Solution:
@@ -88,7 +81,7 @@ def test_three_methods_agree_and_the_indirect_one_is_the_reference() -> None:
 
 
 def test_the_paper_example_is_certified_by_three_methods() -> None:
-    problem = paper(formulation="null_space")
+    problem = null_space_problem()
     direct = solve(problem, Collocation(100, 3, "legendre"))
     shot = solve(problem, MultipleShooting(100, control="linear"), guess=direct)
     indirect = solve(problem, Indirect(shooting="backward"), guess=direct)
@@ -205,9 +198,9 @@ def test_a_reference_that_is_wrong_fails_all_the_same() -> None:
 
 def test_an_extremal_of_another_branch_is_found_out_though_it_passes_its_audit() -> None:
     """J = 1.7351 and J = 1.7467 both satisfy the minimum principle of the paper's example."""
-    problem = paper()
+    problem = paper_problem()
     best = solve(problem, Indirect(shooting="backward"))
-    other = solve(paper(0.03), Collocation(100))
+    other = solve(paper_problem(guess_damping=0.03), Collocation(100))
     assert best.cost == pytest.approx(1.735114311245, abs=1e-9)
     assert other.cost > best.cost + 0.01
     found = certificate(problem, {"best": best, "other": other})

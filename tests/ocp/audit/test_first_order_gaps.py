@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Joint, Link, Robot
-from ocp import Collocation, MultipleShooting, Problem, Solution, minimum_velocity_problem, resolve, solve
+from ocp import Collocation, MultipleShooting, Problem, Solution, TipTask, minimum_velocity_problem, resolve, solve
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum, of
 from tests.ocp.problems import Array, double_integrator
 
@@ -208,12 +208,11 @@ def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motio
     """Least rates at each instant, costates of minus the rates: stationary, and dearer than the optimum."""
     start, way, dearer = MOTIONS[motion]
     machine = planar([size] * len(start))
-    asked: dict[str, Any] = {"rows": (3, 4), "start_joints": start, "horizon": 2.0}
-    velocity = size * np.array(way)
-    local = resolve(machine, velocity, **asked)
+    task = TipTask(rows=(3, 4), velocity=size * np.array(way))
+    local = resolve(machine, task, start, 2.0)
     assert local.stopped is None
     for bound in (None, 99.0):
-        problem = minimum_velocity_problem(machine, velocity, **asked)
+        problem = minimum_velocity_problem(machine, task, start, 2.0)
         if bound:  # never active
             problem.path("far", problem.declared.states["joints"].symbol[0], -bound, bound)
         optimum = solve(problem, Collocation(20))

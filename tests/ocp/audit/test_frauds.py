@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Robot
-from ocp import Collocation, Indirect, Problem, ProblemError, Solution, minimum_velocity_problem, solve
+from ocp import Collocation, Indirect, Problem, ProblemError, Solution, TipTask, minimum_velocity_problem, solve
 from ocp.curves import PiecewisePolynomial
 from tests.ocp.audit.drawn import holds
 from tests.ocp.problems import Array, double_integrator
@@ -43,8 +43,8 @@ def panda() -> Solution:
     urdf = next(file.locate() for file in files("example-robot-data") or [] if file.name == "panda.urdf")
     robot = Robot.from_urdf(urdf, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02})
     start = [0.0, -0.6, 0.1, -2.2, 0.2, 1.7, 0.7]
-    asked: dict[str, Any] = {"rows": (3, 4, 5), "start_joints": start, "horizon": 2.0}
-    return solve(minimum_velocity_problem(FixedBase(robot), [0.1, 0.12, -0.06], **asked), Collocation(8, 4))
+    task = TipTask(rows=(3, 4, 5), velocity=[0.1, 0.12, -0.06])
+    return solve(minimum_velocity_problem(FixedBase(robot), task, start, 2.0), Collocation(8, 4))
 
 
 def bounded() -> Solution:

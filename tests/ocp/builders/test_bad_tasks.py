@@ -50,7 +50,6 @@ from ocp import (
     minimum_velocity_problem,
     plan_capture,
     plan_dynamics,
-    plan_minimum_velocity,
     plan_standing,
     plan_steps,
     resolve,
@@ -147,7 +146,7 @@ ASKED: dict[str, Bad] = {
     "weights": RATES,
     "start_base": but(BASE, "empty"),
 }
-GIVEN = {"machine": ARM, "task": FORWARD, "start_joints": START, "horizon": 1.0}
+GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
 STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
 EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
 
@@ -266,10 +265,9 @@ VELOCITIES = [
         {**GIVEN, "samples": 5},
         {
             **ASKED,
-            "task": TASK,
+            "tasks": TASK,
             "damping": NONNEGATIVE | NOTHING,
             "tolerance": POSITIVE | NOTHING,
-            "check_start": FLAG,
             "samples": COUNT
             | NOTHING
             | {"falling": [0, 0.5, 0.4, 1.0], "one": [0.0], "texts": ["0", "1"], "nan": [0, NAN, 1]},
@@ -280,18 +278,17 @@ VELOCITIES = [
         resolve,
         {
             "machine": ARM,
-            "tip_velocity": [0.1, 0.0],
-            "rows": (3, 4),
+            "tasks": TipTask(rows=(3, 4), velocity=[0.1, 0.0]),
             "start_joints": START,
             "horizon": 1.0,
             "samples": 5,
         },
-        {"tip_velocity": TRACK | NOTHING, "rows": ROWS | NOTHING | {"too many": (2, 3, 4, 5), "unmoved": (0, 3)}},
+        {"tasks": TASK, "start_joints": array(3), "horizon": HORIZON},
     ),
     Case(
         "resolve a pose",
         lambda position: resolve(
-            ARM, task=TipTask(position=position, rows=(3, 4)), start_joints=START, horizon=1.0, samples=3
+            ARM, tasks=TipTask(position=position, rows=(3, 4)), start_joints=START, horizon=1.0, samples=3
         ),
         {"position": REACHED},
         {"position": PLACE | {"elsewhere": [9.0, 9.0]}},
@@ -302,32 +299,11 @@ VELOCITIES = [
         GIVEN,
         {
             **ASKED,
-            "task": TASK,
-            "free_start": FLAG,
+            "tasks": TASK,
             "cyclic": FLAG,
-            "formulation": CHOICE,
-            "limits": FLAG,
+            "limits": but(INSTANCE, "None"),
             "guess_damping": POSITIVE | NOTHING,
-            "symbols": SYMBOLS,
-        },
-    ),
-    Case(
-        "plan_minimum_velocity",
-        plan_minimum_velocity,
-        {**GIVEN, "method": Collocation(5)},
-        {
-            "machine": ASKED["machine"],
-            "start_joints": array(3) | NOTHING,
-            "horizon": HORIZON,
-            "weights": RATES,
-            "task": TASK,
-            "free_start": FLAG,
-            "cyclic": FLAG,
-            "formulation": CHOICE,
-            "limits": FLAG,
-            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
-            "dampings": but(SEQUENCE, "numbers") | NOTHING | {"empty": [], "zero": [0.0]},
-            "options": MAPPING,
+            "clear": but(INSTANCE, "None"),
         },
     ),
 ]
@@ -651,7 +627,7 @@ STEPS = [
     ),
 ]
 CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS, *STEPS]
-LONG = ("along", "plan_minimum_velocity", "plan_standing", "plan_steps")
+LONG = ("along", "plan_standing", "plan_steps")
 
 
 @pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))

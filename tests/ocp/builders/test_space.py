@@ -111,7 +111,7 @@ def null_space(machine: FreeFloating, start: Array, shift: Any, method: Collocat
     at = np.array(ca.DM(machine.tip_pose(machine.base_home(), start).position)).ravel()
     reach = TipTask(position=along(at[: len(shift)], shift), rows=(3, 4, 5)[: len(shift)])
     still = TipTask(link=machine.robot.root, rows=(0, 1, 2), velocity=np.zeros(3))
-    held = solve(minimum_velocity_problem(machine, task=[reach, still], start_joints=start, horizon=20.0), method)
+    held = solve(minimum_velocity_problem(machine, tasks=[reach, still], start_joints=start, horizon=20.0), method)
     assert turned(held) < 1e-9
     end = np.array(ca.DM(machine.tip_pose(held["base"][-1], held["joints"][-1]).position)).ravel()
     assert end[: len(shift)] == pytest.approx(at[: len(shift)] + shift, abs=1e-4)

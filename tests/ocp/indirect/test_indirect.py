@@ -12,8 +12,20 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Machine, paper_example
-from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, minimum_velocity_problem, prepare, solve
+from ocp import (
+    Collocation,
+    Indirect,
+    Limits,
+    MultipleShooting,
+    Problem,
+    Solution,
+    TipTask,
+    minimum_velocity_problem,
+    prepare,
+    solve,
+)
 from ocp.problem.formulation import Formulation
+from scripts.papers.free_floating import formulations
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import Array, energy, plant
@@ -29,8 +41,8 @@ every_extremum = pytest.mark.parametrize("name", EXTREMA)
 
 
 def paper_problem(formulation: Any = "rates", machine: Machine | None = None, horizon: float = 5.0) -> Problem:
-    by = machine or paper_example()
-    return minimum_velocity_problem(by, [-1, -1], [3, 4], PAPER_START, horizon, formulation=formulation)
+    declare = formulations.problem if formulation == "rates" else formulations.null_space_problem
+    return declare(horizon, machine=machine)
 
 
 @cache
@@ -164,7 +176,13 @@ ARM_START = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
 )
 @pytest.mark.parametrize("shooting", SHOOTINGS)
 def test_spatial_arms_agree_with_collocation(machine: Machine, horizon: float, segments: int, shooting: str) -> None:
-    problem = minimum_velocity_problem(machine, [0.1, 0.1, -0.05], [3, 4, 5], ARM_START, horizon, limits=False)
+    problem = minimum_velocity_problem(
+        machine,
+        TipTask(rows=[3, 4, 5], velocity=[0.1, 0.1, -0.05]),
+        ARM_START,
+        horizon,
+        limits=Limits(velocity=np.inf, joints=False),
+    )
     direct = solve(problem, Collocation(20, 3, "legendre"))
     solution = solve(problem, Indirect(segments=segments, shooting=shooting), guess=direct)
     assert solution.cost == pytest.approx(direct.cost, abs=1e-10)

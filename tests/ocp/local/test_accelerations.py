@@ -468,7 +468,7 @@ def test_a_pose_that_takes_all_joints_gives_the_motion_of_the_rates() -> None:
     goal = rotation @ turned((1, 2, 0.5), 0.4), position + np.array([0.02, 0.15, -0.1])
     line = pose_line((rotation, position), goal, 1.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    slow = resolve(FixedBase(six().robot), task=task, start_joints=SIX_START, horizon=1.0, samples=11)
+    slow = resolve(FixedBase(six().robot), tasks=task, start_joints=SIX_START, horizon=1.0, samples=11)
     fast = resolve_accelerations(six(), task, SIX_START, 1.0, step=0.01)
     assert fast.tip_error.max() < 1e-8
     np.testing.assert_allclose(fast.motion.joints[::10], slow.joints, atol=1e-7)

@@ -66,7 +66,7 @@ def test_the_cost_is_the_one_of_the_least_rates_at_every_time() -> None:
     weights = np.array([9.0, 1, 1, 4, 1, 1, 0.5])
     found = followed(panda(), task(), start[None], steps=256, weights=weights)
     horizon = task().duration
-    local = resolve(panda(), task=task(), start_joints=start, horizon=horizon, weights=weights, samples=401)
+    local = resolve(panda(), tasks=task(), start_joints=start, horizon=horizon, weights=weights, samples=401)
     assert local.stopped is None
     effort = 0.5 * np.trapezoid((np.asarray(local.joint_rates) ** 2) @ weights, local.t)
     assert found.cost[0] == pytest.approx(effort, rel=2e-3)
@@ -146,7 +146,7 @@ def test_a_floating_base_goes_where_its_momentum_says(momentum: Any) -> None:
     line = smooth(Path.through([place, place + np.array([0.05, -0.08, 0.06])]), deviation=0.01)
     asked = TipTask.along(line, 0.05)
     found = followed(machine, asked, PANDA_START[None], steps=256)
-    local = resolve(machine, task=asked, start_joints=PANDA_START, horizon=asked.duration, samples=257)
+    local = resolve(machine, tasks=asked, start_joints=PANDA_START, horizon=asked.duration, samples=257)
     assert found.misfit[0] < 1e-6
     np.testing.assert_allclose(found.base[0, -1], local.base[-1], atol=2e-4)
     np.testing.assert_allclose(found.joints[0, -1], local.joints[-1], atol=2e-4)

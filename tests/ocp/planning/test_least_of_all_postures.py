@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cache
 
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -44,8 +43,7 @@ def test_no_posture_leads_to_a_cheaper_seam() -> None:
     mesh = Collocation(8, 7).with_nodes_at(task.breaks / task.duration)
     costs = []
     for joints in other_postures():
-        asked = {"start_joints": joints, "horizon": task.duration, "free_start": True, "symbols": ca.MX}
-        problem = minimum_velocity_problem(what.machine, task=task, **asked)
+        problem = minimum_velocity_problem(what.machine, task, near=joints)
         motion = solve(problem, mesh, options={"max_iter": 60}, check=False)
         if motion.success:  # or the posture is lost on its way
             costs.append(motion.cost)

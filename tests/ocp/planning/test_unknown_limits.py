@@ -65,7 +65,9 @@ def in_pieces(machine: FixedBase) -> Any:
 
 def least_velocities(machine: FixedBase) -> Any:
     velocity = np.array([-0.2, 0.15])
-    problem = minimum_velocity_problem(machine, tip_velocity=velocity, rows=(3, 4), start_joints=START, horizon=1.0)
+    problem = minimum_velocity_problem(
+        machine, tasks=TipTask(rows=(3, 4), velocity=velocity), start_joints=START, horizon=1.0
+    )
     return solve(problem, Collocation(5)).cost
 
 

@@ -26,6 +26,7 @@ from ocp import (
     Solution,
     SolveError,
     StorageWarning,
+    TipTask,
     prepare,
     solve,
 )
@@ -61,7 +62,7 @@ def mapped() -> Problem:
 
 def moved() -> Problem:
     arm, start = papers.paper_example(), [0.7, 0.6, 0.9]
-    return ocp.minimum_velocity_problem(arm, (-1.0, -1.0), (3, 4), start, 0.5)
+    return ocp.minimum_velocity_problem(arm, TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), start, 0.5)
 
 
 PROBLEMS: dict[str, tuple[Callable[[], Problem], dict[str, Any]]] = {

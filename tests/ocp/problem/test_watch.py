@@ -111,7 +111,7 @@ def test_the_builders_watch_where_the_tips_are() -> None:
         (moving, ("task position",)),
         (TipTask(velocity=[-0.1, 0.0, 0.1], rows=(2, 3, 4)), ("task way", "task turn")),
     ):
-        problem = minimum_velocity_problem(machine, task=task, **asked)
+        problem = minimum_velocity_problem(machine, tasks=task, **asked)
         assert tuple(problem.declared.watch) == names
         audit = solve(problem, Collocation(10)).audit()
         for name in names:

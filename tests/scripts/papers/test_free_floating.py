@@ -8,15 +8,16 @@ import pytest
 from PIL import Image
 
 from models import FreeFloating, paper_example
-from ocp import Collocation, resolve, solve
+from ocp import Collocation, TipTask, resolve, solve
 from ocp.local.rates import LocalSolution
 from scripts import free_floating
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating import results as free_floating_results
 from scripts.papers.free_floating.extremals import DAMPINGS, SPREADS
 from scripts.papers.free_floating.false_optima import FALSE, Trial
+from scripts.papers.free_floating.formulations import ROWS, START_JOINTS, TIP_VELOCITY, problem
 from scripts.papers.free_floating.motion import laws, momentum, motion_of_local, total_center_of_mass
-from scripts.papers.free_floating.results import ROWS, START_JOINTS, TIP_VELOCITY, Results
+from scripts.papers.free_floating.results import Results
 from tests.scripts.papers.script_run import Run, assert_whole_picture, column
 
 PAPER = free_floating.PAPER
@@ -180,7 +181,7 @@ def test_tip_stays_on_its_line_along_the_reintegrated_plan(run: Run[Results]) ->
 
 
 def test_tip_stays_on_its_line_on_half_the_intervals(machine: FreeFloating) -> None:
-    plan = solve(free_floating_results.problem(), Collocation(50, scheme="legendre"))
+    plan = solve(problem(), Collocation(50, scheme="legendre"))
     assert abs(plan.cost - REFERENCE) < 1e-8
     kept = laws(machine, plan.audit(), TIP_VELOCITY)
     assert kept.tip_error < 2e-6
@@ -219,7 +220,7 @@ def test_center_of_mass_moves_with_the_linear_momentum(machine: FreeFloating) ->
 
 
 def test_motion_of_a_local_solution_keeps_its_arrays(machine: FreeFloating) -> None:
-    local = resolve(machine, TIP_VELOCITY, ROWS, START_JOINTS, 1.0, samples=11)
+    local = resolve(machine, TipTask(rows=ROWS, velocity=TIP_VELOCITY), START_JOINTS, 1.0, samples=11)
     assert isinstance(local, LocalSolution)
     motion = motion_of_local(machine, local, TIP_VELOCITY, ROWS)
     assert motion.joint_accelerations.shape == (11, 3)

@@ -12,16 +12,9 @@ from models import paper_example
 from scripts import free_floating
 from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL
 from scripts.papers.free_floating.false_optima import first_guess
+from scripts.papers.free_floating.formulations import ROWS, START_JOINTS, TIP_VELOCITY
 from scripts.papers.free_floating.optimality import costate_difference, costates, hamiltonians
-from scripts.papers.free_floating.results import (
-    PAPER_PEAKS,
-    ROWS,
-    START,
-    START_BASE,
-    START_JOINTS,
-    TIP_VELOCITY,
-    Results,
-)
+from scripts.papers.free_floating.results import PAPER_PEAKS, START, START_BASE, Results
 from tests.scripts.papers.script_run import Run, column
 from tests.scripts.papers.test_free_floating import HORIZONS, REFERENCE, SAMPLE, STARTS
 

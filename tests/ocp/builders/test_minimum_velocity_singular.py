@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Machine, planar_chain
-from ocp import Collocation, Solution, TipTask, minimum_velocity_problem, plan_minimum_velocity, resolve, solve
+from ocp import Collocation, Solution, TipTask, minimum_velocity_problem, refine, resolve, solve
 from ocp.local.rates import LocalSolution
 from tests.models.robot.trees import Array, numeric, seven_joint_arm
 
 HORIZON = 4.0
+FINE = (9e-7, 9e-7)  # m and rad, that a tip may be off its line
 
 
 def grazing(size: int, seed: int) -> tuple[FixedBase, dict[str, Any], Array]:
@@ -34,8 +35,8 @@ def grazing(size: int, seed: int) -> tuple[FixedBase, dict[str, Any], Array]:
     angle = np.arctan2(first[1], first[0]) + np.arccos(near / distance)
     foot = near * np.array([np.cos(angle), np.sin(angle), 0.0])
     speed = 1.7 * (foot - first) / HORIZON
-    task = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed), rows=(3, 4))
-    return machine, {"task": task, "start_joints": start, "horizon": HORIZON}, speed
+    task = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed), rows=(3, 4), tolerance=FINE)
+    return machine, {"tasks": task, "start_joints": start, "horizon": HORIZON}, speed
 
 
 def floating(pose: bool) -> tuple[FreeFloating, dict[str, Any], Array]:
@@ -43,16 +44,17 @@ def floating(pose: bool) -> tuple[FreeFloating, dict[str, Any], Array]:
     machine = FreeFloating(seven_joint_arm())
     start, speed = np.array([0.087, 1.049, -0.898, -0.204, 0.404, 0.923, 1.2]), np.array([-0.4068, -0.0055, -0.0092])
     first = numeric(machine.tip_pose(machine.base_home(), start).position).ravel()
-    line = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed))
-    task = line if pose else TipTask(rows=(3, 4, 5), velocity=speed)
-    return machine, {"task": task, "start_joints": start, "horizon": 5.0}, speed
+    line = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed), tolerance=FINE)
+    task = line if pose else TipTask(rows=(3, 4, 5), velocity=speed, tolerance=FINE)
+    return machine, {"tasks": task, "start_joints": start, "horizon": 5.0}, speed
 
 
 def check(machine: Machine, asked: dict[str, Any], speed: Array, intervals: int) -> tuple[Solution, LocalSolution]:
     """The plan passes its audit, stays on its line and has no jump, and one on a finer mesh costs the same."""
     local = resolve(machine, **asked, samples=401)
     assert local.stopped is not None or local.manipulability.min() < 0.03 * local.manipulability[0]
-    plan = plan_minimum_velocity(machine, method=Collocation(intervals=intervals, degree=4), **asked)
+    problem = minimum_velocity_problem(machine, **asked)
+    plan = refine(problem, Collocation(intervals=intervals, degree=4))
     audit = plan.audit()
     assert audit.passed, str(audit)
     base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("joints", machine.joint_size)
@@ -62,7 +64,7 @@ def check(machine: Machine, asked: dict[str, Any], speed: Array, intervals: int)
     assert np.abs(tips - tips[0] - audit.t[:, None] * speed).max() < 1e-6
     assert local.stopped is not None or plan.cost < local.cost[-1]
     finer = Collocation(intervals=2 * plan.method["intervals"], degree=4)
-    again = solve(minimum_velocity_problem(machine, **asked), finer, guess=plan)
+    again = solve(problem, finer, guess=plan)
     assert plan.cost == pytest.approx(again.cost, rel=1e-4)
     fine = plan.at(np.linspace(0, plan.horizon, 2001))["joints"]
     assert np.abs(np.diff(fine, axis=0)).max() < 2 * np.abs(plan["rates"]).max() * plan.horizon / 2000
