@@ -58,7 +58,7 @@ LAZY = {
 """Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
 SEEN_BY_ALL = {"models.cache", "models.input_files"}
 """What all of ocp may import of models: they know no machine."""
-FOREIGN = {"models": {"casadi", "numpy", "scipy"}}
+FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from models.arrays import Array, ArrayInput, checked_each, checked_instance, checked_nonnegative, checked_rotation
 from models.errors import ModelError
@@ -112,26 +113,14 @@ def footprint(
 
 
 def convex_hull(points: ArrayInput) -> Array:
-    """Corners of the convex hull of points in the plane, counter-clockwise (Andrew 1979). Shape (k, 2).
+    """Corners of the convex hull of points in the plane, counter-clockwise, by qhull. Shape (k, 2).
 
-    Fewer than three where all points lie in one line.
+    Fewer than three where all points lie in one line, as far as doubles tell.
     """
     cloud = np.unique(np.asarray(points, dtype=float), axis=0)  # sorted by x, then y
-    flat = 1e-12 * float(np.ptp(cloud, axis=0).max(initial=0.0)) ** 2
-    lower, upper = _chain(cloud, flat), _chain(cloud[::-1], flat)
-    return np.array([*lower[:-1], *upper[:-1]])
-
-
-def _chain(points: Iterable[Array], flat: float) -> list[Array]:
-    chain: list[Array] = []
-    for point in points:
-        while len(chain) > 1:
-            a, b = chain[-1] - chain[-2], point - chain[-1]
-            if a[0] * b[1] - a[1] * b[0] > flat:
-                break
-            chain.pop()
-        chain.append(point)
-    return chain
+    if np.linalg.matrix_rank(cloud - cloud[:1], tol=1e-12 * float(np.ptp(cloud, axis=0).max(initial=0.0))) < 2:
+        return cloud[[0, -1]] if len(cloud) > 1 else cloud
+    return np.asarray(cloud[ConvexHull(cloud).vertices])
 
 
 def _corners(shape: CollisionShape) -> Array:

@@ -1,256 +1,182 @@
-"""Collada documents (.dae) as triangles, with the colours of their materials.
+"""Collada documents (.dae) as triangles, with the colours of their materials, read by pycollada, of the extra `meshes`.
 
-Parts are found by the ids that others call them by. <unit> is applied, so that lengths are in m, <up_axis> is not, see
+It is given a tree without entities, pictures, cameras and skins, opens no file, and never sees what it would read in
+part, as something else, or without end. <unit> is applied, so that lengths are in m, <up_axis> is not, see
 `models.shapes.mesh_files`. Of a material its diffuse colour is taken; where that is an image there is none.
 """
 
 from __future__ import annotations
 
-import re
-from array import array
-from collections.abc import Iterator
+import warnings
+from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from models.arrays import Array
 from models.errors import ModelError
 from models.input_files import parse_xml
-from models.shapes.triangles import MOST_FACES, Faces, Triangles, bare, numbers, together, wrong
+from models.shapes.triangles import MOST_FACES, Triangles, together, wrong
 
 __all__ = ["read_collada"]
 
-DEEPEST = 64
-"""Of nodes within nodes in a scene."""
-WORDS = re.compile(r"\S.{0,65535}\S*", re.DOTALL)
-"""Some of the words of a long text, which are read one part after the other."""
-INSTANCE = 64
-"""Triangles that a borrowed node counts for: one that borrows others, which borrow others, ends in time."""
+MOST_NODES, DEEPEST = 2**12, 64
+"""Of a scene, each counted as often as it is borrowed; nodes within nodes."""
 
 
 def read_collada(file: Path, data: bytes) -> Triangles:
-    """All instances of geometries in the scene; of all geometries where there is no scene."""
+    """All instances of geometries in the scene; all geometries where there is no scene.
+
+    Raises:
+        ModelError: pycollada is not installed, the file is no Collada or is too large, or it holds what would be read
+            in part or as something else.
+    """
     try:
-        tree = parse_xml(data)
+        from collada import Collada
+        from collada.lineset import BoundLineSet
+    except ImportError as error:
+        message = (
+            f"mesh {str(file)!r}: Collada is read by the package pycollada: "
+            'pip install "selfmotion[meshes]", or from a clone pip install ".[meshes]"'
+        )
+        raise ModelError(message, name=str(file), value=error.name) from error
+    parts, count = [], 0
+    try:
+        tree, scale = _plain(file, data)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", DeprecationWarning)  # all that numpy says of a text that is not all numbers
+            document = Collada(BytesIO(ElementTree.tostring(tree)))
+            if document.scene is None:
+                bodies = [geometry.bind(np.eye(4), {}) for geometry in document.geometries]
+            else:
+                bodies = document.scene.objects("geometry")
+            for primitive in (part for body in bodies for part in body.primitives()):
+                if isinstance(primitive, BoundLineSet):
+                    continue
+                triangles = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
+                count += len(triangles)
+                if count > MOST_FACES:
+                    raise wrong(file, f"{count} triangles in the scene", count, MOST_FACES)
+                if not len(triangles):
+                    continue
+                faces = np.asarray(triangles.vertex_index, dtype=np.intp).reshape(-1, 3)
+                if faces.min() < 0:  # those that are too large are refused by pycollada
+                    raise wrong(file, f"a triangle names vertex {faces.min()}", int(faces.min()), 0)
+                material = primitive.material or document.materials.get(primitive.original.material)
+                color = np.array(material.effect.diffuse if material and material.effect.diffuse else [np.nan] * 4)
+                vertices = scale * np.asarray(triangles.vertex, dtype=float)
+                parts.append(Triangles(vertices, faces, np.tile(color, (len(faces), 1))))
+    except ModelError:
+        raise
+    except Exception as error:  # whatever pycollada stumbles over
+        raise wrong(file, f"it is no Collada that can be read: {error}", type(error).__name__) from error
+    return together(parts)
+
+
+def _plain(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
+    """The document with what pycollada shall read alone, and its unit, m.
+
+    Borrowed nodes stand where they are borrowed, and effects are but a colour. What pycollada would read as something
+    else than it says is refused.
+    """
+    try:
+        given = parse_xml(data)
     except ElementTree.ParseError as error:
         raise wrong(file, f"it is not well-formed XML: {error}", error.position) from error
     except (ValueError, LookupError) as error:
         raise wrong(file, f"it cannot be read: {error}") from error
-    for element in tree.iter():
-        if isinstance(element.tag, str):
-            element.tag = element.tag.rpartition("}")[2]
-    if tree.tag != "COLLADA":
-        raise wrong(file, f"its root element is <{tree.tag}>, not <COLLADA>", tree.tag, "COLLADA")
-    with np.errstate(all="ignore"):  # what is not finite is refused with its vertex
-        return _Collada(file, tree).triangles()
+    for each in given.iter():
+        each.tag = each.tag.rpartition("}")[2]
+    if given.tag != "COLLADA":
+        raise wrong(file, f"its root element is <{given.tag}>, not <COLLADA>", given.tag, "COLLADA")
+    unit = given.find("asset/unit")
+    scale = 1.0 if unit is None else float(unit.get("meter", 1.0))
+    _check_numbers(file, given)
+    _place_borrowed(file, given)
+    root = _with_colors(given)
+    root.set("xmlns", "http://www.collada.org/2005/11/COLLADASchema")
+    root.extend(part for part in given if part.tag in ("library_geometries", "library_visual_scenes", "scene"))
+    return root, scale
 
 
-class _Collada:
-    """A document: its elements by id, and the triangles of its scene."""
-
-    def __init__(self, file: Path, tree: ElementTree.Element) -> None:
-        self.file, self.tree = file, tree
-        self.by_id = {element.get("id"): element for element in tree.iter() if element.get("id")}
-        self.read: dict[int, list[tuple[str, Triangles]]] = {}
-        self.colors: dict[str, Array] = {}
-        self.count = 0
-
-    def triangles(self) -> Triangles:
-        unit = self.tree.find("asset/unit")
-        scale = 1.0
-        if unit is not None and "meter" in unit.attrib:
-            scale = float(self._values(unit.get("meter", ""), 1, unit)[0])
-        start = np.diag([scale, scale, scale, 1.0])
-        parts: list[Triangles] = []
-        scene = self.tree.find("scene/instance_visual_scene")
-        if scene is not None:
-            for node in self._named(scene).findall("node"):
-                parts += self._placed(node, start, 0)
-        else:
-            parts += [self._moved(geometry, start, {}) for geometry in self.tree.iter("geometry")]
-        return together(parts)
-
-    def _wrong(self, element: ElementTree.Element, what: str, value: object = None, limit: object = None) -> ModelError:
-        name = element.get("id") or element.get("url") or element.get("source") or ""
-        return wrong(self.file, f"<{element.tag}>{f' {name!r}' if name else ''}: {what}", value, limit)
-
-    def _values(self, text: str | None, count: int | None, element: ElementTree.Element) -> Array:
-        values = array("d")
-        for part in WORDS.finditer(text or ""):
-            where = f"<{element.tag}> {element.get('id') or ''}".strip()
-            values.extend(numbers(self.file, part[0].split(), lambda where=where: where))  # type: ignore[misc]
-        if count is not None and len(values) != count:
-            raise self._wrong(element, f"{len(values)} numbers, not {count}", len(values))
-        return np.array(values)
-
-    def _indices(self, text: str | None, element: ElementTree.Element) -> Faces:
-        values = self._values(text, None, element)
-        if not (np.isfinite(values).all() and (values == np.floor(values)).all() and (np.abs(values) < 2**31).all()):
-            raise self._wrong(element, "indices must be whole numbers")
-        return values.astype(np.intp)
-
-    def _named(self, element: ElementTree.Element, key: str = "url") -> ElementTree.Element:
-        name = element.get(key, "")
-        found = self.by_id.get(name.removeprefix("#"))
-        if found is None:
-            raise self._wrong(element, f"{key} {name!r} names nothing in the file", name)
-        return found
-
-    def _placed(self, node: ElementTree.Element, above: Array, depth: int) -> Iterator[Triangles]:
-        """Triangles of a node, of the nodes in it and of those that it borrows."""
-        if depth > DEEPEST:
-            raise self._wrong(node, f"nodes within nodes, more than {DEEPEST} deep, or in a ring", depth)
-        place = above @ self._transform(node)
-        for child in node:
-            if child.tag == "node":
-                yield from self._placed(child, place, depth + 1)
-            elif child.tag == "instance_node":
-                self._counted(child, INSTANCE)
-                yield from self._placed(self._named(child), place, depth + 1)
-            elif child.tag == "instance_geometry":
-                yield self._moved(self._named(child), place, self._materials(child))
-            elif child.tag == "instance_controller":
-                skin = self._named(child).find("skin")
-                if skin is not None:
-                    yield self._moved(self._named(skin, "source"), place, self._materials(child))
-
-    def _counted(self, element: ElementTree.Element, more: int) -> None:
-        self.count += more
-        if self.count > MOST_FACES:
-            raise self._wrong(element, f"{self.count} triangles in the scene", self.count, MOST_FACES)
-
-    def _transform(self, node: ElementTree.Element) -> Array:
-        place = np.eye(4)
-        for element in node:
-            step = np.eye(4)
-            if element.tag == "matrix":
-                step = self._values(element.text, 16, element).reshape(4, 4)
-            elif element.tag == "translate":
-                step[:3, 3] = self._values(element.text, 3, element)
-            elif element.tag == "scale":
-                step[:3, :3] = np.diag(self._values(element.text, 3, element))
-            elif element.tag == "rotate":
-                *axis, angle = self._values(element.text, 4, element)
-                step[:3, :3] = _turned(np.array(axis), np.deg2rad(angle))
-            elif element.tag in ("lookat", "skew"):
-                raise self._wrong(element, "this transform is not read; apply it in the program that wrote the file")
-            place = place @ step
-        return place
-
-    def _materials(self, instance: ElementTree.Element) -> dict[str, str]:
-        """What an instance calls its materials, to their ids."""
-        bound = instance.iter("instance_material")
-        return {each.get("symbol", ""): each.get("target", "").removeprefix("#") for each in bound}
-
-    def _color(self, material: str) -> Array:
-        """Diffuse colour of a material, and opacity. Shape (4,); nan where it has none."""
-        if material not in self.colors:
-            self.colors[material] = self._found_color(material)
-        return self.colors[material]
-
-    def _found_color(self, material: str) -> Array:
-        own = self.by_id.get(material)
-        effect = None if own is None else own.find("instance_effect")
-        effect = None if effect is None else self.by_id.get(effect.get("url", "").removeprefix("#"))
-        said = None if effect is None else effect.find("profile_COMMON/technique/*/diffuse/color")
-        if said is None:
-            return np.full(4, np.nan)
-        color = self._values(said.text, 4, said)
-        return np.asarray(np.clip(np.append(color[:3], 1.0), 0.0, 1.0))  # programs do not agree what an opacity means
-
-    def _moved(self, geometry: ElementTree.Element, place: Array, materials: dict[str, str]) -> Triangles:
-        if id(geometry) not in self.read:
-            self.read[id(geometry)] = self._geometry(geometry)
-        parts = self.read[id(geometry)]
-        self._counted(geometry, sum(len(part.faces) + len(part.vertices) // 3 for _, part in parts))
-        painted = [
-            Triangles(
-                vertices @ place[:3, :3].T + place[:3, 3],
-                faces,
-                np.tile(self._color(materials.get(symbol, symbol)), (len(faces), 1)),
-            )
-            for symbol, (vertices, faces, _) in parts
-        ]
-        return together(painted)
-
-    def _geometry(self, geometry: ElementTree.Element) -> list[tuple[str, Triangles]]:
-        """Sets of triangles, and what they call their material."""
-        mesh = geometry.find("mesh")
-        found: list[tuple[str, Triangles]] = []
-        for part in () if mesh is None else mesh:
-            if part.tag not in ("triangles", "polylist", "polygons", "tristrips", "trifans"):
-                continue
-            points, stride, column = self._positions(part)
-            faces = self._faces(part, stride, column)
-            if faces.size and (faces.min() < 0 or faces.max() >= len(points)):
-                raise self._wrong(part, f"an index outside its {len(points)} points", int(faces.max()))
-            found.append((part.get("material", ""), bare(points, faces)))
-        return found
-
-    def _positions(self, part: ElementTree.Element) -> tuple[Array, int, int]:
-        """The points of a set of faces, how many indices a corner has, and which of them is that of the point."""
-        inputs = part.findall("input")
-        own = next((each for each in inputs if each.get("semantic") == "VERTEX"), None)
-        if own is None:
-            raise self._wrong(part, "no <input> of the semantic VERTEX")
-        offsets = [int(self._indices(each.get("offset", "0"), each)[0]) for each in inputs]
-        column = int(self._indices(own.get("offset", "0"), own)[0])
-        if not 0 <= min(offsets) <= max(offsets) < DEEPEST:
-            raise self._wrong(part, f"<input> offsets {offsets} are impossible", tuple(offsets))
-        stride = max(offsets) + 1
-        vertices = self._named(own, "source")
-        where = next((each for each in vertices.findall("input") if each.get("semantic") == "POSITION"), None)
-        if where is None:
-            raise self._wrong(vertices, "no <input> of the semantic POSITION")
-        source = self._named(where, "source")
-        array = source.find("float_array")
+def _check_numbers(file: Path, root: ElementTree.Element) -> None:
+    """Refuse what pycollada reads in part or as something else; make the axes of rotations unit vectors."""
+    for part in root.iter():
+        several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
+        if several or part.tag in ("lookat", "skew", "ph"):
+            raise wrong(file, f"a <{part.tag}> of this kind is not read: convert the file to STL", part.tag)
+    for part in root.iter("rotate"):
+        *axis, angle = (float(word) for word in (part.text or "").split())
+        length = float(np.linalg.norm(axis))
+        if not 0 < length < np.inf:
+            raise wrong(file, f"<rotate>: the axis {axis} has no direction", tuple(axis))
+        part.text = " ".join(str(value) for value in [*(np.array(axis) / length).tolist(), angle])
+    for source in root.iter("source"):
         accessor = source.find("technique_common/accessor")
-        if array is None:
-            raise self._wrong(source, "no <float_array>")
-        width = 3 if accessor is None else int(self._indices(accessor.get("stride", "1"), accessor)[0])
-        start = 0 if accessor is None else int(self._indices(accessor.get("offset", "0"), accessor)[0])
-        numbers = self._values(array.text, None, array)
-        if width < 3 or start < 0:
-            raise self._wrong(source, f"an <accessor> of stride {width}, offset {start}; three numbers make a point")
-        rows = (len(numbers) - start) // width
-        return numbers[start : start + max(rows, 0) * width].reshape(-1, width)[:, :3], stride, column
-
-    def _faces(self, part: ElementTree.Element, stride: int, column: int) -> Faces:
-        lists = [self._indices(each.text, part) for each in part.iter("p")]
-        for each in lists:
-            if len(each) % stride:
-                raise self._wrong(part, f"{len(each)} indices, not a multiple of {stride}", len(each))
-        corners = [each[column::stride] for each in lists]
-        if part.tag == "triangles":
-            whole = np.concatenate([*corners, np.zeros(0, dtype=np.intp)])
-            if len(whole) % 3:
-                raise self._wrong(part, f"{len(whole)} corners, not a multiple of 3", len(whole))
-            return whole.reshape(-1, 3)
-        if part.tag == "polylist":
-            counts = part.find("vcount")
-            sizes = self._indices(None if counts is None else counts.text, part)
-            whole = np.concatenate([*corners, np.zeros(0, dtype=np.intp)])
-            if (sizes < 0).any() or sizes.sum() != len(whole):
-                raise self._wrong(part, f"<vcount> says {int(sizes.sum())} corners, there are {len(whole)}", len(whole))
-            corners = np.split(whole, np.cumsum(sizes)[:-1]) if len(sizes) else []
-        if part.tag == "tristrips":
-            fans = [np.stack([each[:-2], each[1:-1], each[2:]], axis=1) for each in corners if len(each) > 2]
-        else:
-            fans = [
-                np.stack([np.full(len(each) - 2, each[0]), each[1:-1], each[2:]], axis=1)
-                for each in corners
-                if len(each) > 2
-            ]
-        return np.concatenate([*fans, np.zeros((0, 3), dtype=np.intp)])
+        if accessor is not None:
+            stride, offset = int(accessor.get("stride", 1)), int(accessor.get("offset", 0))
+            if offset or stride != len(accessor.findall("param")):
+                message = f"an <accessor> of stride {stride}, offset {offset}: each <param> of it must be one number"
+                raise wrong(file, message, (stride, offset))
+        if "nan" in (source.findtext("float_array") or "").lower():
+            raise wrong(file, f"<source> {source.get('id')!r}: a number is not finite")
+    for part in root.iter("polylist"):
+        counts = np.array((part.findtext("vcount") or "").split(), dtype=np.int64)
+        stride = 1 + max((int(each.get("offset", 0)) for each in part.findall("input")), default=0)
+        corners = len((part.findtext("p") or "").split()) / stride
+        if (counts < 3).any() or counts.sum() != corners:
+            raise wrong(file, f"<vcount> says {counts.sum()} corners, there are {corners:g}", int(counts.sum()))
 
 
-def _turned(axis: Array, angle: float) -> Array:
-    """Rodrigues' rotation about an axis of any length but zero, which turns nothing. Shape (3, 3)."""
-    length = float(np.linalg.norm(axis))
-    if not length > 0:
-        return np.eye(3)
-    x, y, z = axis / length
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Array = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
-    return rotation
+def _place_borrowed(file: Path, root: ElementTree.Element) -> None:
+    """Put nodes where they are borrowed, after how many they become is counted: those that borrow others double."""
+    nodes = {each.get("id"): each for each in root.iter("node")}
+    counts: dict[ElementTree.Element, int] = {}
+
+    def count(node: ElementTree.Element, depth: int) -> int:
+        if depth > DEEPEST:
+            raise wrong(file, f"nodes within nodes, more than {DEEPEST} deep, or in a ring", depth)
+        if node in counts:
+            return counts[node]
+        children = [child for child in node if child.tag not in ("instance_camera", "instance_light")]
+        for k, child in enumerate(children):
+            if child.tag == "instance_node":
+                url = child.get("url", "").removeprefix("#")
+                if url not in nodes:
+                    raise wrong(file, f"<instance_node>: {url!r} names nothing in the file", url)
+                children[k] = nodes[url]
+        node[:] = children
+        counts[node] = 1 + sum(count(child, depth + 1) for child in children if child.tag == "node")
+        return counts[node]
+
+    whole = sum(count(node, 0) for node in root.findall("library_visual_scenes/visual_scene/node"))
+    if whole > MOST_NODES:
+        raise wrong(file, f"{whole} nodes in the scene", whole, MOST_NODES)
+
+
+def _with_colors(given: ElementTree.Element) -> ElementTree.Element:
+    """A document of the materials of another alone, with their diffuse colours; where that is an image they have none.
+
+    Programs do not agree what an opacity means: all are opaque.
+    """
+    root = ElementTree.Element("COLLADA")
+    effects = {each.get("id"): each for each in given.iter("effect")}
+    libraries = [ElementTree.SubElement(root, f"library_{what}") for what in ("effects", "materials")]
+    known = {each.get("id", ""): each for each in given.iter("material")}
+    for k, (name, material) in enumerate(known.items()):
+        own = material.find("instance_effect")
+        effect = None if own is None else effects.get(own.get("url", "").removeprefix("#"))
+        said = None if effect is None else effect.findtext("profile_COMMON/technique/*/diffuse/color")
+        plain = ElementTree.SubElement(libraries[0], "effect", id=f"effect{k}")
+        for tag in ("profile_COMMON", "technique", "lambert", "diffuse", "color")[: 5 if said else 3]:
+            plain = ElementTree.SubElement(plain, tag)
+        if said:
+            plain.text = " ".join(str(min(max(float(word), 0.0), 1.0)) for word in [*said.split()[:3], "1"])
+        named = ElementTree.SubElement(libraries[1], "material", id=name)
+        ElementTree.SubElement(named, "instance_effect", url=f"#effect{k}")
+    for bound in given.iter("technique_common"):
+        for each in bound.findall("instance_material"):
+            if each.get("target", "").removeprefix("#") not in known:
+                bound.remove(each)
+    return root

@@ -1,7 +1,7 @@
 """Triangle meshes from files: STL (binary and text), OBJ and Collada, found by the names that URDF gives them.
 
-Where the surface is and what colour its materials have is read; normals and textures are passed over. The standard
-library and numpy read all of it; a file is refused before it fills the memory.
+Where the surface is and what colour its materials have is read; normals and textures are passed over. Collada is read
+by pycollada, the others by numpy alone; a file is refused before it fills the memory.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
 """MCAP, the log format that ROS 2 and Foxglove read and play: joint states over time, and the tip's path.
 
-Messages are those of ROS 2, written as CDR (OMG, DDS-XTypes 1.3, 7.4: little endian, each number aligned to its size,
-lengths before strings and sequences). The package `mcap`, of the extra of that name, knows the file around them.
+Messages are those of ROS 2, written and read by the package `mcap-ros2-support`, of the extra `mcap`. They are read by
+the definitions below, never by those that a file brings.
 """
 
 from __future__ import annotations
 
 import io
 import os
-import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
@@ -16,7 +15,6 @@ from typing import IO, Any
 
 import numpy as np
 
-from models.arrays import Array
 from models.input_files import open_regular
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.planning import Plan
@@ -28,23 +26,31 @@ LARGEST_LOG, MOST_UNPACKED, LARGEST_RECORD = 2**30, 2**30, 2**26
 """Bytes: of a log's file, of all that it unpacks to, and of one record or chunk, unpacked."""
 MOST_OF_JOINTS = 2**26
 """Bytes of all messages that are kept: they take five times as much memory."""
-HEADER = "std_msgs/Header header\n"
-BAR = "=" * 80 + "\n"
-HEADER_PARTS = (
-    f"{BAR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    f"{BAR}MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-)
-SCHEMAS = {
-    "sensor_msgs/msg/JointState": HEADER
-    + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
-    + HEADER_PARTS,
-    "nav_msgs/msg/Path": HEADER
-    + "geometry_msgs/PoseStamped[] poses\n"
-    + f"{BAR}MSG: geometry_msgs/PoseStamped\n{HEADER}geometry_msgs/Pose pose\n"
-    + f"{BAR}MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-    + f"{BAR}MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
-    + f"{BAR}MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
-    + HEADER_PARTS,
+
+
+def _with_parts(fields: str, **parts: str) -> str:
+    """The definition of a message: its header, its fields, and those of the types in them."""
+    parts["std_msgs/Header"] = "builtin_interfaces/Time stamp\nstring frame_id\n"
+    parts |= {f"builtin_interfaces/{name}": "int32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")}
+    bar = "=" * 80
+    return f"std_msgs/Header header\n{fields}" + "".join(f"{bar}\nMSG: {name}\n{own}" for name, own in parts.items())
+
+
+STATE, PATH = "sensor_msgs/msg/JointState", "nav_msgs/msg/Path"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+VECTOR = "float64 x\nfloat64 y\nfloat64 z\n"
+POSE_PARTS = {
+    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/Point": VECTOR,
+    "geometry_msgs/Quaternion": f"{VECTOR}float64 w\n",
+}
+POINT = "float64[] positions\nfloat64[] velocities\nfloat64[] accelerations\nfloat64[] effort\n"
+POINT_PARTS = {"trajectory_msgs/JointTrajectoryPoint": f"{POINT}builtin_interfaces/Duration time_from_start\n"}
+DEFINITIONS = {
+    STATE: _with_parts("string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"),
+    PATH: _with_parts("geometry_msgs/PoseStamped[] poses\n", **POSE_PARTS),
+    TRAJECTORY: _with_parts("string[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points\n", **POINT_PARTS),
 }
 
 
@@ -59,90 +65,45 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
         frame: The name of the world in the messages.
 
     Raises:
-        ProblemError: No plan, a period that is not positive, or the package `mcap` is not installed.
+        ProblemError: No plan, a period that is not positive, or mcap-ros2-support is not installed.
         OSError: The file cannot be written.
     """
     checked_instance("plan", plan, Plan)
     checked_text("frame", frame)
     try:
-        from mcap.writer import Writer
+        from mcap_ros2.writer import Writer
     except ImportError as error:
-        words = "MCAP is written by the package mcap: pip install 'selfmotion[mcap]'"
+        words = "MCAP is written by the package mcap-ros2-support: pip install 'selfmotion[mcap]'"
         raise ProblemError(words, name="mcap") from error
     sample = plan.sample(period)
     stamps = np.round(sample.t * 1e9).astype(np.int64).tolist()
 
     def write(stream: IO[bytes]) -> None:
         writer: Any = Writer(stream)
-        writer.start(profile="ros2", library="selfmotion")
-        channels = {}
-        for topic, name in (("/joint_states", "sensor_msgs/msg/JointState"), ("/tip_path", "nav_msgs/msg/Path")):
-            schema = writer.register_schema(name=name, encoding="ros2msg", data=SCHEMAS[name].encode())
-            channels[topic] = writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schema)
+        writer.add_metadata("selfmotion", {})  # at the head of the file: who wrote it
         if np.isfinite(sample.tip).all():
-            data = _path(stamps, sample.tip, frame)
-            writer.add_message(channel_id=channels["/tip_path"], log_time=0, publish_time=0, data=data)
-        for number, (stamp, joints, rates) in enumerate(zip(stamps, sample.joints, sample.rates, strict=True)):
-            writer.add_message(
-                channel_id=channels["/joint_states"],
-                log_time=stamp,
-                publish_time=stamp,
-                data=_joint_state(stamp, plan.names, joints, rates),
-                sequence=number,
-            )
+            poses = [
+                {
+                    "header": _header(stamp, frame),
+                    "pose": {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": i, "y": j, "z": k, "w": w}},
+                }
+                for stamp, (x, y, z, w, i, j, k) in zip(stamps, sample.tip.tolist(), strict=True)
+            ]
+            schema = writer.register_msgdef(PATH, DEFINITIONS[PATH])
+            writer.write_message("/tip_path", schema, {"header": _header(0, frame), "poses": poses}, 0)
+        schema = writer.register_msgdef(STATE, DEFINITIONS[STATE])
+        states = zip(stamps, sample.joints.tolist(), sample.rates.tolist(), strict=True)
+        for number, (stamp, joints, rates) in enumerate(states):
+            state = {"header": _header(stamp, ""), "name": list(plan.names), "position": joints, "velocity": rates}
+            writer.write_message("/joint_states", schema, {**state, "effort": []}, stamp, sequence=number)
         writer.finish()
 
     write_whole(file, write)
 
 
-class _Message:
-    """A message as CDR."""
-
-    def __init__(self) -> None:
-        self.data = bytearray(b"\x00\x01\x00\x00")  # little endian, no options
-
-    def numbers(self, kind: str, *values: float) -> None:
-        """Numbers of one kind of `struct`, aligned to their size from behind the first four bytes."""
-        size = struct.calcsize(kind)
-        self.data += bytes(-(len(self.data) - 4) % size)
-        self.data += struct.pack(f"<{len(values)}{kind}", *values)
-
-    def text(self, text: str) -> None:
-        written = text.encode() + b"\x00"
-        self.numbers("I", len(written))
-        self.data += written
-
-    def header(self, stamp: int, frame: str) -> None:
-        seconds, nanoseconds = divmod(stamp, 10**9)
-        self.numbers("i", seconds)
-        self.numbers("I", nanoseconds)
-        self.text(frame)
-
-    def sequence(self, values: Array) -> None:
-        self.numbers("I", len(values))
-        if len(values):
-            self.numbers("d", *values.tolist())
-
-
-def _joint_state(stamp: int, names: tuple[str, ...], joints: Array, rates: Array) -> bytes:
-    message = _Message()
-    message.header(stamp, "")
-    message.numbers("I", len(names))
-    for name in names:
-        message.text(name)
-    for values in (joints, rates, np.zeros(0)):
-        message.sequence(values)
-    return bytes(message.data)
-
-
-def _path(stamps: list[int], poses: Array, frame: str) -> bytes:
-    message = _Message()
-    message.header(0, frame)
-    message.numbers("I", len(stamps))
-    for stamp, (x, y, z, w, i, j, k) in zip(stamps, poses.tolist(), strict=True):
-        message.header(stamp, frame)
-        message.numbers("d", x, y, z, i, j, k, w)
-    return bytes(message.data)
+def _header(stamp: int, frame: str) -> dict[str, Any]:
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
 
 # ---- reading -----------------------------------------------------------------------------------------------------
@@ -158,22 +119,25 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
         topic: Its name; None: the only one of these kinds, or `/joint_states`.
 
     Raises:
-        ProblemError: No such file, no log, no such topic, or the package `mcap` is not installed.
+        ProblemError: No such file, no log, no such topic, or mcap-ros2-support is not installed.
     """
     try:
         from mcap.records import Channel, Message, Schema
+        from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
-        words = "MCAP is read by the package mcap: pip install 'selfmotion[mcap]'"
+        words = "MCAP is read by the package mcap-ros2-support: pip install 'selfmotion[mcap]'"
         raise ProblemError(words, name="mcap") from error
     found: dict[str, list[tuple[int, int, Any]]] = {}
-    schemas: dict[int, Any] = {}
+    decoders, schemas = DecoderFactory(), dict[int, Any]()
     channels: dict[int, tuple[str, Any]] = {}  # topics, and how their messages are read
     size = 0
     try:
         with open_regular(file, LARGEST_LOG) as stream:
             for record in _records(stream):
                 if isinstance(record, Schema):
-                    schemas[record.id] = READERS.get(record.name)
+                    if record.name in (STATE, TRAJECTORY):
+                        own = Schema(record.id, DEFINITIONS[record.name].encode(), "ros2msg", record.name)
+                        schemas[record.id] = decoders.decoder_for("cdr", own)
                 elif isinstance(record, Channel) and record.message_encoding == "cdr":
                     channels[record.id] = record.topic, schemas.get(record.schema_id)
                 elif isinstance(record, Message):
@@ -182,8 +146,9 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
                         size += len(record.data)
                         if size > MOST_OF_JOINTS:
                             raise ValueError(f"its messages of joints have more than {MOST_OF_JOINTS} bytes; split it")
-                        told = read(_Cursor(record.data))
-                        stamp = told.pop("stamp") or record.log_time
+                        told = _fields(read(record.data))
+                        stamp = told["header"]["stamp"]["sec"] * 10**9 + told["header"]["stamp"]["nanosec"]
+                        stamp = stamp or record.log_time
                         found.setdefault(name, []).append((record.log_time, stamp, told))
     except OSError as error:
         raise ProblemError(f"{file}: cannot be read: {error.strerror}", name="file", value=str(file)) from error
@@ -236,62 +201,10 @@ def _unpacked(chunk: Any) -> bytes:
     return bytes(data)
 
 
-class _Cursor:
-    """A place in a message of CDR."""
-
-    def __init__(self, data: bytes) -> None:
-        if len(data) < 4 or data[1] not in (0, 1):
-            raise ValueError("a message is no plain CDR")
-        self.order = "<" if data[1] else ">"
-        self.data, self.place = memoryview(data)[4:], 0
-
-    def numbers(self, kind: str, count: int = 1) -> tuple[Any, ...]:
-        size = struct.calcsize(kind)
-        self.place += -self.place % size
-        if count < 0 or self.place + count * size > len(self.data):
-            raise ValueError("a message ends too early")
-        values = struct.unpack_from(f"{self.order}{count}{kind}", self.data, self.place)
-        self.place += count * size
-        return values
-
-    def text(self) -> str:
-        (count,) = self.numbers("I")
-        return bytes(self.numbers("B", count)).rstrip(b"\0").decode()
-
-    def texts(self) -> list[str]:
-        (count,) = self.numbers("I")
-        if count > len(self.data):
-            raise ValueError("a message ends too early")
-        return [self.text() for _ in range(count)]
-
-    def sequence(self) -> list[float]:
-        (count,) = self.numbers("I")
-        return list(self.numbers("d", count)) if count else []
-
-    def stamp(self) -> int:
-        (seconds,), (nanoseconds,) = self.numbers("i"), self.numbers("I")
-        self.text()
-        return int(seconds * 10**9 + nanoseconds)
-
-
-def _read_state(cursor: _Cursor) -> dict[str, Any]:
-    told: dict[str, Any] = {"stamp": cursor.stamp(), "name": cursor.texts()}
-    for word in ("position", "velocity", "effort"):
-        told[word] = cursor.sequence()
-    return told
-
-
-def _read_trajectory(cursor: _Cursor) -> dict[str, Any]:
-    told: dict[str, Any] = {"stamp": cursor.stamp(), "joint_names": cursor.texts(), "points": []}
-    (count,) = cursor.numbers("I")
-    for _ in range(count):
-        point: dict[str, Any] = {
-            word: cursor.sequence() for word in ("positions", "velocities", "accelerations", "effort")
-        }
-        (seconds,), (nanoseconds,) = cursor.numbers("i"), cursor.numbers("I")
-        point["time_from_start"] = {"sec": seconds, "nanosec": nanoseconds}
-        told["points"].append(point)
-    return told
-
-
-READERS = {"sensor_msgs/msg/JointState": _read_state, "trajectory_msgs/msg/JointTrajectory": _read_trajectory}
+def _fields(message: Any) -> Any:
+    """A message, or a list of them, as names and values."""
+    if isinstance(message, list):
+        return [_fields(each) for each in message] if message and hasattr(message[0], "__slots__") else message
+    if not hasattr(message, "__slots__"):
+        return message
+    return {name: _fields(getattr(message, name)) for name in message.__slots__}

@@ -34,14 +34,15 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 import yaml
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
+from mcap_ros2.writer import Writer
 
 from models import Box, FixedBase, ModelError, Moving, Robot, Sphere, planar_chain
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Solution, SolveError, TipTask, plan, solve
 from ocp.files import read_gcode, read_trajectory, read_waypoints
-from ocp.files.mcap import _joint_state
+from ocp.files.mcap import DEFINITIONS, STATE
 from ocp.files.obstacles import read_obstacles
 from ocp.files.task_file import read_task
 from ocp.schedule import JointTrajectory
@@ -375,14 +376,12 @@ def sampled() -> bytes:
 
 def log(packed: CompressionType) -> bytes:
     stream = io.BytesIO()
-    writer: Any = Writer(stream, compression=packed, chunk_size=1000)
-    writer.start("ros2")
-    name = "sensor_msgs/msg/JointState"
-    channel = writer.register_channel("/joint_states", "cdr", writer.register_schema(name, "ros2msg", b""))
-    for stamp, q, v in zip(
-        (motion().t * 1e9).astype(int).tolist(), motion().positions, motion().velocities, strict=True
-    ):
-        writer.add_message(channel, stamp, _joint_state(stamp, NAMES, q, v), stamp)
+    writer: Any = Writer(stream, chunk_size=1000, compression=packed)
+    schema = writer.register_msgdef(STATE, DEFINITIONS[STATE])
+    for t, q, v in zip(motion().t, motion().positions.tolist(), motion().velocities.tolist(), strict=True):
+        header = {"stamp": {"sec": int(t), "nanosec": int(t % 1 * 1e9)}, "frame_id": ""}
+        state = {"header": header, "name": list(NAMES), "position": q, "velocity": v, "effort": []}
+        writer.write_message("/joint_states", schema, state, int(t * 1e9))
     writer.finish()
     return stream.getvalue()
 
