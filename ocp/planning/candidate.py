@@ -152,14 +152,14 @@ class Candidate:
         return f"<Candidate from {start}: cost {self.cost:.6g}, {self.reason or 'the plan'}>"
 
     @classmethod
-    def of_record(cls, start: Any, cost: Any, reason: Any, solution: Solution) -> Candidate:
+    def of_record(cls, start: Any, cost: Any, stage: Any, reason: Any, solution: Solution) -> Candidate:
         """A candidate of a plan that a file holds, whose motion is the solution unless it was rejected.
 
         Raises:
             KeyError, TypeError, ValueError: What the file says is damaged.
         """
         why = None if reason is None else Reason.of_record(reason)
-        return cls(np.array(start, dtype=float), float(cost), why, solution=solution if why is None else None)
+        return cls(np.array(start, dtype=float), float(cost), why, Stage(stage), solution if why is None else None)
 
     @property
     def passed(self) -> bool:
@@ -168,7 +168,7 @@ class Candidate:
 
     def rejected(self, reason: Reason) -> Candidate:
         """The same with the reason why it is not the plan; where bodies were separated for that they collided first."""
-        if self.separated is not None and reason.kind is not Rejection.COSTLIER:
+        if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, then=f"held apart: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 

@@ -75,8 +75,9 @@ class CandidateSolver(Solver):
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             self.error = error
+            kind = Rejection.ACTUATORS if candidate.stage is Stage.AUDITED else Rejection.INFEASIBLE
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
-            return [failed.rejected(Reason.of_error(Rejection.INFEASIBLE, error))]
+            return [failed.rejected(Reason.of_error(kind, error))]
         return [found, *self._freed(found)]
 
     # ---- stages ----------------------------------------------------------------------------------------------------
@@ -129,13 +130,10 @@ class CandidateSolver(Solver):
             if other.passed and again.cost <= solution.cost * (1 + self.settings.same_cost) + slack:
                 solution, audit = again, other
         candidate = replace(candidate, cost=solution.cost, solution=solution)
-        near = max(
-            (each for proof in audit.clearances.values() for each in proof.pairs),
-            key=attrgetter("missed"),
-            default=None,
-        )
+        proofs = list(audit.clearances.values())
+        near = max((pair for proof in proofs for pair in proof.pairs), key=attrgetter("missed"), default=None)
         if clear is not None and near is not None and near.missed > 0:
-            wider = replace(candidate, clear=clear.widened(list(audit.clearances.values())))
+            wider = replace(candidate, clear=clear.widened(proofs))
             return self._again(wider, Stage.FINE, self._collision(near))
         if audit.passed:
             return replace(candidate, stage=Stage.AUDITED)
@@ -147,25 +145,12 @@ class CandidateSolver(Solver):
 
     def _limit(self, candidate: Candidate) -> Candidate:
         """Solve a candidate again within the limits of actuators."""
-        moved = self.plan([candidate])
-        try:
-            solution = within_actuator_limits(self.request, self.start, self.reference, moved)
-        except SolveError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise
-            self.error = error
-            reason = replace(Reason.of_error(Rejection.ACTUATORS, error), name=str(error.name))
-            return replace(candidate, cost=np.nan).rejected(reason)
+        solution = within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution)
 
     def _freed(self, found: Candidate) -> list[Candidate]:
         """What passed with a fixed start, to be solved again with its start free."""
-        if (
-            not found.seed.fixed
-            or not found.passed
-            or found.stage is not Stage.AUDITED
-            or self.request.start is not None
-        ):
+        if not (found.seed.fixed and found.passed and found.stage is Stage.AUDITED):
             return []
         clear = self.request.clear
         if clear is not None:

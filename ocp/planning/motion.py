@@ -319,7 +319,9 @@ class Plan:
                 "request": request,
                 "parts": self.parts,
                 "bound": self.bound,
-                "candidates": [[c.start.tolist(), c.cost, c.reason and c.reason.record()] for c in self.candidates],
+                "candidates": [
+                    [c.start.tolist(), c.cost, int(c.stage), c.reason and c.reason.record()] for c in self.candidates
+                ],
                 "targets": [np.column_stack([o.t, o.position, o.rotation.reshape(-1, 9)]) for o in self.targets],
             }
         )
@@ -349,7 +351,8 @@ class Plan:
                 solution = solution.tied_to(request.problem())
             parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in told["parts"])
             candidates = tuple(
-                Candidate.of_record(start, cost, reason, solution) for start, cost, reason in told["candidates"]
+                Candidate.of_record(start, cost, stage, reason, solution)
+                for start, cost, stage, reason in told["candidates"]
             )
             bound = None if told["bound"] is None else float(told["bound"])
             targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in told["targets"])

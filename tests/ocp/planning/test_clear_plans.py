@@ -277,7 +277,12 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
     collisions = [reason for reason in reasons if reason.kind is Rejection.COLLISION]
     assert collisions
     assert all(" overlap by " in str(reason) and " s" in str(reason) for reason in collisions)
-    assert all(reason.value < reason.limit and 0 <= reason.time <= result.horizon for reason in collisions)
+    for reason in collisions:
+        assert reason.value is not None
+        assert reason.limit is not None
+        assert reason.time is not None
+        assert reason.value < reason.limit
+        assert 0 <= reason.time <= result.horizon
     for one in result.candidates:
         if one.solution is not None and (one.reason is None or one.reason.kind is not Rejection.COLLISION):
             at = one.solution.at_fraction(np.linspace(0, 1, 2001))

@@ -16,7 +16,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, planar_chain, rectangle
 from ocp import ProblemError, Solution
-from ocp.planning import Plan
+from ocp.planning import Candidate, Plan, Reason, Rejection
 from ocp.planning.request import restored_request, stored_request
 from ocp.problem.stored import packed, unpacked
 from ocp.schedule import JointTrajectory
@@ -59,12 +59,16 @@ def test_a_plan_is_read_as_it_was_written(saved: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[name], found[name])
     np.testing.assert_array_equal(again.t, found.t)
     assert (again.horizon, again.bound, again.parts) == (found.horizon, found.bound, found.parts)
-    assert [repr((c.cost, c.reason)) for c in again.candidates] == [repr((c.cost, c.reason)) for c in found.candidates]
+    assert [told_of(each) for each in again.candidates] == [told_of(each) for each in found.candidates]
     np.testing.assert_array_equal(again.candidates[0].start, found.candidates[0].start)
     assert again.candidates[0].solution is again.solution
     assert str(again) == str(found)
     again.save(tmp_path / "again.npz")
     assert Plan.load(tmp_path / "again.npz").cost == found.cost
+
+
+def told_of(candidate: Candidate) -> str:
+    return repr((candidate.cost, candidate.stage, candidate.reason))
 
 
 def edited(saved: Path, tmp_path: Path, edit: Callable[[Arrays], Arrays]) -> Path:
@@ -145,7 +149,15 @@ DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
     "a part that never ends": told(lambda record: {**record, "parts": [[0.0, math.nan, ""]]}),
     "parts apart": told(lambda record: {**record, "parts": [[0.0, 5.0, ""], [6.0, 7.0, ""]]}),
     "another horizon": told(lambda record: {**record, "parts": [[0.0, 2 * record["parts"][0][1], ""]]}),
-    "a candidate of words": told(lambda record: {**record, "candidates": ["abc"]}),
+    "a candidate of words": told(lambda record: {**record, "candidates": ["abcd"]}),
+    "a candidate of another stage": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 99, None]]}),
+    "a candidate of an unknown reason": told(
+        lambda record: {
+            **record,
+            "candidates": [[[0.0], 1.0, 3, {**Reason(Rejection.AUDIT).record(), "kind": "os.system"}]],
+        }
+    ),
+    "a candidate of half a reason": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 3, {"kind": "AUDIT"}]]}),
     "a bound of words": told(lambda record: {**record, "bound": "low"}),
     "a machine of words": told(lambda record: having(record, "UR5")),
     "a machine of another kind": told(lambda record: having(record, {**machine_in(record), "kind": "Rig"})),
