@@ -11,6 +11,7 @@ import pytest
 from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain
 from models.spatial import rotation
 from ocp import Collocation, SolveError, TipTask, Unreachable, plan_minimum_velocity, resolve
+from ocp.local.floating_reach import check_floating_reach
 from ocp.local.inverse_kinematics import check_reach
 from tests.models.robot.trees import seven_joint_arm
 
@@ -91,3 +92,34 @@ def test_of_what_depends_on_the_way_or_on_a_floating_base_nothing_is_said() -> N
         check_reach(arm(), [task], START, 3.0, True, START)
     floating = FreeFloating(seven_joint_arm())
     check_reach(floating, [TipTask(position=(50.0, 0.0, 0.0))], np.zeros(7), 3.0, True, np.zeros(7))
+
+
+def test_velocities_are_summed_up_only_along_axes_in_which_the_place_is_told() -> None:
+    """Along the axes of the link that it is relative to a steady velocity leads out of reach; along the world's it
+    need not, since the link may turn: the tip then goes round in a circle.
+    """
+    asked: dict[str, Any] = {"velocity": (0.4, 0.0), "rows": (3, 4), "relative_to": "link1"}
+    check_reach(arm(), [TipTask(axes="world", **asked)], START, 10.0, True, START)
+    with pytest.raises(Unreachable):
+        check_reach(arm(), [TipTask(axes="reference", **asked)], START, 10.0, True, START)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_floating_arm_reaches_as_far_as_its_centre_of_mass_allows(share: float) -> None:
+    """A base of 2 kg, its joint 0.3 m off; a rod of 1 kg, 0.6 m long: stretched, the centre of all is 0.2 m from the
+    base's and 0.7 m from the tip, in whichever direction.
+    """
+    base = Link("base", 2.0, inertia=0.02 * np.eye(3))
+    rod = Link("rod", 1.0, (0.3, 0.0, 0.0), np.diag([1e-4, 0.03, 0.03]))
+    joint = Joint("turn", "revolute", "base", "rod", (0.3, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    machine = FreeFloating(Robot((base, rod), (joint,), tip_translation=(0.6, 0.0, 0.0)))
+    home = np.asarray(machine.base_home(), dtype=float)
+    centre = (2.0 * np.zeros(3) + np.array([0.3 + 0.3 * np.cos(1.0), 0.3 * np.sin(1.0), 0.0])) / 3
+    task = TipTask(position=centre + share * 0.7 * np.array([0.0, 0.6, 0.8]))
+    bounds: dict[str, Any] = {"lower": np.array([-np.pi]), "upper": np.array([np.pi])}
+    if share < 1:
+        check_floating_reach(machine, [task], home, np.array([1.0]), 0.0, 1.0, **bounds)
+        return
+    with pytest.raises(Unreachable) as caught:
+        check_floating_reach(machine, [task], home, np.array([1.0]), 0.0, 1.0, **bounds)
+    assert 0.07 / np.sqrt(3) <= caught.value.misfit <= 0.07  # the largest entry of a miss of 0.07 m
