@@ -157,7 +157,7 @@ def torque_rows(
     check()
     found = sampler(*values)[0]
     mean = motion.q.mean(axis=0)
-    weight = np.abs(np.array(ca.Function("m", [q, a], [ca.jacobian(torque, a)])(mean, 0 * mean)))
+    weight = np.abs(np.array(ca.Function("inertia", [q], [ca.jacobian(torque, a)])(mean)))  # torques are linear in them
     blurred = motion.along("acceleration")
     blur = weight @ (np.zeros(n) if blurred is None else np.median(np.asarray(blurred.blur), axis=0))
     rows, faults = [], []

@@ -137,5 +137,4 @@ class _Looks:
         if self._turns == 1:
             place = center - ca.mtimes(rotation((0, 0, 1), turn), center_of_mass(robot, joints))
             return ca.vertcat(place[:2], turn)
-        unit = turn / ca.norm_2(turn)
-        return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(unit), center_of_mass(robot, joints)), unit)
+        return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(turn), center_of_mass(robot, joints)), turn)

@@ -26,9 +26,23 @@ def is_supported(case: Case, run: Run) -> bool:
 
 
 RUNS = [(c, r, f"{c.name}: {r}") for c in CASES for r in c.runs if is_supported(c, r)]
+
+
+def first(case: Case) -> Run:
+    """The run of a case that is solved in every run of the tests."""
+    return next(run for known, run, _ in RUNS if known is case)
+
+
 every_run = pytest.mark.parametrize(
     ("case", "run"),
-    [pytest.param(c, r, id=name, marks=pytest.mark.xdist_group(f"fatrop {name}")) for c, r, name in RUNS],
+    [
+        pytest.param(
+            *(c, r),
+            id=name,
+            marks=[pytest.mark.xdist_group(f"fatrop {name}"), *([] if r is first(c) else [pytest.mark.long])],
+        )
+        for c, r, name in RUNS
+    ],
 )
 
 

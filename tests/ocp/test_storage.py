@@ -10,7 +10,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -183,13 +182,11 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
 # ---- reading -----------------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.npz").mkdir()
-    began = time.monotonic()
     for path in (tmp_path / "pipe.npz", tmp_path / "folder.npz", Path("/dev/zero"), Path("/dev/null")):
         refused(path, "is no file, but a folder, a pipe or a device")
-    assert time.monotonic() - began < 1.0
     with pytest.raises(FileNotFoundError):
         Solution.load(tmp_path / "absent.npz")
     for wrong in (None, 3, "a\0b", ["a"]):

@@ -15,6 +15,7 @@ from models.cts.rig import BRANCHES, HOME, INCH, Branch, forward
 from models.cts.roll import ACTIVE, STATUS
 from models.cts.table import all_joint_sets, reachable_rolls
 from models.cts.trigonometric import Harmonics, least_point, roots, series_roots
+from tests.families import some
 from tests.models.cts.cts_oracle import Array, grid_minimum, index_by_geometry, joints_by_geometry, random_targets
 
 LIMITS: dict[str, Any] = {"lower": (0.2, -3.0, -2.0, -1.2, 0.3, -2.0), "upper": (1.6, -0.2, 2.2, 1.1, 2.6, 2.5)}
@@ -62,9 +63,10 @@ def test_reference_rolls(z: float) -> None:
     assert (int(active), int(status)) == (0, 0)
 
 
-def test_no_target_of_1e5_misses_the_global_minimum_of_i1() -> None:
+@pytest.mark.parametrize("count", some([10_000, 100_000], [10_000]))
+def test_no_target_misses_the_global_minimum_of_i1(count: int) -> None:
     rng = np.random.default_rng(5)
-    targets, previous = random_targets(rng, 100_000), np.zeros(100_000)
+    targets, previous = random_targets(rng, count), np.zeros(count)
     active, status = check_against_grid(RIG, TUNNEL, HOME, targets, previous, 120)
     names = {ACTIVE[code] for code in np.unique(active)}
     assert names == {"free", "pitch reach", "yaw reach"}
@@ -72,15 +74,16 @@ def test_no_target_of_1e5_misses_the_global_minimum_of_i1() -> None:
     assert 0.1 < np.mean(active != 0) < 0.5  # the free optimum is often out of reach
 
 
+@pytest.mark.parametrize("count", some([1000, 10_000], [1000]))
 @pytest.mark.parametrize("rate_weight", [0.05, 0.5, 5.0])
-def test_no_target_of_1e4_misses_the_global_minimum_of_i2(rate_weight: float) -> None:
+def test_no_target_misses_the_global_minimum_of_i2(rate_weight: float, count: int) -> None:
     rng = np.random.default_rng(int(100 * rate_weight))
-    targets, previous = random_targets(rng, 10_000), rng.uniform(-4, 4, 10_000)
+    targets, previous = random_targets(rng, count), rng.uniform(-4, 4, count)
     check_against_grid(RIG, TUNNEL, HOME, targets, previous, 240, rate_weight)
 
 
 @pytest.mark.parametrize("limits", [LIMITS, WIDE])
-@pytest.mark.parametrize("rate_weight", [0.0, 0.3, 5.0])
+@pytest.mark.parametrize("rate_weight", some([0.0, 0.3, 5.0], [0.0, 0.3]))
 def test_joint_limits_hold_and_no_better_roll_is_within_them(limits: dict[str, Any], rate_weight: float) -> None:
     rng = np.random.default_rng(8)
     targets, previous = random_targets(rng, 4000), rng.uniform(-2, 2, 4000)
@@ -90,7 +93,7 @@ def test_joint_limits_hold_and_no_better_roll_is_within_them(limits: dict[str, A
         assert {f"joint {k}" for k in (1, 2, 3, 5, 6)} <= {ACTIVE[code][:7] for code in active}
 
 
-@settings(max_examples=20)  # each builds a search of its own
+@settings(max_examples=8)  # each builds a search of its own
 @given(st.lists(st.floats(0.05, 2.0), min_size=6, max_size=6), seeds, st.sampled_from(BRANCHES))
 def test_other_rigs_tunnels_and_branches(sizes: list[float], seed: int, branch: Branch) -> None:
     rng = np.random.default_rng(seed)
@@ -115,7 +118,7 @@ def test_other_rigs_tunnels_and_branches(sizes: list[float], seed: int, branch: 
         (0.0, {}),
     ],
 )
-@pytest.mark.parametrize("branch", [Branch(-1, -1), Branch(1, 1)])
+@pytest.mark.parametrize("branch", some([Branch(-1, -1), Branch(1, 1)], 1))
 def test_several_arcs_and_special_yaws(yaw: float | None, limits: dict[str, Any], branch: Branch) -> None:
     """Limits that leave out a window, so that arcs end and begin again; equations with double roots."""
     rng = np.random.default_rng(12)

@@ -63,6 +63,23 @@ def test_whole_turns_keep_joint_limits_where_they_can() -> None:
     assert np.sin((q[0] + q[1] + q[3] - 0.3) / 2) == pytest.approx(0, abs=1e-14)
 
 
+@given(seeds, st.integers(0, 3))
+def test_the_turn_is_the_smallest_that_brings_a_range_within_its_limits_and_none_for_the_quill(
+    seed: int, joint: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-8, 4, 4)
+    high = low + rng.uniform(0, 8, 4)
+    arm = Scara(0.4, 0.4, lower=low, upper=high)
+    least = float(rng.uniform(-20, 20))
+    most = least + float(rng.uniform(0, 4))
+    quill = arm.robot.moving_joints[joint].kind == "prismatic"
+    turns = [0.0] if quill else sorted((2 * np.pi * k for k in range(-9, 10)), key=abs)
+    held = [turn for turn in turns if low[joint] <= least + turn and most + turn <= high[joint]]
+    found = arm.whole_turn(joint, least, most)
+    assert found == (pytest.approx(held[0], abs=1e-12) if held else None)
+
+
 @settings(max_examples=40)
 @given(seeds)
 def test_rates_along_a_path_are_differences_and_follow_the_tools_twist(seed: int) -> None:

@@ -523,3 +523,11 @@ def test_a_joint_whose_limits_are_equal_but_for_the_sign_of_zero_is_no_error() -
     low, high = np.full(robot.dof, -3.0), np.full(robot.dof, 3.0)
     low[0], high[0] = 0.0, -0.0
     assert checked_pairs(robot, bodies, lower=low, upper=high).checked == ((0, 3), (1, 3))
+
+
+def test_the_bound_is_exact_where_a_ball_lies_off_a_corner() -> None:
+    """On the diagonal of a cube of 0.2 m, 0.4 m from its middle; neither is at the origin of its frame."""
+    diagonal, middle = np.ones(3) / np.sqrt(3), np.array([0.3, -0.2, 0.5])
+    box, ball = Box((0.2, 0.2, 0.2), middle), Sphere(0.05, (0.0, 0.7, 0.0))
+    turn, shift = np.eye(3)[None], (middle + 0.4 * diagonal - [0.0, 0.7, 0.0])[None]
+    assert _bound(box, ball)(turn, shift) == pytest.approx([0.4 - 0.1 * np.sqrt(3) - 0.05], abs=1e-12)

@@ -18,6 +18,7 @@ from scipy.optimize import linprog
 
 from ocp import MultipleShooting, Problem, Solution, solve
 from ocp.curves import PiecewisePolynomial
+from tests.families import some
 from tests.ocp.audit.test_duality import fitted, lost, without_costates
 from tests.ocp.problems import Array
 
@@ -106,7 +107,10 @@ class Linear:
 
 
 KINDS = ("own", "soft", "another")
-every_program = pytest.mark.parametrize(("seed", "ends"), [(s, ends) for s in range(3) for ends in ("free", "fixed")])
+every_program = pytest.mark.parametrize(
+    ("seed", "ends"),
+    [pytest.param(s, ends, marks=pytest.mark.long if s else ()) for s in range(3) for ends in ("free", "fixed")],
+)
 
 
 @every_program
@@ -137,7 +141,7 @@ def test_units_and_the_order_of_declaration_change_nothing(seed: int, ends: str,
     assert other == pytest.approx(one, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", some(range(3), 1))
 def test_a_film_played_backwards_loses_as_much(seed: int) -> None:
     """From the end to the start: x' = -(A x + B u), the same controls at the time that is left."""
     there = Linear.drawn(seed, "fixed")

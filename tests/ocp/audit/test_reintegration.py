@@ -263,7 +263,7 @@ def test_the_middle_of_an_obstacle_is_as_bad_however_its_distance_is_written(
 # ---- how long it takes -----------------------------------------------------------------------------------------------
 
 
-def test_the_time_grows_no_faster_than_the_intervals() -> None:
+def test_the_time_grows_with_the_intervals_and_not_with_their_square() -> None:
     seconds = []
     for intervals in (100, 400):
         plan = solve(van_der_pol(), Collocation(intervals))
@@ -274,4 +274,4 @@ def test_the_time_grows_no_faster_than_the_intervals() -> None:
             again(van_der_pol(), plan)
             tries.append(process_time() - began)
         seconds.append(min(tries))
-    assert seconds[1] < 1.2 * 4 * seconds[0]
+    assert seconds[1] < 8 * seconds[0]

@@ -5,14 +5,15 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from models import FixedBase, FreeFloating, Link, planar_chain
-from ocp import ProblemError, TipTask
-from ocp.builders.tool_motion import stretches_of
+from ocp import Collocation, Limits, ProblemError, TipTask, solve
+from ocp.builders.tool_motion import stretches_of, tool_motion_problem
 from ocp.tasks.checks import ignorable_joints
 from ocp.tasks.equations import bind
 from tests.ocp.tasks.space_tasks import floating_panda, panda, ur5
@@ -116,3 +117,38 @@ def test_no_joint_of_a_floating_arm_is_ignorable_that_moves_the_base() -> None:
     """The roll of the last joint turns the base, too; a chain's tip in world depends on every joint."""
     assert joints_of(floating_panda(), TipTask(position=PLACE, direction=DOWN)) == []
     assert joints_of(FLOATING, TipTask(velocity=[0.1, 0.2], rows=(3, 4))) == []
+
+
+# ---- tasks held by accelerations -------------------------------------------------------------------------------------
+
+
+def test_accelerations_hold_a_velocity_that_changes_in_each_stretch_of_the_time() -> None:
+    """Two stretches of unequal length, so that the time of the problem is not that of the tasks."""
+    machine = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
+
+    def velocity(begin: float) -> Any:
+        return lambda time: ca.vertcat(-0.3 * ca.sin(2 * (begin + time)), 0.1 * (begin + time))
+
+    tasks = [
+        TipTask(velocity=velocity(0.0), rows=(3, 4), duration=0.5),
+        TipTask(velocity=velocity(0.5), rows=(3, 4), begin=0.5, duration=1.0),
+    ]
+    motion = tool_motion_problem(
+        machine,
+        stretches_of(machine, tasks, 1.5),
+        base=np.zeros(0),
+        start=np.array([0.4, 0.9]),
+        reference=np.array([0.4, 0.9]),
+        cyclic=False,
+        weights=np.ones(2),
+        bounds=Limits(acceleration=50.0).bounds(machine),
+        driven=True,
+    )
+    found = solve(motion.problem, Collocation(8), options={"max_iter": 60})
+    for stretch in motion.stretches:
+        fractions = np.linspace(0.0, 1.0, 9)
+        sample, t = found.at_fraction(fractions), stretch.begin + fractions * stretch.duration
+        joints, rates = sample[f"joints{stretch.suffix}"], sample[f"velocities{stretch.suffix}"]
+        twists = [np.array(ca.DM(machine.tip_jacobian((), q))) @ w for q, w in zip(joints, rates, strict=True)]
+        wanted = np.column_stack([-0.3 * np.sin(2 * t), 0.1 * t])
+        np.testing.assert_allclose(np.array(twists)[:, 3:5], wanted, atol=1e-6)

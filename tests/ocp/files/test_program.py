@@ -87,6 +87,17 @@ def test_the_position_is_the_integral_of_the_speed_along_the_tangent(timed: Time
     assert np.median(np.linalg.norm(difference - expected, axis=1)) < 1e-6
 
 
+def test_a_time_may_be_beyond_the_end_by_rounding_of_its_own_size_and_no_more(program: Program) -> None:
+    slow = program.schedule(LineLimits(1e-4, 2.0, 100.0, 1.0), rapid=1e-4)
+    end = slow.duration
+    assert end > 100.0
+    np.testing.assert_array_equal(slow.at(end * (1 + 9e-10)).position, slow.at(end).position)
+    np.testing.assert_array_equal(slow.at(-9e-10 * end).position, slow.at(0.0).position)
+    for beyond in (end * (1 + 2e-9), -2e-9 * end):
+        with pytest.raises(ProblemError, match="within the program"):
+            slow.at(beyond)
+
+
 def test_no_feed_and_no_limit_is_exceeded(program: Program, timed: TimedProgram) -> None:
     motion = timed.at(np.linspace(0, timed.duration, 20_001))
     for i, stretch in enumerate(program.stretches):

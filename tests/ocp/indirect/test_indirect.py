@@ -26,6 +26,7 @@ from ocp import (
 )
 from ocp.problem.formulation import Formulation
 from scripts.papers.free_floating import formulations
+from tests.families import some
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.indirect.extremals import EXTREMA
 from tests.ocp.problems import Array, energy, plant
@@ -174,7 +175,7 @@ ARM_START = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
     [(FixedBase(seven_joint_arm()), 1.5, 8), (FreeFloating(seven_joint_arm(), base="spatial"), 0.5, 2)],
     ids=["fixed", "floating"],
 )
-@pytest.mark.parametrize("shooting", SHOOTINGS)
+@pytest.mark.parametrize("shooting", some(SHOOTINGS, ["multiple"]))
 def test_spatial_arms_agree_with_collocation(machine: Machine, horizon: float, segments: int, shooting: str) -> None:
     problem = minimum_velocity_problem(
         machine,

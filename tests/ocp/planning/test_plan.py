@@ -14,6 +14,7 @@ from models import FixedBase, Path, smooth
 from ocp import Limits, TipTask
 from ocp.planning import Plan
 from ocp.schedule import LineLimits, schedule
+from tests.families import some
 from tests.models.robot.trees import Array
 from tests.ocp.planning.motions import (
     ASKED,
@@ -32,7 +33,11 @@ from tests.ocp.tasks.space_tasks import panda
 
 CLOSE = 1e-6
 """m and rad."""
-EACH = [pytest.param(name, marks=pytest.mark.xdist_group(f"plan {name}")) for name in ASKED]
+DAILY = (
+    *("three_lanes_panda", "seam_ur5", "seam_panda", "contour_panda", "contour_ur5", "contour_space_arm"),
+    *("poses_ur5", "finishing_ur5", "two_arms", "helix_ur5", "poses_panda"),
+)
+EACH = some([pytest.param(name, marks=pytest.mark.xdist_group(f"plan {name}"), id=name) for name in ASKED], DAILY)
 """One process for each motion, so that it is planned once."""
 every_motion = pytest.mark.parametrize("name", EACH)
 
@@ -198,7 +203,10 @@ def test_what_leaves_more_freedom_is_never_dearer() -> None:
 
 
 @pytest.mark.parametrize(
-    "robot", [pytest.param(one, marks=pytest.mark.xdist_group(f"plan finishing_{one}")) for one in ("panda", "ur5")]
+    "robot",
+    some(
+        [pytest.param(one, marks=pytest.mark.xdist_group(f"plan finishing_{one}")) for one in ("panda", "ur5")], ["ur5"]
+    ),
 )
 def test_a_cone_is_cheaper_than_the_axis_held_and_is_used_to_its_edge(robot: str) -> None:
     cone, name = planned(f"finishing_{robot}"), {"panda": "three_lanes_panda"}.get(robot)

@@ -226,6 +226,15 @@ def test_a_trajectory_starts_and_ends_at_rest(sampled: JointTrajectory) -> None:
     assert np.diff(sampled.t)[:-1] == pytest.approx(1e-3, abs=2e-9)
 
 
+def test_a_trajectory_is_as_long_as_its_schedule_to_a_nanosecond(sampled: JointTrajectory) -> None:
+    arm = example_arm()
+    plan = schedule(arm.path, replace(FREE, joints=SLOW), joints=arm)
+    assert 0 <= sampled.t[-1] - plan.duration < 1.001e-9
+    assert np.abs(sampled.t * 1e9 - np.round(sampled.t * 1e9)).max() < 1e-3
+    expected, *_ = joint_motion(arm, plan.at(np.minimum(sampled.t, plan.duration)))
+    np.testing.assert_allclose(sampled.positions, expected, atol=1e-14)
+
+
 def test_csv_and_message_give_back_every_bit(sampled: JointTrajectory, tmp_path: File) -> None:
     file = tmp_path / "trajectory.csv"
     sampled.write_csv(file)
