@@ -42,7 +42,7 @@ def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, meth
     for kind, index in (("x", fragment.variable_bounds), ("g", fragment.row_bounds)):
         arguments |= {f"lb{kind}": low[index], f"ub{kind}": high[index]}
     rows = np.asarray(prepared.program.values(plan.variables, p)[1].full()).ravel()
-    outcome = Outcome(plan.variables, plan.cost, rows, plan.multipliers, True, "", 0, 0.0)
+    outcome = Outcome(plan.variables, plan.cost, rows, plan.multipliers, plan.status, "", 0, 0.0)
     at = conditions(prepared.program, outcome, arguments, unscaled(fragment))
     for value, push, lower, upper in (
         (plan.variables, at.of_bounds, arguments["lbx"], arguments["ubx"]),
