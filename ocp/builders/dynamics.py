@@ -368,7 +368,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, given: Any) 
 
 def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
     """Hold the tips to their tasks by their accelerations, and watch where they are."""
-    base, joints, rates, second, _, base_rate = motion
+    base, joints, rates, second, *_ = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)
     check_length(equations, ends.base, duration)
@@ -377,7 +377,7 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
     if not ends.rests[0]:
         residual = equations.residual(base, joints, rates, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, problem.time, base_rate=base_rate)
+    gap = equations.acceleration(base, joints, rates, second, problem.time)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, stray in equations.strays(base, joints, rates, targets).items():
         problem.watch(name, **stray)

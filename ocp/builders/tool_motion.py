@@ -30,15 +30,12 @@ from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.geometry import is_holonomic
 from ocp.tasks.limits import JointBounds
 from ocp.tasks.tip_task import TipTask
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names where the time is free: of the time as a state, of the derivatives of joints and time by the tasks' own."""
-SAME_TIME = 1e-9
-"""Share of the horizon: times nearer to each other are one."""
-DEPENDENT = 1e-9
-"""Relative size of what is left of a row that is a combination of others."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
     Raises:
         ProblemError: A task that begins or ends outside the horizon.
     """
-    slack = SAME_TIME * horizon
+    slack = ROUNDING_SHARE * horizon  # times nearer to each other are one
     for number, task in enumerate(tasks):
         last = task.begin if task.duration is None else task.end
         if last > horizon + slack or task.begin > horizon - slack:
@@ -499,5 +496,5 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
 
 def _within(slopes: Array, known: Array) -> NDArray[np.bool_]:
     """Which rows are combinations of those that are known. Shapes (k, n), (m, n) to (k,)."""
-    left = slopes - slopes @ np.linalg.pinv(known, rcond=DEPENDENT) @ known
-    return np.asarray(np.linalg.norm(left, axis=1) <= DEPENDENT * np.linalg.norm(slopes, axis=1))
+    left = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known
+    return np.asarray(np.linalg.norm(left, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))

@@ -23,8 +23,9 @@ from ocp.curves import rk4_step
 from ocp.errors import ProblemError, checked_choice, checked_flag, checked_instance, checked_positive
 from ocp.local.laws import Law, Layer, Stabiliser, accelerations, checked_law
 from ocp.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
-from ocp.tasks.equations import bind, on_symbols
+from ocp.tasks.equations import bind
 from ocp.tasks.tip_task import TipTask
+from ocp.tasks.tracks import on_symbols
 from ocp.tasks.zmp_rules import checked_place
 
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]

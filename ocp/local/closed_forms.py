@@ -173,51 +173,71 @@ def closed_forms(machine: Machine) -> tuple[ClosedForm, ...]:
     if machine.base_size or n > MOST or any(joint.mimic is not None for joint in path):
         return ()
     order = tuple(robot.joint_names.index(joint.name) for joint in path)
-    at = ca.DM(machine.joint_size, 1)
-    pose, jacobian = machine.tip_pose((), at), np.array(ca.DM(machine.tip_jacobian((), at)))
-    place, rotation = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))
-    turning, moving = jacobian[:3].T, jacobian[3:].T
-    turns = np.linalg.norm(turning, axis=1) > 0.5
-    ways = np.where(turns[:, None], turning, moving)
-    points = np.where(turns[:, None], place + np.cross(turning, moving), place)
-    size = max(float(np.linalg.norm(points - place, axis=1).max()), 1e-3)
+    arm = _Arm.of(machine, order)
+    return _forms_of_scara(arm) if n == SCARA else _forms_of_six(arm)
 
-    def form(kind: str, three: tuple[int, ...], held: tuple[int, ...]) -> ClosedForm:
-        return ClosedForm(kind, three, held, ways, points, turns, place, rotation, order, size)
 
-    def apart(one: int, other: int) -> float:
-        """Distance of parallel axes."""
-        way = points[other] - points[one]
-        return float(np.linalg.norm(way - way @ ways[one] * ways[one]))
+def _forms_of_scara(arm: _Arm) -> tuple[ClosedForm, ...]:
+    three, slides = tuple(j for j in arm.order if arm.turns[j]), [j for j in arm.order if not arm.turns[j]]
+    if len(slides) != 1 or arm.kind_of(three) != "parallel":
+        return ()
+    lean = float(np.linalg.norm(np.cross(arm.ways[slides[0]], arm.ways[three[0]])))
+    return (arm.form("scara", three, ()),) if lean < STRAIGHT else ()
 
-    def kind_of(three: tuple[int, ...]) -> str:
-        """What three axes do that follow each other."""
-        if not turns[list(three)].all():
+
+def _forms_of_six(arm: _Arm) -> tuple[ClosedForm, ...]:
+    n, found = len(arm.order), list[ClosedForm]()
+    for held in combinations(arm.order, n - SIX) if n >= SIX else ():
+        if not arm.turns[[j for j in arm.order if j not in held]].all():
+            continue
+        rows = [arm.order[i : i + 3] for i in range(n - 2)]
+        kinds = [(arm.kind_of(three), three) for three in rows if not set(three) & set(held)]
+        found += [arm.form(kind, three, held) for kind, three in sorted(kinds) if kind][:1]
+    return tuple(found)
+
+
+class _Arm(NamedTuple):
+    """Axes of an arm with all joints at zero, and its tip there; as of ClosedForm."""
+
+    ways: Array
+    points: Array
+    turns: NDArray[np.bool_]
+    place: Array
+    rotation: Array
+    order: tuple[int, ...]
+    size: float
+
+    @classmethod
+    def of(cls, machine: Machine, order: tuple[int, ...]) -> _Arm:
+        at = ca.DM(machine.joint_size, 1)
+        pose, jacobian = machine.tip_pose((), at), np.array(ca.DM(machine.tip_jacobian((), at)))
+        place, rotation = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))
+        turning, moving = jacobian[:3].T, jacobian[3:].T
+        turns = np.linalg.norm(turning, axis=1) > 0.5  # it is one or zero
+        ways = np.where(turns[:, None], turning, moving)
+        points = np.where(turns[:, None], place + np.cross(turning, moving), place)
+        size = max(float(np.linalg.norm(points - place, axis=1).max()), 1e-3)
+        return cls(ways, points, turns, place, rotation, order, size)
+
+    def form(self, kind: str, three: tuple[int, ...], held: tuple[int, ...]) -> ClosedForm:
+        """The closed form by three axes, with some joints held."""
+        return ClosedForm(kind, three, held, *self)
+
+    def kind_of(self, three: tuple[int, ...]) -> str:
+        """What three axes do that follow each other: "parallel", "meeting", or "" for neither."""
+        ways, points = self.ways, self.points
+        if not self.turns[list(three)].all():
             return ""
         leans = [float(np.linalg.norm(np.cross(ways[one], ways[other]))) for one, other in pairwise(three)]
         if max(leans) < STRAIGHT:
-            return "parallel" if min(apart(one, other) for one, other in pairwise(three)) > STRAIGHT * size else ""
+            apart = [points[other] - points[one] for one, other in pairwise(three)]
+            apart = [way - way @ ways[three[0]] * ways[three[0]] for way in apart]
+            return "parallel" if min(map(np.linalg.norm, apart)) > STRAIGHT * self.size else ""
         across = np.eye(3) - ways[list(three), :, None] * ways[list(three), None, :]
         pulled = np.einsum("kij,kj->ki", across, points[list(three)])
         point = np.linalg.lstsq(across.sum(axis=0), pulled.sum(axis=0), rcond=STRAIGHT)[0]
         off = np.linalg.norm(np.einsum("kij,j->ki", across, point) - pulled, axis=1).max()
-        return "meeting" if min(leans) > STRAIGHT and off < STRAIGHT * size else ""
-
-    if n == SCARA:
-        three = tuple(j for j in order if turns[j])
-        slides = [j for j in order if not turns[j]]
-        if len(slides) == 1 and kind_of(three) == "parallel":
-            lean = float(np.linalg.norm(np.cross(ways[slides[0]], ways[three[0]])))
-            return (form("scara", three, ()),) if lean < STRAIGHT else ()
-        return ()
-    found = list[ClosedForm]()
-    for held in combinations(order, n - SIX) if n >= SIX else ():
-        if not turns[[j for j in order if j not in held]].all():
-            continue
-        rows = [order[i : i + 3] for i in range(n - 2)]
-        kinds = [(kind_of(three), three) for three in rows if not set(three) & set(held)]
-        found += [form(kind, three, held) for kind, three in sorted(kinds) if kind][:1]
-    return tuple(found)
+        return "meeting" if min(leans) > STRAIGHT and off < STRAIGHT * self.size else ""
 
 
 def _dot(one: Array, other: Array) -> Array:

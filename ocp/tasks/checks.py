@@ -333,35 +333,47 @@ def check_speed(equations: TaskEquations, most: Array, begin: float, end: float)
     times = np.linspace(begin, end, TRACK_SAMPLES)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
     for part, mine in _parts(equations, values):
-        task, robot = part.task, part.tip.robot
-        chain = [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
-        if part.tip.base_size or part.reference or task.axes != "world" or any(j.mimic is not None for j in chain):
+        chain = [joint for joint in part.tip.robot.path_to(part.tip.robot.tip_link) if joint.moves]
+        task, moving = part.task, any(joint.mimic is not None for joint in chain)
+        if part.tip.base_size or part.reference or task.axes != "world" or moving or task.start_gap > CLOSED:
             continue
-        rates = [float(most[robot.joint_names.index(joint.name)]) for joint in chain]
-        moved = zip(rates, chain, strict=True)
-        fastest = sum(
-            rate * (_length_from(part.tip, joint) if joint.kind != "prismatic" else 1) for rate, joint in moved
-        )
-        turning = sum(rate for rate, joint in zip(rates, chain, strict=True) if joint.kind != "prismatic")
-        turned = [row for row in task.chosen if row in ANGULAR]
-        if task.is_pose:
-            spins = mine[-3:] if task.tilts else mine[-3:][turned]
-            rows = [mine[3:6][task.linear], spins] if task.position is not None else [mine[:0], spins]
-        else:
-            at = {row: mine[i] for i, row in enumerate(task.chosen)}
-            rows = [np.array([at[row] for row in at if (row in ANGULAR) == angular]) for angular in (False, True)]
-        for asked, limit, unit in zip(rows, (fastest, turning), ("m/s", "rad/s"), strict=True):
-            if not len(asked) or task.start_gap > CLOSED:
-                continue
-            speed = np.linalg.norm(asked, axis=0)
-            worst = int(speed.argmax())
-            if speed[worst] > limit * (1 + CLOSED):
+        for asked, limit, unit in zip(
+            _speeds(task, mine), _fastest(part.tip, chain, most), ("m/s", "rad/s"), strict=True
+        ):
+            worst = int(asked.argmax())
+            if asked[worst] > limit * (1 + CLOSED):
                 words = (
-                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {speed[worst]:.4g} {unit}, "
+                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {asked[worst]:.4g} {unit}, "
                     f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
                 )
-                told: dict[str, Any] = {"value": float(speed[worst]), "limit": limit, "time": float(times[worst])}
+                told: dict[str, Any] = {"value": float(asked[worst]), "limit": limit, "time": float(times[worst])}
                 raise ProblemError(words, name=_frame(part), **told)
+
+
+def _fastest(machine: Machine, chain: Sequence[Joint], most: Array) -> tuple[float, float]:
+    """How fast joints at their limits (n,) move the tip, m/s, and turn it, rad/s, at most."""
+    moved, turned = 0.0, 0.0
+    for joint in chain:
+        rate, turns = float(most[machine.robot.joint_names.index(joint.name)]), joint.kind != "prismatic"
+        moved += rate * (_length_from(machine, joint) if turns else 1.0)
+        turned += rate if turns else 0.0
+    return moved, turned
+
+
+def _speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
+    """How fast a task moves and turns its tip in its rows. Shape (M,) each, m/s and rad/s."""
+    turned = [row for row in task.chosen if row in ANGULAR]
+    if task.is_pose:
+        spins = targets[-3:] if task.tilts else targets[-3:][turned]
+        way = targets[3:6][task.linear] if task.position is not None else targets[:0]
+    else:
+        at = {row: targets[i] for i, row in enumerate(task.chosen)}
+        none = np.zeros((0, targets.shape[1]))
+        way, spins = (
+            np.array([at[row] for row in at if (row in ANGULAR) == angular]).reshape(-1, none.shape[1])
+            for angular in (False, True)
+        )
+    return np.linalg.norm(way, axis=0), np.linalg.norm(spins, axis=0)
 
 
 def _length_from(machine: Machine, joint: Joint) -> float:

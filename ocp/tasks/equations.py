@@ -7,24 +7,25 @@ targets, written element by element on SX symbols.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing, center_of_mass
+from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing
 from models.arrays import Array
 from models.machines.machine import with_tip
 from models.robot.indices import manipulability_of
-from models.spatial import on_scalars, skew
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, floats
+from models.spatial import on_scalars
+from ocp.errors import ProblemError, checked_each
 from ocp.tasks.geometry import (
     Bound,
     angular_velocity,
+    closing_combinations,
     cross_product,
     derivative,
     held_task,
@@ -42,10 +43,9 @@ from ocp.tasks.geometry import (
     wanted_twist,
 )
 from ocp.tasks.tip_task import ANGULAR, TipTask
+from ocp.tasks.tracks import on_symbols, track_expression
 
-__all__ = ["TaskEquations", "bind", "on_symbols", "task_errors", "track_expression"]
-
-_Made = TypeVar("_Made")
+__all__ = ["TaskEquations", "bind", "task_errors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,15 +216,7 @@ class TaskEquations:
         return np.array(found, dtype=bool)
 
     def acceleration(
-        self,
-        base: Any,
-        joints: Any,
-        rates: Any,
-        second: Any,
-        time: Any,
-        pace: Any = 1,
-        change: Any = 0,
-        base_rate: Any = None,
+        self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
     ) -> Any:
         """J u' - c, by differentiating `residual` along the motion, with the feedback of its own. Shape (size, 1).
 
@@ -235,13 +227,11 @@ class TaskEquations:
             second: Joint accelerations u', (joint_size, 1).
             time, pace: As of `targets`; a pace other than 1 is a symbol too.
             change: Rate of the pace, 1/s^2.
-            base_rate: Of the base, where it is not the machine's alone: of (pose, momentum).
         """
         residual = self.residual(base, joints, rates, self.targets(time, pace))
         at, moving = [joints, rates, time], [rates, second, 1]
         if self.machine.base_size:
-            change_of_base = self.machine.base_rate(base, joints, rates) if base_rate is None else base_rate
-            at, moving = [base, *at], [change_of_base, *moving]
+            at, moving = [base, *at], [self.machine.base_rate(base, joints, rates), *moving]
         if isinstance(pace, ca.SX | ca.MX):
             at, moving = [*at, pace], [*moving[:-1], pace, change]
         gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])
@@ -350,19 +340,22 @@ class TaskEquations:
 
     def errors(self, t: Any, base: Any, joints: Any) -> Array:
         """As `task_errors`. Shape (M, size)."""
+        place, angles, targets = self._along(t, base, joints)
+        count = len(angles)
+        return np.array(self.function().map(count)(place.T, angles.T, targets)[2]).reshape(-1, count).T
+
+    def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
+        """Base (M, base_size), joints (M, joint_size) and targets, one column each, along a motion."""
         times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
-        targets = self.target_function().map(len(times))(times[None, :])
-        return np.array(self.function().map(len(times))(place.T, angles.T, targets)[2]).reshape(-1, len(times)).T
+        return place, angles, self.target_function().map(len(times))(times[None, :])
 
     def overhangs(self, t: Any, base: Any, joints: Any) -> Array:
         """Angles by which tool axes lean further than they may, rad, arguments as of `errors`. Shape (M, k)."""
-        times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
-        place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+        place, angles, targets = self._along(t, base, joints)
         if not self.most_lean.size:
-            return np.zeros((len(times), 0))
-        targets = self.target_function().map(len(times))(times[None, :])
-        cosines = np.array(self._lean_function.map(len(times))(place.T, angles.T, targets)).T
+            return np.zeros((len(angles), 0))
+        cosines = np.array(self._lean_function.map(len(angles))(place.T, angles.T, targets)).T
         return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.most_lean, 0.0))
 
     @cached_property
@@ -423,94 +416,12 @@ class TaskEquations:
         chosen = np.concatenate([is_holonomic(part) for part in self.bound])
         if self.machine.base_size == 0:
             return np.eye(self.size)[:, chosen]
-        if not isinstance(self.machine, FreeFloating):
-            return np.zeros((self.size, 0))
-        rows = []
-        for part in self.bound:
-            by_base = relative_twist(part, base, joints, part.tip.jacobians(base, joints)[0], "base")  # type: ignore[attr-defined]
-            rows.append(np.array(ca.DM(rows_of(part, ca.DM(base), ca.DM(joints), by_base))))
-        frame = self.machine.world_from_base(base)
-        lever = center_of_mass(self.machine.robot, joints, frame) - frame.position
-        center = np.array(ca.DM(ca.horzcat(-skew(lever), ca.DM.eye(3))))[:, self.machine.twist_rows]
-        task = np.vstack(rows)[chosen]
-        closes = _combinations(np.vstack([task, center]), len(task))
-        linear = self.machine.twist_rows.index(3)  # the rows of the angular momentum come first
-        if np.any(np.asarray(self.machine.conserved_momentum)[linear:]):
-            alone = _combinations(task, len(task))
-            if alone.shape[1] < closes.shape[1]:
-                words = (
-                    "cyclic: the linear momentum moves the centre of mass on, and the joints cannot return together "
-                    "with a tip that returns in the world; let the task be relative to the base"
-                )
-                raise ProblemError(words, name="cyclic", value=self.machine.conserved_momentum)
-            closes = alone
-        free = np.zeros((self.size, closes.shape[1]))
-        free[chosen] = closes
-        return free
-
-
-def on_symbols(make: Callable[[Any], _Made]) -> _Made:
-    """What `make` makes of SX symbols, or of MX symbols where interpolants and external functions take no others."""
-    try:
-        return make(ca.SX)
-    except (RuntimeError, NotImplementedError):
-        return make(ca.MX)
-
-
-def track_expression(
-    track: Any,
-    time: Any,
-    shapes: tuple[int, int] | tuple[tuple[int, int], ...],
-    what: str = "track",
-    begin: float = 0.0,
-) -> Any:
-    """A constant or a function of time as a dense matrix of expressions of the symbol `time`.
-
-    Args:
-        track: A constant, or a function: casadi time -> casadi matrix, array, or a list of expressions.
-        time: The symbol.
-        shapes: The shape it has, or several that it may have.
-        what: Its name in errors.
-        begin: When the track begins, s, from where on it counts its time.
-
-    Raises:
-        ProblemError: Another shape, not finite, or an expression of anything but the time.
-    """
-    allowed = (shapes,) if isinstance(shapes[0], int) else shapes
-    value = _asked(track, time - begin if begin else time, what) if callable(track) else track
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = list(value.ravel())
-    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
-        value = ca.vertcat(*value)
-    wanted = " or ".join(map(str, allowed))
-    if not isinstance(value, ca.SX | ca.MX | ca.DM):
-        try:
-            value = ca.DM(floats(value))
-        except NOT_NUMBERS as error:
-            words = f"{what} gives {value!r}, not numbers or expressions of shape {wanted}"
-            raise ProblemError(words, name=what, value=value, limit=allowed) from error
-    if value.shape not in allowed:
-        hint = ": one entry for each row of the task" if what == "velocity" else ""
-        words = f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}"
-        raise ProblemError(words, name=what, value=value.shape, limit=allowed)
-    if isinstance(value, ca.DM):
-        if not np.isfinite(np.array(value)).all():
-            found = np.array(value).ravel()
-            raise ProblemError(f"{what} {found.tolist()} is not finite", name=what, value=found)
-    elif strange := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
-        words = f"{what} depends on {strange}, but only the time it is called with may occur"
-        raise ProblemError(words, name=what, value=strange)
-    return ca.densify(value)
-
-
-def _asked(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """What a track says; ProblemError where it fails, but for what interpolants say of SX symbols (see on_symbols)."""
-    try:
-        return track(time)
-    except (RuntimeError, NotImplementedError, ProblemError, ModelError):
-        raise
-    except Exception as error:  # of the function's own
-        raise ProblemError(f"{what}: the function fails: {error!r}", name=what, value=track) from error
+        found = np.zeros((self.size, 0))
+        if isinstance(self.machine, FreeFloating):
+            closes = closing_combinations(self.machine, self.bound, chosen, base, joints)
+            found = np.zeros((self.size, closes.shape[1]))
+            found[chosen] = closes
+        return found
 
 
 def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
@@ -523,14 +434,6 @@ def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
     whole = type(value)(3, 1)
     whole[task.linear] = value
     return ca.densify(whole)
-
-
-def _combinations(by_base: Array, count: int) -> Array:
-    """Orthonormal combinations of the first `count` rows, with any of the others, that are zero. Shape (count, k)."""
-    left, values, _ = np.linalg.svd(by_base)
-    rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
-    of_task, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)
-    return np.asarray(of_task[:, : int(np.sum(shares > 1e-9))])
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from models import Machine
+from models import FreeFloating, Machine, center_of_mass
 from models.arrays import Array
 from models.spatial import Frame, on_scalars, rotation_from_quaternion, skew
+from ocp.errors import ProblemError
 from ocp.tasks.tip_task import ANGULAR, TipTask
 
 
@@ -167,3 +170,41 @@ def cross_product(a: Any, b: Any) -> Any:
 def angular_velocity(turn: Any, rate: Any) -> Any:
     spin = ca.mtimes(rate, turn.T)
     return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
+
+
+def closing_combinations(
+    machine: FreeFloating, bound: Sequence[Bound], chosen: NDArray[np.bool_], base: Array, joints: Array
+) -> Array:
+    """Combinations of the chosen rows that do not depend on the base's pose, the centre of mass staying. Shape (m, k).
+
+    Raises:
+        ProblemError: The centre of mass moves, and the joints cannot return.
+    """
+    rows = []
+    for part in bound:
+        by_base = relative_twist(part, base, joints, part.tip.jacobians(base, joints)[0], "base")  # type: ignore[attr-defined]
+        rows.append(np.array(ca.DM(rows_of(part, ca.DM(base), ca.DM(joints), by_base))))
+    frame = machine.world_from_base(base)
+    lever = center_of_mass(machine.robot, joints, frame) - frame.position
+    center = np.array(ca.DM(ca.horzcat(-skew(lever), ca.DM.eye(3))))[:, machine.twist_rows]
+    task = np.vstack(rows)[chosen]
+    closes = _combinations(np.vstack([task, center]), len(task))
+    linear = machine.twist_rows.index(3)  # the rows of the angular momentum come first
+    if np.any(np.asarray(machine.conserved_momentum)[linear:]):
+        alone = _combinations(task, len(task))
+        if alone.shape[1] < closes.shape[1]:
+            words = (
+                "cyclic: the linear momentum moves the centre of mass on, and the joints cannot return together "
+                "with a tip that returns in the world; let the task be relative to the base"
+            )
+            raise ProblemError(words, name="cyclic", value=machine.conserved_momentum)
+        closes = alone
+    return closes
+
+
+def _combinations(by_base: Array, count: int) -> Array:
+    """Orthonormal combinations of the first `count` rows, with any of the others, that are zero. Shape (count, k)."""
+    left, values, _ = np.linalg.svd(by_base)
+    rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
+    of_task, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)
+    return np.asarray(of_task[:, : int(np.sum(shares > 1e-9))])

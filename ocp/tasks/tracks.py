@@ -7,25 +7,29 @@ by the time would be half or none: at the bounds of a path's pieces and at its e
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
 
+from models import ModelError
 from models.arrays import Array, ArrayInput
 from models.paths.blends import rest_to_rest
 from models.paths.functions import path_function, turn_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, real
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, floats, real
 
-__all__ = ["PathTracks", "PoseLine", "Track", "along", "pose_line", "rated", "run_by"]
+__all__ = ["PathTracks", "PoseLine", "Track", "along", "on_symbols", "pose_line", "rated", "run_by", "track_expression"]
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
 
+_Made = TypeVar("_Made")
+
 LARGEST_TURN = np.pi - 1e-3
+"""rad, of a line between poses: half a turn has no axis of its own."""
 
 
 class PoseLine(NamedTuple):
@@ -210,3 +214,67 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], what: str) -> tuple[Array, Array]
         words = f"the {what} pose has the orientation {orientation.tolist()}, which is no rotation"
         raise ProblemError(words, name=what, value=orientation)
     return orientation, position.ravel()
+
+
+def on_symbols(make: Callable[[Any], _Made]) -> _Made:
+    """What `make` makes of SX symbols, or of MX symbols where interpolants and external functions take no others."""
+    try:
+        return make(ca.SX)
+    except (RuntimeError, NotImplementedError):
+        return make(ca.MX)
+
+
+def track_expression(
+    track: Any,
+    time: Any,
+    shapes: tuple[int, int] | tuple[tuple[int, int], ...],
+    what: str = "track",
+    begin: float = 0.0,
+) -> Any:
+    """A constant or a function of time as a dense matrix of expressions of the symbol `time`.
+
+    Args:
+        track: A constant, or a function: casadi time -> casadi matrix, array, or a list of expressions.
+        time: The symbol.
+        shapes: The shape it has, or several that it may have.
+        what: Its name in errors.
+        begin: When the track begins, s, from where on it counts its time.
+
+    Raises:
+        ProblemError: Another shape, not finite, or an expression of anything but the time.
+    """
+    allowed = (shapes,) if isinstance(shapes[0], int) else shapes
+    value = _asked(track, time - begin if begin else time, what) if callable(track) else track
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = list(value.ravel())
+    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
+        value = ca.vertcat(*value)
+    wanted = " or ".join(map(str, allowed))
+    if not isinstance(value, ca.SX | ca.MX | ca.DM):
+        try:
+            value = ca.DM(floats(value))
+        except NOT_NUMBERS as error:
+            words = f"{what} gives {value!r}, not numbers or expressions of shape {wanted}"
+            raise ProblemError(words, name=what, value=value, limit=allowed) from error
+    if value.shape not in allowed:
+        hint = ": one entry for each row of the task" if what == "velocity" else ""
+        words = f"{what} has shape {tuple(value.shape)}, expected {wanted}{hint}"
+        raise ProblemError(words, name=what, value=value.shape, limit=allowed)
+    if isinstance(value, ca.DM):
+        if not np.isfinite(np.array(value)).all():
+            found = np.array(value).ravel()
+            raise ProblemError(f"{what} {found.tolist()} is not finite", name=what, value=found)
+    elif strange := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
+        words = f"{what} depends on {strange}, but only the time it is called with may occur"
+        raise ProblemError(words, name=what, value=strange)
+    return ca.densify(value)
+
+
+def _asked(track: Callable[[Any], Any], time: Any, what: str) -> Any:
+    """What a track says; ProblemError where it fails, but for what interpolants say of SX symbols (see on_symbols)."""
+    try:
+        return track(time)
+    except (RuntimeError, NotImplementedError, ProblemError, ModelError):
+        raise
+    except Exception as error:  # of the function's own
+        raise ProblemError(f"{what}: the function fails: {error!r}", name=what, value=track) from error

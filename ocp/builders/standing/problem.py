@@ -54,7 +54,7 @@ from ocp.tasks.checks import (
     checked_tasks,
     rates_at_rest,
 )
-from ocp.tasks.equations import bind
+from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.limits import JointBounds, Limits
 from ocp.tasks.tip_task import TipTask
 from ocp.tasks.zmp_rules import (
@@ -220,19 +220,7 @@ def standing_problem(
     progress: tuple[Any, ...] = (problem.time,)
     if along == "parameter":
         progress = _progress(problem, start, end, guess)
-    none = ca.DM(0, 1)
-    if tip_level == "acceleration":
-        if start == "free":
-            targets = equations.targets(*progress[:2])
-            residual = equations.residual(none, joints, velocities, targets)
-            problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-        gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
-        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        for name, stray in equations.strays(none, joints, velocities, equations.targets(*progress[:2])).items():
-            problem.watch(name, **stray)
-    else:
-        gap = equations.gap(none, joints, velocities, equations.targets(*progress[:2]))
-        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""), tolerance=equations.tolerances)
+    _hold_tips(problem, equations, motion, progress, tip_level, start == "free")
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _ground(problem, machine, motion, wrenches, zmp, limits)
@@ -242,6 +230,7 @@ def standing_problem(
         torques = machine.joint_torques(*motion, wrenches)[limited]
         problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
 
+    none = ca.DM(0, 1)
     if clear is not None:
         known = None if isinstance(horizon, FreeTime) else duration
         checked_instance("standing_problem: clear", clear, Clear).declare(problem, none, joints, horizon=known)
@@ -253,6 +242,30 @@ def standing_problem(
     running += weights.jerk * ca.sumsqr(jerks)
     problem.minimize(running=running, terminal=weights.time * final)
     return problem
+
+
+def _hold_tips(
+    problem: Problem,
+    equations: TaskEquations,
+    motion: tuple[Any, Any, Any],
+    progress: tuple[Any, ...],
+    tip_level: str,
+    moving: bool,
+) -> None:
+    """Hold the tips to their tasks: by their poses, or by accelerations, from a start at rest or `moving`."""
+    none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
+    targets = equations.targets(*progress[:2])
+    if tip_level == "position":
+        gap = equations.gap(none, joints, velocities, targets)
+        problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""), tolerance=equations.tolerances)
+        return
+    if moving:
+        residual = equations.residual(none, joints, velocities, targets)
+        problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
+    gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
+    problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
+    for name, stray in equations.strays(none, joints, velocities, targets).items():
+        problem.watch(name, **stray)
 
 
 def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:

@@ -20,9 +20,10 @@ from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.local.accelerations import resolve_accelerations
 from ocp.tasks.checks import inside_limits
-from ocp.tasks.equations import TaskEquations, on_symbols
+from ocp.tasks.equations import TaskEquations
 from ocp.tasks.limits import JointBounds
 from ocp.tasks.tip_task import timed
+from ocp.tasks.tracks import on_symbols
 from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]

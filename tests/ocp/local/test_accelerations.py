@@ -13,8 +13,8 @@ from models.robot.indices import jacobian_manipulability, joint_limit_index
 from ocp import ProblemError, TipTask, resolve, resolve_accelerations
 from ocp.local.accelerations import AccelerationSolution, Layer, Stabiliser
 from ocp.local.laws import Law, accelerations
-from ocp.tasks.equations import bind, task_errors, track_expression
-from ocp.tasks.tracks import pose_line
+from ocp.tasks.equations import bind, task_errors
+from ocp.tasks.tracks import pose_line, track_expression
 from tests.models.machines.standing_machines import planar_machine, random_standing
 from tests.models.robot.trees import Array, numeric, seeds
 from tests.ocp.builders.standing_tasks import (
