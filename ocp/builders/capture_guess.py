@@ -7,7 +7,7 @@ the approach at last. After the grasp the arm slows down evenly while the wheels
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -24,16 +24,32 @@ __all__ = ["free_motion", "guess_approach", "guess_braking", "guessed"]
 
 Guesses = dict[str, Any]
 """Functions of the time, by the names of states and controls."""
-STEPS, TRIES = 200, 9
-"""Of a motion; free times that are tried."""
-REACHED = 1e-3
-"""How near the tip has to come, m and rad."""
-MET, LATE = 0.75, 0.5
-"""Fractions of the approach: where the tip begins to move with the target, and where to come nearer to the grasp."""
-DAMPING = 0.05
-"""Of the pseudo-inverse, m and 1."""
-ROUNDS = 4
-"""In which the attitude at the end and the speeds of the wheels that follow from it are found."""
+
+
+@dataclass(frozen=True)
+class GuessSettings:
+    """How a capture's first guess is made.
+
+    Attributes:
+        steps: Of a motion.
+        durations: Of a free time: that many are tried, evenly spread by their logarithms.
+        reached: How near the tip has to come, m and rad.
+        met: Fraction of the approach after which the tip moves with the target.
+        nearing: Fraction of the approach after which the tip comes nearer to the grasp.
+        damping: Of the pseudo-inverse, m and 1.
+        rounds: Newton steps for the speeds of the wheels at the end, which the attitude depends on.
+    """
+
+    steps: int = 200
+    durations: int = 9
+    reached: float = 1e-3
+    met: float = 0.75
+    nearing: float = 0.5
+    damping: float = 0.05
+    rounds: int = 4
+
+
+GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
@@ -67,19 +83,19 @@ def guess_approach(
     first = guessed(problem)
     tries = [first]
     if not horizon.fixed:
-        spread = np.geomspace(constant(horizon.lower)[0], constant(horizon.upper)[0], TRIES)
+        spread = np.geomspace(constant(horizon.lower)[0], constant(horizon.upper)[0], GUESS.durations)
         tries += sorted(spread, key=lambda duration: abs(np.log(duration / first)))
     nearest = np.inf
     walker = _Walker(problem, chaser, rates)
     for duration in tries:
-        times = np.linspace(0.0, duration, STEPS + 1)
+        times = np.linspace(0.0, duration, GUESS.steps + 1)
         bases = free_motion(target, target_base, times)
         way = _way_of_tip(chaser, target, times, bases, (joints, base), out)
         gap, guesses = walker.along(times, way, joints, base)
         if gap < nearest:
             nearest = gap
             tell(problem, duration, {**guesses, "target": _curve(times, bases)})
-        if gap < REACHED:
+        if gap < GUESS.reached:
             return
 
 
@@ -109,11 +125,11 @@ class _Walker:
         speed[self.arm] = 0.0
         drifting = speed
         found, moving = [(joints, base)], []
-        for k in range(STEPS):
+        for k in range(GUESS.steps):
             at, home = found[-1]
             position, rotation, matrix, drift = (np.array(part) for part in self.look(home, at, drifting))
             gap = _gap(places[k + 1], turns[k + 1], position, rotation)[self.rows]
-            square = matrix @ matrix.T + DAMPING**2 * np.eye(len(self.rows))
+            square = matrix @ matrix.T + GUESS.damping**2 * np.eye(len(self.rows))
             speed = drifting.copy()
             speed[self.arm] = matrix.T @ np.linalg.solve(square, gap / step - drift.ravel())
             speed = np.clip(speed, -self.fastest, self.fastest)
@@ -145,7 +161,10 @@ def _way_of_tip(
         return place, Rotation.from_matrix(turn.reshape(-1, 3, 3).transpose(0, 2, 1))
 
     share = times / times[-1]
-    meeting, nearer = QUINTIC(np.clip(share / MET, 0, 1)), QUINTIC(np.clip((share - LATE) / (1 - LATE), 0, 1))
+    meeting, nearer = (
+        QUINTIC(np.clip(share / GUESS.met, 0, 1)),
+        QUINTIC(np.clip((share - GUESS.nearing) / (1 - GUESS.nearing), 0, 1)),
+    )
     grasped, turned = frames(bases)
     own = chaser.tip_pose(start[1], start[0])
     first, axes = np.array(ca.DM(own.position)).ravel(), Rotation.from_matrix(np.array(ca.DM(own.rotation)))
@@ -165,7 +184,7 @@ def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Ar
     Which speeds of the wheels hold it follows by Newton's method: the attitude at the end depends on them.
     """
     robot, duration = pair.robot, guessed(problem)
-    times = np.linspace(0.0, duration, STEPS + 1)
+    times = np.linspace(0.0, duration, GUESS.steps + 1)
     share = times[:, None] / duration
     slowing = 1 - 3 * share**2 + 2 * share**3
     way = (share - share**3 + share**4 / 2) * duration
@@ -177,11 +196,11 @@ def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Ar
     look = ca.Function("look", [b, q, v], [held, ca.jacobian(held, v)[:, turning]])
     last = np.zeros(len(joints))
     step = _stepper(pair)
-    for _ in range(ROUNDS if wheels else 1):
+    for _ in range(GUESS.rounds if wheels else 1):
         speeds = last + slowing * (rates - last)
         angles = joints + last * times[:, None] + way * (rates - last)
         found = [base]
-        for k in range(STEPS):
+        for k in range(GUESS.steps):
             middle = (angles[k] + angles[k + 1]) / 2, (speeds[k] + speeds[k + 1]) / 2
             found.append(step(times[1], found[-1], *middle))
         have, matrix = (np.array(part) for part in look(found[-1], angles[-1], last))

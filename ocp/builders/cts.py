@@ -12,6 +12,7 @@ near, and is then refined within a tube about itself that grows thinner.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -32,18 +33,40 @@ from ocp.direct.guess import Samples
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
 from ocp.problem.problem import Problem
 
-__all__ = ["ROLLS", "least_course", "roll_problem", "spline_targets"]
+__all__ = ["least_course", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
 LARGEST_SINE = 1 - 1e-9  # of q4, and cosine of q2: short of the end of the reach
-GUESS_TIMES = 65
-VIOLATION_PRICE = 1e3  # of a violation in the guess: per m, rad or unit of a sine
-GUESS_MARGIN = 2.0  # widths of the smooth minimum that the guess keeps beyond the clearance asked for
-ROLLS = 120
-"""Rolls of the grid to a turn."""
-TUBE_SIDE, TUBE_FINER, TUBE_LEVELS = 8, 4, 3  # rolls of the tube to each side, how much finer each level is, levels
-LARGEST_WAY = 2 * FULL_TURN  # how far from its start a roll with limits is looked for, rad
-STEPS_BY_RATE = 2.0  # grid steps that the rate limit should allow from one time to the next
+
+
+@dataclass(frozen=True)
+class RollGuessSettings:
+    """How the first guess of the roll is looked for: a shortest way over a grid of times and rolls, refined in a tube.
+
+    Attributes:
+        times: Of the grid.
+        price: Of a violation, per m, rad or unit of a sine.
+        margin: Widths of the smooth minimum that the guess keeps beyond the clearance asked for.
+        rolls: Of the grid, to a turn.
+        tube_side: Rolls of the tube to each side.
+        tube_finer: How much finer each level of the tube is.
+        tube_levels: Levels of the tube.
+        largest_way: How far from its start a roll with limits is looked for, rad.
+        steps_by_rate: Grid steps that the rate limit should allow from one time to the next.
+    """
+
+    times: int = 65
+    price: float = 1e3
+    margin: float = 2.0
+    rolls: int = 120
+    tube_side: int = 8
+    tube_finer: int = 4
+    tube_levels: int = 3
+    largest_way: float = 2 * FULL_TURN
+    steps_by_rate: float = 2.0
+
+
+SEARCH = RollGuessSettings()
 
 
 @interruptible
@@ -159,15 +182,15 @@ def roll_problem(
         gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
         near = nearness(gap, clearance_weight, clearance_width)
         if np.isfinite(clearance):
-            short += ca.fmax(clearance + GUESS_MARGIN * softness - gap, 0)
-    t = np.linspace(0, horizon, GUESS_TIMES)
+            short += ca.fmax(clearance + SEARCH.margin * softness - gap, 0)
+    t = np.linspace(0, horizon, SEARCH.times)
     rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
     status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         missed = int(np.flatnonzero(status)[0])
         message = f"roll_problem: no roll reaches the target at {t[missed]:.4g} s; see solve_table"
         raise ProblemError(message, name="target", value=rows[:, missed], time=float(t[missed]))
-    price = ca.Function("price", [x, phi], [ca.cse(index + ca.fmin(near, VIOLATION_PRICE) + VIOLATION_PRICE * short)])
+    price = ca.Function("price", [x, phi], [ca.cse(index + ca.fmin(near, SEARCH.price) + SEARCH.price * short)])
     first = least_course(
         lambda times, rolls: np.asarray(np.array(price.map(len(rolls))(rows[:, times], rolls[None]))[0]),
         t,
@@ -258,12 +281,12 @@ def least_course(
         rate_limit: rad/s; the first grid may exceed it by one step.
     """
     count, about = len(t), float(np.clip(0.0, lower, upper)) if start is None else start
-    step = FULL_TURN / ROLLS
+    step = FULL_TURN / SEARCH.rolls
     circle = not np.isfinite([lower, upper]).any()
     if circle:
-        rolls = about + step * np.arange(ROLLS) - np.pi
+        rolls = about + step * np.arange(SEARCH.rolls) - np.pi
     else:
-        first, last = max(lower, about - LARGEST_WAY), min(upper, about + LARGEST_WAY)
+        first, last = max(lower, about - SEARCH.largest_way), min(upper, about + SEARCH.largest_way)
         rolls = np.linspace(first, last, int(np.ceil((last - first) / step)) + 1) if first < last else np.array([about])
     table = cost(np.repeat(np.arange(count), len(rolls)), np.tile(rolls, count)).reshape(count, -1)
     gain = float(np.median(np.median(table, axis=1) - table.min(axis=1)))  # of the best roll over any
@@ -273,7 +296,7 @@ def least_course(
     if start is not None:
         table[0, np.arange(len(rolls)) != int(np.abs(rolls - about).argmin())] = np.inf
     # a slow roll needs a coarse grid of times: else a step of the grid is faster than it may move
-    ticks = int(np.clip((t[-1] - t[0]) * min(rate_limit, 1e6) / (STEPS_BY_RATE * step), 8, count))
+    ticks = int(np.clip((t[-1] - t[0]) * min(rate_limit, 1e6) / (SEARCH.steps_by_rate * step), 8, count))
     groups = np.array_split(np.arange(count), ticks)
     stage = np.array([table[group].mean(axis=0) for group in groups])
     at = np.array([t[group].mean() for group in groups])
@@ -283,9 +306,9 @@ def least_course(
     path = _cheapest(stage, [away] * (ticks - 1), np.diff(at), rate_weight, rate_limit, step)
     moves = [away[i, k] for i, k in pairwise(path)]
     roll = np.interp(t, at, rolls[path[0]] + np.concatenate([[0.0], np.cumsum(moves)]))
-    for _ in range(TUBE_LEVELS):
-        step /= TUBE_FINER
-        offsets = step * np.arange(-TUBE_SIDE, TUBE_SIDE + 1)
+    for _ in range(SEARCH.tube_levels):
+        step /= SEARCH.tube_finer
+        offsets = step * np.arange(-SEARCH.tube_side, SEARCH.tube_side + 1)
         tube = np.clip(roll[:, None] + offsets, lower, upper)
         if start is not None:
             tube[0] = start

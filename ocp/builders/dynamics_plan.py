@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy as np
@@ -37,17 +38,29 @@ from ocp.tightening import exceeded, tighten
 __all__ = ["breaks_of", "plan_dynamics", "within_limits"]
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
-MESHES = 3
-"""Each finer than the one before."""
-THIRDS = 3
-"""Pieces of an interval in which a limit that is drawn in costs too much: its cost falls to a ninth."""
-HELD = 1e-5
-"""By how much a limit may be exceeded between the nodes, in its own unit."""
-DEARER = 1e-3
-"""Share of its cost that a plan may cost more for limits drawn in: more is mended by nodes where it switches."""
 IPOPT = {"max_iter": 300}
 ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<what>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
 """Labels of the rows of joints, in a phase or without one."""
+
+
+@dataclass(frozen=True)
+class HoldingSettings:
+    """How limits are made to hold between the nodes of a mesh.
+
+    Attributes:
+        meshes: That are tried, each finer than the one before.
+        pieces: Of an interval in which a tightened limit costs too much: its cost falls to a ninth.
+        held: By how much a limit may be exceeded between the nodes, in its own unit.
+        dearer: Share of its cost that a plan may cost more for tightened limits; nodes where it switches mend more.
+    """
+
+    meshes: int = 3
+    pieces: int = 3
+    held: float = 1e-5
+    dearer: float = 1e-3
+
+
+HOLDING = HoldingSettings()
 
 
 @interruptible
@@ -169,7 +182,7 @@ def _first_that_holds(
     reasons: list[str] = []
     why, last, begin = SolveError(), None, guess
     feasible, dear = list[Solution](), list[tuple[Collocation, Solution]]()
-    for _ in range(MESHES):
+    for _ in range(HOLDING.meshes):
         for what, plan in _attempts(problem, mesh, settings, guess):
             name = f"{mesh.intervals} intervals{what}"
             if isinstance(plan, SolveError):
@@ -200,7 +213,7 @@ def _first_that_holds(
         for plan in [plan for own, plan in dear if own is finest]:
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
-                plan = tighten(problem, own, tolerance=HELD, options={**NEAR, **settings}, guess=plan)
+                plan = tighten(problem, own, tolerance=HOLDING.held, options={**NEAR, **settings}, guess=plan)
                 audit = plan.audit(tolerances=tolerances)
                 held += [plan] if audit.feasible else []
                 reasons.append(f"{finest.intervals} intervals, at whatever cost: {audit.sentence}")
@@ -232,11 +245,11 @@ def _drawn_in(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
     """A plan that holds its limits between its nodes, and costs hardly more than one that does not; or why not."""
-    if exceeded(problem, plan) <= HELD:
+    if exceeded(problem, plan) <= HOLDING.held:
         return plan
-    own, most = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + DEARER * abs(plan.cost)
+    own, most = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.dearer * abs(plan.cost)
     try:
-        drawn = tighten(problem, own, tolerance=HELD, options=settings, guess=plan, dearest=most)
+        drawn = tighten(problem, own, tolerance=HOLDING.held, options=settings, guess=plan, dearest=most)
     except SolveError as error:
         return error
     if drawn.cost <= most:
@@ -250,7 +263,7 @@ def _finer(mesh: Collocation, plan: Solution, why: SolveError) -> Collocation:
     if plan.drawn_in is None or why.solution is not plan or why.name != "cost":
         return mesh.halved()
     nodes, drawn = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
-    return mesh.with_mesh(split(nodes, np.where(drawn > 0, THIRDS, 1), drawn, THIRDS * len(drawn)))
+    return mesh.with_mesh(split(nodes, np.where(drawn > 0, HOLDING.pieces, 1), drawn, HOLDING.pieces * len(drawn)))
 
 
 def _by_joint(error: SolveError, driven: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:

@@ -28,10 +28,6 @@ __all__ = ["PlannedJoints", "joint_path"]
 
 DEGREE = 5
 DERIVATIVES = 3
-ON_PATH = 1e-6
-"""Share of a path's length by which tasks that run along it may be off it."""
-AT_ONCE = 1024
-"""Places whose torques are computed side by side."""
 ON_ROWS = {
     ca.OP_ADD: np.add,
     ca.OP_SUB: np.subtract,
@@ -45,6 +41,22 @@ ON_ROWS = {
     ca.OP_TWICE: lambda of, into: np.add(of, of, into),
 }
 """Instructions that dynamics consist of, on rows of numbers: of the operands, into the last."""
+
+
+@dataclass(frozen=True)
+class SplineSettings:
+    """How the joints of a plan are made a spline.
+
+    Attributes:
+        on_path: Share of a path's length by which tasks that run along it may be off it.
+        at_once: Places whose torques are computed side by side.
+    """
+
+    on_path: float = 1e-6
+    at_once: int = 1024
+
+
+SPLINE = SplineSettings()
 
 
 class _Along(NamedTuple):
@@ -181,11 +193,11 @@ def _planned(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, 
         asked = np.isfinite(apart).any(axis=2)
         off = np.where(asked, np.linalg.norm(np.nan_to_num(apart), axis=2), np.inf).min(axis=0)
         worst = int(off.argmax())
-        if asked.any() and not off[worst] <= ON_PATH * length:
+        if asked.any() and not off[worst] <= SPLINE.on_path * length:
             found = f"are {off[worst]:.3g} m off the path" if off[worst] < np.inf else "ask for no position"
             words = f"the plan's tasks {found} at {t[worst]:.6g} s: they do not run along all of it at one speed; "
             words += "give (distances, joints) instead of the plan"
-            told = {"value": float(off[worst]), "limit": ON_PATH * length, "time": float(t[worst])}
+            told = {"value": float(off[worst]), "limit": SPLINE.on_path * length, "time": float(t[worst])}
             raise ProblemError(words, name="plan", **told)
     times = np.linspace(0.0, plan.horizon, samples)
     return length * plan.task_share(times), plan.at(times)["joints"]
@@ -282,8 +294,8 @@ class _OnRows:
             table, steps = self.tables.pop()
         except IndexError:  # the first call, or another thread has it
             table, steps = self._table()
-        for first in range(0, count, AT_ONCE):
-            here = min(AT_ONCE, count - first)
+        for first in range(0, count, SPLINE.at_once):
+            here = min(SPLINE.at_once, count - first)
             table[self.inputs, :here] = given[:, first : first + here]
             for operation, places in steps:
                 operation(*places)
@@ -293,7 +305,7 @@ class _OnRows:
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
         """Rows of numbers, and the instructions on them."""
-        table = np.zeros((self.rows + len(self.constants), AT_ONCE))
+        table = np.zeros((self.rows + len(self.constants), SPLINE.at_once))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
         return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]

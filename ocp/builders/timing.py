@@ -42,12 +42,25 @@ from ocp.solution import Solution
 
 __all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "plan_minimum_time"]
 
-CUT_DEMAND = 2e-4
-"""Intervals in which a limit is passed by more than this share are cut, into up to `MOST_PARTS`."""
-CUT_DEFECT = 1e-6
-"""And those whose states do not follow from their jerk to this share, of the distance and of the top speed."""
-MOST_PARTS = 8
 IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
+
+
+@dataclass(frozen=True)
+class CutSettings:
+    """Which intervals of the mesh of a fastest motion are cut.
+
+    Attributes:
+        demand: Share by which a limit may be passed in an interval.
+        defect: Share of the distance and of the top speed by which states may not follow from their jerk.
+        parts: Into which an interval is cut at most.
+    """
+
+    demand: float = 2e-4
+    defect: float = 1e-6
+    parts: int = 8
+
+
+CUTS = CutSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +309,9 @@ def _parts(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     way, speed, _ = advanced(v[:-1], a[:-1], j, t)
     covered, gained = way / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
-    error = np.maximum((demand - 1) / CUT_DEMAND, np.maximum(np.abs(covered), np.abs(gained)) / CUT_DEFECT)[1:-1]
+    error = np.maximum((demand - 1) / CUTS.demand, np.maximum(np.abs(covered), np.abs(gained)) / CUTS.defect)[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
-    return np.where(error > 1, np.minimum(parts, MOST_PARTS), 1)
+    return np.where(error > 1, np.minimum(parts, CUTS.parts), 1)
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:

@@ -3,12 +3,13 @@
 The time of the reference motion is the path parameter of ocp.builders.timing. What the path asks of speed becomes a
 smooth casadi function of it, polynomials between the path's corners: everything is sampled between the places where a
 derivative of the path jumps, never across one, and cells are halved until their polynomials agree with the path to
-`TABLE_ACCURACY`.
+`TABLES.accuracy`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import comb
 from typing import Any
 
@@ -37,19 +38,31 @@ __all__ = [
 Columns = Callable[[Array], Array]
 """Times (M,) to values (M, m)."""
 
-DEGREE = 7
-"""Of the polynomials of a table."""
-TABLE_ACCURACY = 1e-8
-"""Largest error of a column, relative to its largest value."""
-SMALLEST_CELL = 1e-9
-"""Cells below this share of the whole are not halved further."""
-HALVINGS = 40
-PIECE_POINTS = 40
-"""Points of a piece at which demands are looked at: ten times those of the collocation and the node."""
-BESIDE_JUMP = 1e-6
-"""Nodes stand this far before and after a place where the path's derivatives jump, over the whole time."""
-ONE_NODE = 1e-7
-"""Nodes closer than this over the whole time count as one."""
+
+@dataclass(frozen=True)
+class TableSettings:
+    """How exact the tables of a path are, and where its mesh has nodes.
+
+    Attributes:
+        degree: Of the polynomials of a table.
+        accuracy: Largest error of a column, relative to its largest value.
+        smallest_cell: Cells below this share of the whole are not halved further.
+        halvings: Of a cell at most.
+        points: Of a piece at which demands are looked at: ten times those of the collocation and the node.
+        beside_jump: How far before and after a jump of the path's derivatives nodes stand, over the whole time.
+        one_node: Nodes closer than this over the whole time count as one.
+    """
+
+    degree: int = 7
+    accuracy: float = 1e-8
+    smallest_cell: float = 1e-9
+    halvings: int = 40
+    points: int = 40
+    beside_jump: float = 1e-6
+    one_node: float = 1e-7
+
+
+TABLES = TableSettings()
 
 
 def table(columns: Columns, breaks: Array) -> Any:
@@ -57,13 +70,15 @@ def table(columns: Columns, breaks: Array) -> Any:
 
     At a break its value is that of the cell that begins there.
     """
-    nodes = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2  # inside: no break is touched
+    nodes = (
+        1 - np.cos(np.pi * (np.arange(TABLES.degree + 1) + 0.5) / (TABLES.degree + 1))
+    ) / 2  # inside: no break is touched
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
     done: list[tuple[Array, Array]] = []
     scale: Array | None = None
-    for number in range(HALVINGS):
+    for number in range(TABLES.halvings):
         if not start.size:
             break
         places = np.concatenate([nodes, between])
@@ -72,8 +87,10 @@ def table(columns: Columns, breaks: Array) -> Any:
             scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
         coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
         error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
-        fine = ((error <= TABLE_ACCURACY * scale).all(axis=(1, 2))) | (width < SMALLEST_CELL * (breaks[-1] - breaks[0]))
-        fine |= number == HALVINGS - 1
+        fine = ((error <= TABLES.accuracy * scale).all(axis=(1, 2))) | (
+            width < TABLES.smallest_cell * (breaks[-1] - breaks[0])
+        )
+        fine |= number == TABLES.halvings - 1
         done.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2
         start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
@@ -82,12 +99,12 @@ def table(columns: Columns, breaks: Array) -> Any:
     order = np.argsort(starts)
     pieces = pieces[order]
     # a constant cell behind the end, which would belong to none
-    pieces = np.concatenate([pieces, np.repeat(pieces[-1:, -1:], DEGREE + 1, axis=1)])
+    pieces = np.concatenate([pieces, np.repeat(pieces[-1:, -1:], TABLES.degree + 1, axis=1)])
     ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
-    knots = np.repeat(ends, DEGREE + 1).tolist()
+    knots = np.repeat(ends, TABLES.degree + 1).tolist()
     flat = pieces.reshape(-1, pieces.shape[2])
     time = ca.MX.sym("time")
-    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [DEGREE], flat.shape[1], {"lookup_mode": ["binary"]})
+    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TABLES.degree], flat.shape[1], {"lookup_mode": ["binary"]})
     return ca.Function("along", [time], [value])
 
 
@@ -161,17 +178,19 @@ def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> 
 
 def demand_of_pieces(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
     """Largest demand inside each piece of a profile, from either side where the path jumps. Shape (K,)."""
-    inside = (np.arange(PIECE_POINTS) + 0.5) / PIECE_POINTS
+    inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     distance = np.clip(motion.distance, 0.0, path.length)
     found = largest_demand(path, limits, joints, motion._replace(distance=distance))
-    return np.asarray(found.reshape(-1, PIECE_POINTS).max(axis=1))
+    return np.asarray(found.reshape(-1, TABLES.points).max(axis=1))
 
 
 def _bernstein(x: Array) -> Array:
-    """Values of the DEGREE + 1 Bernstein polynomials at x. Shape (len(x), DEGREE + 1)."""
-    return np.stack([comb(DEGREE, i) * x**i * (1 - x) ** (DEGREE - i) for i in range(DEGREE + 1)], axis=1)
+    """Values of the Bernstein polynomials of the degree of a table at x. Shape (len(x), degree + 1)."""
+    return np.stack(
+        [comb(TABLES.degree, i) * x**i * (1 - x) ** (TABLES.degree - i) for i in range(TABLES.degree + 1)], axis=1
+    )
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
@@ -212,13 +231,15 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
         span: s.
     """
     whole, (begin, end) = reference.duration, span
-    just = BESIDE_JUMP * whole
+    just = TABLES.beside_jump * whole
     joins = joins[(joins > begin + 2 * just) & (joins < end - 2 * just)]
     sides = np.concatenate([joins - just, joins + just])
-    changes = reference.t[(reference.t > begin + ONE_NODE * whole) & (reference.t < end - ONE_NODE * whole)]
+    changes = reference.t[
+        (reference.t > begin + TABLES.one_node * whole) & (reference.t < end - TABLES.one_node * whole)
+    ]
     if sides.size:
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * just]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), ONE_NODE * whole)
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TABLES.one_node * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
     mesh = cut(nodes, parts)
     fractions = (mesh - begin) / (end - begin)

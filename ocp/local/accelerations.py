@@ -30,9 +30,23 @@ from ocp.tasks.zmp_rules import checked_place
 
 __all__ = ["AccelerationSolution", "Layer", "Stabiliser", "Stop", "resolve_accelerations"]
 
-CHUNK = 50  # steps between two looks at the motion
-TIP_TOLERANCE = 1e-3  # m and rad
-CVODES_STEPS = 5000  # of the integrator between two samples
+
+@dataclass(frozen=True)
+class StepSettings:
+    """How a motion by accelerations is integrated and looked at.
+
+    Attributes:
+        chunk: Steps between two looks at the motion.
+        tip_tolerance: m and rad, by which the tip may miss its task before the motion stops.
+        cvodes_steps: Of the integrator between two samples.
+    """
+
+    chunk: int = 50
+    tip_tolerance: float = 1e-3
+    cvodes_steps: int = 5000
+
+
+STEPPING = StepSettings()
 
 
 @dataclass(frozen=True)
@@ -81,7 +95,7 @@ class AccelerationSolution:
             "lift_off": not motion.stays_on_ground,
             "leaves_foot": not motion.stays_in_foot,
             "joint_limits": not motion.stays_in_limits,
-            "leaves_path": not bool((self.tip_error <= TIP_TOLERANCE).all()),
+            "leaves_path": not bool((self.tip_error <= STEPPING.tip_tolerance).all()),
         }
         first = () if self.stopped is None else (self.stopped.reason,)
         return (*first, *(name for name, is_wrong in wrong.items() if is_wrong and name not in first))
@@ -184,7 +198,7 @@ def resolve_accelerations(
     state, done = np.concatenate([joints, velocities]), 0
     stopped = watch.look(np.zeros(1), state[None, :])
     while done < steps and stopped is None:
-        count = min(CHUNK, steps - done)
+        count = min(STEPPING.chunk, steps - done)
         times = np.asarray((done + np.arange(1, count + 1)) * simulate.step, dtype=float)
         stopped = watch.look(times, simulate.advance(done * simulate.step, state, count))
         state, done = watch.state, done + count
@@ -214,7 +228,7 @@ class _Simulation:
             options = {
                 "abstol": tolerance,
                 "reltol": tolerance,
-                "max_num_steps": CVODES_STEPS,
+                "max_num_steps": STEPPING.cvodes_steps,
                 "disable_internal_warnings": True,
                 "show_eval_warnings": False,
             }

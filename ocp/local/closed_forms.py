@@ -27,17 +27,33 @@ __all__ = ["ClosedForm", "closed_forms"]
 
 SIX, SCARA, MOST = 6, 4, 8
 """Joints of the arms that closed forms are known of, and as many as an arm may have, those that are held counted."""
-STRAIGHT = 1e-6
-"""Share of the arm's size, and rad, up to which axes meet or are parallel; what is left Newton's method takes up."""
-NEAR = 1e-3
-"""Miss of equations up to which what solves them is corrected: where two solutions meet they are so inexact."""
-STEPS, EXACT, ROUGH = 8, 1e-10, 0.1
-"""Newton steps at most, and shares of the arm's size, and rad, that the pose is missed by at last, and ever."""
-SAME = 1e-6
-"""rad: postures nearer to each other are one."""
 POSTURES = 8
 """At most, at one pose, of joints that turn."""
 TURN = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class FormSettings:
+    """How exact geometry and solutions of a closed form have to be.
+
+    Attributes:
+        straight: Share of the arm's size, and rad, up to which axes meet or are parallel; Newton's method refines.
+        near: Miss of equations up to which what solves them is corrected: where two solutions meet they are so inexact.
+        steps: Of Newton's method at most.
+        exact: Share of the arm's size, and rad, that the pose is missed by at last.
+        rough: Share of the arm's size, and rad, that the pose is missed by ever.
+        same: rad: postures nearer to each other are one.
+    """
+
+    straight: float = 1e-6
+    near: float = 1e-3
+    steps: int = 8
+    exact: float = 1e-10
+    rough: float = 0.1
+    same: float = 1e-6
+
+
+FORMS = FormSettings()
 
 
 class Motion(NamedTuple):
@@ -182,7 +198,7 @@ def _forms_of_scara(arm: _Arm) -> tuple[ClosedForm, ...]:
     if len(slides) != 1 or arm.kind_of(three) != "parallel":
         return ()
     lean = float(np.linalg.norm(np.cross(arm.ways[slides[0]], arm.ways[three[0]])))
-    return (arm.form("scara", three, ()),) if lean < STRAIGHT else ()
+    return (arm.form("scara", three, ()),) if lean < FORMS.straight else ()
 
 
 def _forms_of_six(arm: _Arm) -> tuple[ClosedForm, ...]:
@@ -229,15 +245,15 @@ class _Arm(NamedTuple):
         if not self.turns[list(three)].all():
             return ""
         leans = [float(np.linalg.norm(np.cross(ways[one], ways[other]))) for one, other in pairwise(three)]
-        if max(leans) < STRAIGHT:
+        if max(leans) < FORMS.straight:
             apart = [points[other] - points[one] for one, other in pairwise(three)]
             apart = [way - way @ ways[three[0]] * ways[three[0]] for way in apart]
-            return "parallel" if min(map(np.linalg.norm, apart)) > STRAIGHT * self.size else ""
+            return "parallel" if min(map(np.linalg.norm, apart)) > FORMS.straight * self.size else ""
         across = np.eye(3) - ways[list(three), :, None] * ways[list(three), None, :]
         pulled = np.einsum("kij,kj->ki", across, points[list(three)])
-        point = np.linalg.lstsq(across.sum(axis=0), pulled.sum(axis=0), rcond=STRAIGHT)[0]
+        point = np.linalg.lstsq(across.sum(axis=0), pulled.sum(axis=0), rcond=FORMS.straight)[0]
         off = np.linalg.norm(np.einsum("kij,j->ki", across, point) - pulled, axis=1).max()
-        return "meeting" if min(leans) > STRAIGHT and off < STRAIGHT * self.size else ""
+        return "meeting" if min(leans) > FORMS.straight and off < FORMS.straight * self.size else ""
 
 
 def _dot(one: Array, other: Array) -> Array:
@@ -291,7 +307,7 @@ def _pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array
     """Angles with a [cos, sin](first) + b [cos, sin](second) = c. Shapes (M, 2, 2), (M, 2, 2), (M, 2)."""
     left, size, right = np.linalg.svd(b)
     size = size + 1e-300
-    low = size[:, 1] < STRAIGHT * size[:, 0]
+    low = size[:, 1] < FORMS.straight * size[:, 0]
     alpha, gamma = left.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", left, c)
     # w(z) = gamma - delta z - conj(delta) / z with z = exp(i first), and (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1
     delta = (alpha[:, :, 0] - 1j * alpha[:, :, 1]) / 2
@@ -307,7 +323,7 @@ def _pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array
     straight = _roots(rows[:, 1])
     roots[low] = np.concatenate([straight, np.full_like(straight, np.nan)], axis=1)[low]
     with np.errstate(divide="ignore", invalid="ignore"):
-        own, column = np.nonzero(np.abs(np.log(np.abs(roots))) < NEAR)
+        own, column = np.nonzero(np.abs(np.log(np.abs(roots))) < FORMS.near)
     first = np.angle(roots[own, column])
     missing = gamma[own] - np.einsum("kij,kj->ki", alpha[own], np.column_stack([np.cos(first), np.sin(first)]))
     cosine = np.clip(missing[:, 0] / size[own, 0], -1.0, 1.0)
@@ -316,7 +332,7 @@ def _pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array
     for side in (sine, -sine):
         unit = np.einsum("kji,kj->ki", right[own], np.column_stack([cosine, side]))
         off = np.abs(missing - size[own] * np.column_stack([cosine, side])).max(axis=1)
-        good = off < NEAR * np.maximum(size[own, 0], 1e-12) ** 0.5
+        good = off < FORMS.near * np.maximum(size[own, 0], 1e-12) ** 0.5
         found.append((own[good], first[good], np.arctan2(unit[good, 1], unit[good, 0])))
     owns, firsts, seconds = (np.concatenate(part) for part in zip(*found, strict=True))
     return owns, firsts, seconds
@@ -402,7 +418,7 @@ def _corrected(
     """Angles that put the tip (M, 3) where it is to be, by Newton's method from rough ones; each once."""
     found, good = found.copy(), np.zeros(len(own), dtype=bool)
     busy = np.arange(len(own))
-    for _ in range(STEPS):
+    for _ in range(FORMS.steps):
         if not busy.size:
             break
         at = own[busy]
@@ -423,8 +439,8 @@ def _corrected(
         missed = np.concatenate([spin / 2, (tip[at] - left.back.at(tip[at])) / size], axis=1)
         over = np.trace(turn, axis1=1, axis2=2) < 1  # turned by a right angle or more
         worst = np.abs(missed).max(axis=1)
-        good[busy[(worst < EXACT) & ~over]] = True
-        on = (worst >= EXACT) & ~over & (worst < ROUGH)
+        good[busy[(worst < FORMS.exact) & ~over]] = True
+        on = (worst >= FORMS.exact) & ~over & (worst < FORMS.rough)
         step = np.einsum("kij,kj->ki", np.linalg.pinv(np.stack(columns, axis=2)[on], rcond=1e-8), missed[on])
         busy = busy[on]
         found[busy] += np.clip(step, -1.0, 1.0)
@@ -436,5 +452,5 @@ def _corrected(
     for apart in range(1, 2 * POSTURES):
         way = found[apart:] - found[:-apart]
         way[:, turns] -= TURN * np.round(way[:, turns] / TURN)
-        twice[apart:] |= (own[apart:] == own[:-apart]) & (np.abs(way) < SAME).all(axis=1)
+        twice[apart:] |= (own[apart:] == own[:-apart]) & (np.abs(way) < FORMS.same).all(axis=1)
     return own[~twice], found[~twice]

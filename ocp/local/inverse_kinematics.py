@@ -28,20 +28,44 @@ from ocp.tasks.tip_task import ANGULAR, TipTask
 __all__ = ["Posture", "Unreachable", "inverse_kinematics", "postures_of"]
 
 LARGEST_SEED = 2**64
-TOLERANCE, APART, ITERATIONS = 1e-10, 1e-3, 100
-"""m and rad, of a solution and between two; of each start."""
-SLIDE_SPREAD = 1.0
-"""m: of the starts of slides without limits."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
-GROWTH, SHRINKAGE = 4.0, 0.25
-"""Of the damping after a step that fails, and one that succeeds."""
+
+
+@dataclass(frozen=True)
+class InverseSettings:
+    """How postures are looked for: Levenberg-Marquardt steps from many starts.
+
+    Attributes:
+        tolerance: Largest misfit of a posture, m and rad.
+        apart: Postures nearer to each other are one, m and rad.
+        iterations: Of each start.
+        slide_spread: m: of the starts of slides without limits.
+        first_damping: Of the first step.
+        least_damping: Below which it does not fall.
+        most_damping: At which a start is given up.
+        growth: Of the damping after a step that fails.
+        shrinkage: Of the damping after a step that succeeds.
+        reach_tolerance: A pose missed by less, m or rad, is not called out of reach.
+        slid: Postures that touch least, slid along their self-motions where all of them touch.
+        simpson_steps: Over which a velocity is summed up to a position.
+    """
+
+    tolerance: float = 1e-10
+    apart: float = 1e-3
+    iterations: int = 100
+    slide_spread: float = 1.0
+    first_damping: float = 1e-2
+    least_damping: float = 1e-12
+    most_damping: float = 1e8
+    growth: float = 4.0
+    shrinkage: float = 0.25
+    reach_tolerance: float = 1e-4
+    slid: int = 8
+    simpson_steps: int = 400
+
+
+INVERSE = InverseSettings()
+
 """Instants of the horizon at which a task's poses are looked for, the start among them."""
-REACH_TOLERANCE = 1e-4
-"""A pose missed by less, m or rad, is not called out of reach."""
-SLID = 8
-"""Postures that touch least, slid along their self-motions where all of them touch."""
-SIMPSON_STEPS = 400
-"""Over which a velocity is summed up to a position."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +113,9 @@ def inverse_kinematics(
     near: Any = None,
     seed: int = 0,
     limits: bool = True,
-    tolerance: float = TOLERANCE,
-    apart: float = APART,
-    iterations: int = ITERATIONS,
+    tolerance: float = INVERSE.tolerance,
+    apart: float = INVERSE.apart,
+    iterations: int = INVERSE.iterations,
     surroundings: Surroundings | None = None,
 ) -> list[Posture]:
     """Different joint positions at which the machine is where its pose tasks want it, the best first.
@@ -157,7 +181,7 @@ def inverse_kinematics(
     nearest = _touching(distinct, surroundings, place, float(time))
     if all(nearest) and equations.size < size:
         order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
-        least = np.array([distinct[k].joints for k in order[:SLID]])
+        least = np.array([distinct[k].joints for k in order[: INVERSE.slid]])
         moved = slid(
             surroundings,
             place,
@@ -194,9 +218,9 @@ class _Search:
     targets: Array
     lower: Array
     upper: Array
-    tolerance: float = TOLERANCE
-    apart: float = APART
-    iterations: int = ITERATIONS
+    tolerance: float = INVERSE.tolerance
+    apart: float = INVERSE.apart
+    iterations: int = INVERSE.iterations
 
     def postures(self, first: Array, random: int) -> list[Posture]:
         """Those that starts (K, n) lead to, the best first; of the last `random` ones angles without limits come round.
@@ -249,18 +273,18 @@ def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: An
         time: s, from when the task begins.
     """
     if task.is_pose:
-        return task if task.start_gap <= REACH_TOLERANCE else None
+        return task if task.start_gap <= INVERSE.reach_tolerance else None
     rows = [row for row in task.chosen if row not in ANGULAR]
     if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
         return None
     equations = bind(machine, task)
-    times = np.linspace(0.0, time, SIMPSON_STEPS + 1)
+    times = np.linspace(0.0, time, INVERSE.simpson_steps + 1)
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    weights = np.ones(SIMPSON_STEPS + 1)
+    weights = np.ones(INVERSE.simpson_steps + 1)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     moved = np.zeros(3)
     wanted = values[[task.chosen.index(row) for row in rows]]
-    moved[[row - 3 for row in rows]] = wanted @ weights * time / SIMPSON_STEPS / 3
+    moved[[row - 3 for row in rows]] = wanted @ weights * time / INVERSE.simpson_steps / 3
     first, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(first)).ravel() + moved)
 
@@ -268,7 +292,7 @@ def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: An
 def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
     size, rng = machine.joint_size, np.random.default_rng(seed)
     slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
-    span = np.where(slides, SLIDE_SPREAD, np.pi)
+    span = np.where(slides, INVERSE.slide_spread, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
     try:
@@ -309,9 +333,9 @@ def gauss_newton(
         return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
 
     residual, jacobian = evaluate(q)
-    cost, damping = (residual**2).sum(axis=1), np.full(count, FIRST_DAMPING)
+    cost, damping = (residual**2).sum(axis=1), np.full(count, INVERSE.first_damping)
     for _ in range(iterations):
-        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < MOST_DAMPING)
+        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < INVERSE.most_damping)
         if not busy.any():
             break
         gradient = np.einsum("kij,ki->kj", jacobian, residual)
@@ -326,12 +350,12 @@ def gauss_newton(
         better = busy & (new_cost < cost)
         q[better], residual[better], jacobian[better] = trial[better], new_residual[better], new_jacobian[better]
         cost[better] = new_cost[better]
-        less, more = np.maximum(SHRINKAGE * damping, LEAST_DAMPING), GROWTH * damping
+        less, more = np.maximum(INVERSE.shrinkage * damping, INVERSE.least_damping), INVERSE.growth * damping
         damping = np.where(better, less, np.where(busy, more, damping))
     return q, np.abs(residual).max(axis=1)
 
 
-def distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float = APART) -> list[Posture]:
+def distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float = INVERSE.apart) -> list[Posture]:
     """Of those nearer than `apart`, full turns not counted, the best."""
     kept: list[Posture] = []
     for posture in found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -33,15 +34,31 @@ __all__ = [
     "rates_at_rest",
 ]
 
-TRACK_SAMPLES = 201
-CLOSURE_SAMPLES = 2001
-CLOSED = 1e-6
-"""Largest gap of a closed path, m and rad."""
-IGNORABLE, IGNORABLE_SAMPLES = 1e-9, 4
-ROUNDING = 1e-9
-"""rad or m, of a joint with a limit below 1, else of its limit: how far beyond it rounding may have it."""
-STILL = 1e-6
-"""Largest velocity asked for where the joints are to rest, m/s and rad/s."""
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """How finely tasks are looked at before anything is solved, and what counts as nothing.
+
+    Attributes:
+        track_samples: Of a track.
+        closure_samples: Of a closed track: an odd number, for Simpson's rule.
+        closed: Largest gap of a closed path, m and rad.
+        ignorable: Relative change below which a joint changes nothing.
+        ignorable_samples: Random configurations in which that is looked at.
+        rounding: rad or m, of a joint with a limit below 1, else of its limit: how far beyond it rounding may have it.
+        still: Largest velocity asked for where the joints are to rest, m/s and rad/s.
+    """
+
+    track_samples: int = 201
+    closure_samples: int = 2001
+    closed: float = 1e-6
+    ignorable: float = 1e-9
+    ignorable_samples: int = 4
+    rounding: float = 1e-9
+    still: float = 1e-6
+
+
+CHECKS = CheckSettings()
 
 
 def checked_horizon(horizon: Any) -> float:
@@ -99,7 +116,7 @@ def inside_limits(what: str, names: Sequence[str], joints: Array, lower: Array, 
         ProblemError: A joint farther outside its limits; ends with a hint what to do.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
-        if value < low - ROUNDING * max(1.0, abs(low)) or value > high + ROUNDING * max(1.0, abs(high)):
+        if value < low - CHECKS.rounding * max(1.0, abs(low)) or value > high + CHECKS.rounding * max(1.0, abs(high)):
             at, least, most = told_apart(value, low, high)
             verb = "ends" if what.startswith("end") else "starts"
             words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {most}; {hint}"
@@ -159,7 +176,7 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
         raise ProblemError(words, name="rows", value=rows)
     if not any(part.task.is_pose for part in equations.bound):
         return
-    times, values = _sampled(equations, horizon, TRACK_SAMPLES)
+    times, values = _sampled(equations, horizon, CHECKS.track_samples)
     if not (finite := np.isfinite(values).all(axis=0)).all():
         first = float(times[~finite][0])
         words = f"the task's targets are not finite at {first:g} s"
@@ -203,7 +220,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
     function = ca.Function("asked", [b, q, u, targets], parts, {"cse": True})
     at_zero = np.array(equations.target_function()(0.0)).ravel()
     found = np.ones(n, dtype=bool)
-    for _ in range(IGNORABLE_SAMPLES):
+    for _ in range(CHECKS.ignorable_samples):
         rates, places = rng.normal(size=n), np.tile(rng.normal(size=n), (n + 1, 1))
         places[np.arange(n), np.arange(n)] += rng.normal(size=n)
         seen = []
@@ -212,7 +229,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
             inverse = np.linalg.pinv(jacobian, rcond=1e-10)
             seen.append(np.concatenate([np.ravel(v) for v in (inverse @ jacobian, inverse @ right, base_rate, lean)]))
         changes = np.abs(np.array(seen[:-1]) - seen[-1]).max(axis=1, initial=0.0)
-        found &= changes <= IGNORABLE * (1 + np.abs(seen[-1]).max(initial=0.0))
+        found &= changes <= CHECKS.ignorable * (1 + np.abs(seen[-1]).max(initial=0.0))
     return found
 
 
@@ -265,25 +282,25 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
     Poses by their targets, velocities by their integrals.
     """
-    times, values = _sampled(equations, horizon, CLOSURE_SAMPLES)
+    times, values = _sampled(equations, horizon, CHECKS.closure_samples)
     for part, mine in _parts(equations, values):
         task = part.task
         if task.is_pose:
             gap = np.abs(np.delete(mine[:, -1] - mine[:, 0], _rate_rows(task))).max()
         else:
             closes = is_holonomic(part)
-            none = np.zeros(CLOSURE_SAMPLES)
+            none = np.zeros(CHECKS.closure_samples)
             whole = [mine[list(task.chosen).index(row)] if row in task.chosen else none for row in ANGULAR]
             linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and closes[i]]
             moved = _integral(mine[linear], times[1])
             turned = _turn(np.array(whole), times[1]) if closes[[row in ANGULAR for row in task.chosen]].any() else 0.0
             gap = max(float(np.abs(moved).max(initial=0.0)), turned)
-        if gap > CLOSED:
+        if gap > CHECKS.closed:
             words = (
                 f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
                 "from where it began, and the joints cannot return; close the path"
             )
-            raise ProblemError(words, name=_frame(part), value=gap, limit=CLOSED)
+            raise ProblemError(words, name=_frame(part), value=gap, limit=CHECKS.closed)
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
@@ -294,12 +311,12 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
             continue
         for part, mine in _parts(equations, np.array(targets(time)).ravel()):
             asked = mine[_rate_rows(part.task)] if part.task.is_pose else mine
-            if np.linalg.norm(asked) > STILL:
+            if np.linalg.norm(asked) > CHECKS.still:
                 words = (
                     f"the task of {_frame(part)!r} moves at {asked.tolist()} (m/s or rad/s) at {time:g} s, where the "
                     "joints are to be at rest; let it come to rest there, or say 'free' for that end"
                 )
-                raise ProblemError(words, name=_frame(part), value=asked, limit=STILL, time=float(time))
+                raise ProblemError(words, name=_frame(part), value=asked, limit=CHECKS.still, time=float(time))
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
@@ -308,7 +325,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
             continue
-        times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, TRACK_SAMPLES)
+        times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, CHECKS.track_samples)
         wanted = values[task.linear].T
         shoulder, reach = _reach(part.tip, base)
         far = np.linalg.norm(wanted - shoulder[task.linear], axis=1)
@@ -330,18 +347,18 @@ def check_speed(equations: TaskEquations, most: Array, begin: float, end: float)
         equations: Of a fixed base; others are not looked at.
         most: Limits of the joint rates, rad/s or m/s, shape (n,). begin, end: Of the tasks, s.
     """
-    times = np.linspace(begin, end, TRACK_SAMPLES)[1:-1]
+    times = np.linspace(begin, end, CHECKS.track_samples)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
     for part, mine in _parts(equations, values):
         chain = [joint for joint in part.tip.robot.path_to(part.tip.robot.tip_link) if joint.moves]
         task, moving = part.task, any(joint.mimic is not None for joint in chain)
-        if part.tip.base_size or part.reference or task.axes != "world" or moving or task.start_gap > CLOSED:
+        if part.tip.base_size or part.reference or task.axes != "world" or moving or task.start_gap > CHECKS.closed:
             continue
         for asked, limit, unit in zip(
             _speeds(task, mine), _fastest(part.tip, chain, most), ("m/s", "rad/s"), strict=True
         ):
             worst = int(asked.argmax())
-            if asked[worst] > limit * (1 + CLOSED):
+            if asked[worst] > limit * (1 + CHECKS.closed):
                 words = (
                     f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {asked[worst]:.4g} {unit}, "
                     f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
@@ -417,16 +434,18 @@ def _rate_rows(task: TipTask) -> list[int]:
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Simpson's rule over an odd number of samples. Shapes (k, CLOSURE_SAMPLES) to (k,)."""
-    weights = np.ones(CLOSURE_SAMPLES)
+    """Simpson's rule over an odd number of samples. Shapes (k, samples) to (k,)."""
+    weights = np.ones(CHECKS.closure_samples)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
 def _turn(spin: Array, step: float) -> float:
-    """Angle (rad) by which an angular velocity in world axes, shape (3, CLOSURE_SAMPLES), turns a body in all."""
+    """Angle (rad) by which an angular velocity in world axes, shape (3, samples), turns a body in all."""
     turn = np.eye(3)
-    for k in range(0, CLOSURE_SAMPLES - 1, 2):  # Magnus' expansion of fourth order over two steps by Simpson's rule
+    for k in range(
+        0, CHECKS.closure_samples - 1, 2
+    ):  # Magnus' expansion of fourth order over two steps by Simpson's rule
         first, middle, last = spin[:, k], spin[:, k + 1], spin[:, k + 2]
         width = 2 * step
         vector = width / 6 * (first + 4 * middle + last) + width**2 / 12 * np.cross(last, first)
@@ -456,7 +475,7 @@ def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDAr
     for _ in range(len(jacobian)):
         best = int((jacobian**2).sum(axis=0).argmax())
         length = np.linalg.norm(jacobian[:, best])
-        if length < IGNORABLE:  # singular: the joints left out move the tip all ways that there are
+        if length < CHECKS.ignorable:  # singular: the joints left out move the tip all ways that there are
             break
         direction = jacobian[:, best] / length
         jacobian = jacobian - np.outer(direction, direction @ jacobian)

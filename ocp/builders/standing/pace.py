@@ -10,7 +10,7 @@ steps are refused only where a solver that starts from the times that are asked 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,20 +32,34 @@ __all__ = ["guess_in_time"]
 COARSE = Collocation(4, degree=2, scheme="legendre")
 ROUGHLY = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 """Of IPOPT: what is wanted are durations to a percent."""
-BRIEFLY = 60
-"""Iterations for steps in the times that are asked, where longer ones are found; those that exist took 31 to 51."""
-NEAR = 0.05
-"""Share of a duration by which so coarse a mesh may be wrong: from 3 to 12 intervals it differs by up to .016."""
-PRICE = 1e4
-"""Of a duration once more, over those of accelerations and rates of a radian in that time."""
-LONGER, LONGEST = 5.0, 50.0
-"""Durations of the guess, and the most, over those that are asked."""
-SAMPLES = 21
-"""Of a phase, at which it is looked what is at its limit."""
-MET = 0.01
-"""Distance from a limit, over the way that it has along the motion, at which a row counts as at its limit."""
-TOLD = 3
-"""Limits that are named, at most."""
+
+
+@dataclass(frozen=True)
+class PaceSettings:
+    """How it is found out whether steps can be taken in their times, on a coarse mesh.
+
+    Attributes:
+        iterations: For steps in the times that are asked, where longer ones are found; those that exist took 31 to 51.
+        near: Share of a duration by which so coarse a mesh may be wrong: 3 and 12 intervals differ by up to .016.
+        price: Of a duration once more, over those of accelerations and rates of a radian in that time.
+        longer: Durations of the guess, over those that are asked.
+        longest: The longest durations, over those that are asked.
+        samples: Of a phase, at which it is looked what is at its limit.
+        met: Distance from a limit, over the way that it has along the motion, at which a row counts as at its limit.
+        told: Limits that are named, at most.
+    """
+
+    iterations: int = 60
+    near: float = 0.05
+    price: float = 1e4
+    longer: float = 5.0
+    longest: float = 50.0
+    samples: int = 21
+    met: float = 0.01
+    told: int = 3
+
+
+PACE = PaceSettings()
 
 
 def guess_in_time(
@@ -73,9 +87,9 @@ def guess_in_time(
             _check_conflicts(problem, found)
         return None
     spans = {name: end - begin for name, (begin, end) in found.phases.items()}
-    if any(spans[name] > (1 + NEAR) * each for name, each in seconds.items()):
+    if any(spans[name] > (1 + PACE.near) * each for name, each in seconds.items()):
         # a minimum beside may be quicker
-        brief = {**options, **ROUGHLY, "max_iter": BRIEFLY}
+        brief = {**options, **ROUGHLY, "max_iter": PACE.iterations}
         asked_for = solve(steps_problem(steps, start_joints, **asked), COARSE, options=brief, check=False)
         if not asked_for.success:
             raise _too_fast(problem, found, seconds, spans)
@@ -91,7 +105,7 @@ def guess_in_time(
 def _unhurried(steps: Steps, start_joints: Any, asked: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
     """The same steps with durations of at least so many seconds; prices in units of their mean, at any scale alike."""
     phases = [
-        replace(phase, duration=FreeTime(each, LONGEST * each, LONGER * each))
+        replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.longer * each))
         if (each := seconds.get(name)) is not None
         else phase
         for name, phase in zip(steps.names, steps.phases, strict=True)
@@ -107,7 +121,7 @@ def _unhurried(steps: Steps, start_joints: Any, asked: Mapping[str, Any], second
     slower = replace(steps, phases=tuple(phases))
     problem = steps_problem(slower, start_joints, **{**asked, "weights": weights})
     problem.minimize(
-        0, PRICE * default.acceleration * sum(problem[name].duration / each for name, each in seconds.items())
+        0, PACE.price * default.acceleration * sum(problem[name].duration / each for name, each in seconds.items())
     )
     return problem
 
@@ -122,7 +136,7 @@ def _check_conflicts(problem: Phases, found: Solution) -> None:
         lines = [
             f"  {each.label} would have to go {each.amount:.3g} beyond its {each.side} bound {each.bound:.4g}, at "
             f"{100 * each.fraction:.0f} % of its phase"
-            for each in error.conflicts[:TOLD]
+            for each in error.conflicts[: PACE.told]
         ]
         words = "no steps were found, however long they may take; near the guess"
         worst = error.conflicts[0]
@@ -133,7 +147,7 @@ def _check_conflicts(problem: Phases, found: Solution) -> None:
 def _too_fast(problem: Phases, found: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]) -> SolveError:
     """That the quickest steps take longer, in which phases, and what they meet there."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
-    late = [name for name in late if spans[name] > (1 + NEAR) * seconds[name]]
+    late = [name for name in late if spans[name] > (1 + PACE.near) * seconds[name]]
     lines = [
         f"  phase {name!r}: {spans[name]:.3g} s, {seconds[name]:.3g} s are asked; {_met(problem, found, name)}"
         for name in late
@@ -147,14 +161,14 @@ def _too_fast(problem: Phases, found: Solution, seconds: Mapping[str, float], sp
 def _met(problem: Phases, found: Solution, phase: str) -> str:
     """What is at its limits in a phase, and for which share of it, in words."""
     form = Formulation.of(problem)
-    at = np.linspace(0.0, 1.0, SAMPLES)
+    at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = found.state_interpolant(at), found.control_interpolant(at)
     p = form.parameter_vector({})
     rows = form.sampled([form.path.expression], x, u, at, found.horizon, p)[0]
     places = np.concatenate([form.bounds.places["state"], form.bounds.places["control"], form.path.bounds])
     low, high = (side[places] for side in form.bound_values(p))
     values = np.hstack([x, u, rows])
-    near = np.minimum(values - low, high - values) <= MET * np.ptp(values, axis=0)
+    near = np.minimum(values - low, high - values) <= PACE.met * np.ptp(values, axis=0)
     near[:, low == high] = False
     names = [label.partition("[")[0] for label in (*form.state_labels, *form.control_labels, *form.path.labels)]
     shares = {
@@ -164,5 +178,5 @@ def _met(problem: Phases, found: Solution, phase: str) -> str:
         for name in dict.fromkeys(names)
         if name.startswith(f"{phase}.") and name != f"{phase}.{DURATION}"
     }
-    most = sorted((name for name in shares if shares[name] > 0), key=lambda name: -shares[name])[:TOLD]
+    most = sorted((name for name in shares if shares[name] > 0), key=lambda name: -shares[name])[: PACE.told]
     return "at their limits " + ", ".join(f"{name} for {100 * shares[name]:.0f} % of it" for name in most)

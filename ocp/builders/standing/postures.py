@@ -5,6 +5,7 @@ A first guess of steps is made of them: from posture to posture, at rest in each
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -22,14 +23,29 @@ from ocp.tasks.tip_task import TipTask
 
 __all__ = ["PLACED", "check_placed", "first_guess", "foot_task", "hold", "standing_posture"]
 
-NEAR = 1.0  # weight of a joint's square distance from where it was, 1/rad^2
-OVER = 300.0  # weight of the center of mass's, 1/m^2: a centimetre as a tenth of a radian and less
-KEPT = 1e-9
-"""Gap between a foot and its foothold, m or rad, that a posture may have."""
 PLACED = 1e-6
 """Gap between a foot and its foothold that a start may have, m or rad."""
-GUESS_STEPS = 40
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
+
+
+@dataclass(frozen=True)
+class PostureSettings:
+    """How a standing posture near another is looked for.
+
+    Attributes:
+        near: Weight of a joint's square distance from where it was, 1/rad^2.
+        over: Weight of the center of mass's, 1/m^2: a centimetre as a tenth of a radian and less.
+        kept: Gap between a foot and its foothold, m or rad, that a posture may have.
+        steps: Of the guess of a step.
+    """
+
+    near: float = 1.0
+    over: float = 300.0
+    kept: float = 1e-9
+    steps: int = 40
+
+
+POSTURES = PostureSettings()
 
 
 def hold(stance: Stance, places: dict[str, Foothold]) -> TaskEquations:
@@ -76,19 +92,19 @@ def standing_posture(stance: Stance, near: Any, over: Any = None) -> Array:
     if stance.others:
         equations = hold(stance, {name: stance.footholds[name] for name in stance.others})
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
-    cost = NEAR * ca.sumsqr(q - begin)
+    cost = POSTURES.near * ca.sumsqr(q - begin)
     if over is not None:
         wanted = checked_numbers(over, 2, "over", "x and y on the ground")
-        cost += OVER * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
+        cost += POSTURES.over * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
     solver = ca.nlpsol("posture", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
     found = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     left = float(np.abs(np.array(found["g"])).max(initial=0.0))
-    if not left < KEPT * 1e3:
+    if not left < POSTURES.kept * 1e3:
         words = (
             f"no posture within the joint limits puts the feet {list(stance.footholds)} on their footholds: the "
             f"nearest that was found is {left:.3g} m or rad away; put them nearer, or start from another posture"
         )
-        raise ProblemError(words, name="footholds", value=left, limit=KEPT)
+        raise ProblemError(words, name="footholds", value=left, limit=POSTURES.kept)
     return np.asarray(np.clip(np.array(found["x"]).ravel(), lower, upper))
 
 
@@ -149,7 +165,7 @@ def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
 
 def _through(postures: Array, seconds: float) -> dict[str, Any]:
     """From posture to posture over a time: quintics from rest to rest, of two pieces a cubic through the middle."""
-    share = np.linspace(0.0, 1.0, GUESS_STEPS + 1)
+    share = np.linspace(0.0, 1.0, POSTURES.steps + 1)
     first, last = postures[0], postures[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]
     if len(postures) == 3:

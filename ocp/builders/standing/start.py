@@ -6,6 +6,7 @@ Limits of the joints, and what the ground bears; the guess is the task done loca
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -28,15 +29,27 @@ from ocp.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_e
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
 
-MISSED = 1e-6
-"""Share of a limit by which it has to be missed to count as missed."""
 
-FAR = 1e6
-"""Greatest acceleration that is thought of, rad/s^2 or m/s^2."""
+@dataclass(frozen=True)
+class StartSettings:
+    """How a start at rest is judged, and a standing motion guessed.
 
-DAMPING = 2.0  # 1/s, of the joint velocities in the null space of the guess
-GUESS_STEPS = 400
-RACING = 100.0  # rad/s or m/s, of a local motion near a singularity
+    Attributes:
+        missed: Share of a limit by which it has to be missed to count as missed.
+        far: Greatest acceleration that is thought of, rad/s^2 or m/s^2.
+        damping: 1/s, of the joint velocities in the null space of the guess.
+        steps: Of the guess.
+        racing: rad/s or m/s, of a local motion near a singularity, at which the guess stops.
+    """
+
+    missed: float = 1e-6
+    far: float = 1e6
+    damping: float = 2.0
+    steps: int = 400
+    racing: float = 100.0
+
+
+STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
@@ -125,9 +138,13 @@ def check_loads(
     function = ca.Function("start", [qdd], [ca.densify(values), ca.densify(ca.jacobian(values, qdd))])
     at_rest, slopes = (np.array(part) for part in function(rest))
     missed = _least_missed(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
-    if missed is None or missed.max(initial=0.0) <= MISSED:
+    if missed is None or missed.max(initial=0.0) <= STARTS.missed:
         return
-    words = [f"{what}, by {100 * share:.3g} %" for (_, what), share in zip(rows, missed, strict=True) if share > MISSED]
+    words = [
+        f"{what}, by {100 * share:.3g} %"
+        for (_, what), share in zip(rows, missed, strict=True)
+        if share > STARTS.missed
+    ]
     message = (
         f"start_joints {np.round(joints, 4).tolist()}: whatever the joints do there, limits are missed: "
         f"{'; '.join(words)}; start elsewhere, load the tip less, or allow for more"
@@ -185,7 +202,7 @@ def _least_missed(
     rows, wanted = (np.zeros((0, n)), np.zeros(0)) if demand is None else demand
     matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [rows, np.zeros((len(rows), 2 * m))]])
     lower, upper = np.concatenate([low - at_rest, wanted]), np.concatenate([high - at_rest, wanted])
-    reach = np.minimum(most, FAR)
+    reach = np.minimum(most, STARTS.far)
     sizes = np.concatenate([np.zeros(n), np.ones(2 * m)])
     settings = {"error_on_fail": False, "highs": {"output_flag": False}}
     shape = {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}
@@ -216,22 +233,22 @@ def local_guess(
     parts = [joints[None, :], still, still]
     try:
         found = resolve_accelerations(
-            machine, tasks, joints, horizon, null_damping=DAMPING, external=external,
-            step=horizon / GUESS_STEPS, stop_at_lift_off=False, speed_limit=RACING,
+            machine, tasks, joints, horizon, null_damping=STARTS.damping, external=external,
+            step=horizon / STARTS.steps, stop_at_lift_off=False, speed_limit=STARTS.racing,
         ).motion  # fmt: skip
     except ProblemError:  # the task and the start are checked: the start is singular, which a plan may still leave
         pass
     else:
-        racing = np.asarray((np.abs(found.joint_velocities) > RACING / 2).any(axis=1))
+        racing = np.asarray((np.abs(found.joint_velocities) > STARTS.racing / 2).any(axis=1))
         sound = int(racing.argmax()) if racing.any() else len(racing)
         times = found.t[:sound]
         parts = [part[:sound] for part in (found.joints, found.joint_velocities, found.joint_accelerations)]
     if times[-1] < horizon * (1 - 1e-9):
         parts = [np.vstack([part, more]) for part, more in zip(parts, (parts[0][-1:], still, still), strict=True)]
-        times = np.append(times, times[-1] + horizon / GUESS_STEPS)
+        times = np.append(times, times[-1] + horizon / STARTS.steps)
     names = ("joints", "velocities", "accelerations")
     guess: dict[str, Any] = {name: Samples(times, part) for name, part in zip(names, parts, strict=True)}
-    at = np.linspace(0.0, 1.0, GUESS_STEPS + 1)
+    at = np.linspace(0.0, 1.0, STARTS.steps + 1)
     along = (rest_to_rest(at), 30 * (at * (1 - at)) ** 2 / horizon, (60 * at - 180 * at**2 + 120 * at**3) / horizon**2)
     for name, values in zip(("path", "path_rate", "path_acceleration"), along, strict=True):
         guess[name] = Samples(at * horizon, values[:, None])
