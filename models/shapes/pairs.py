@@ -53,11 +53,26 @@ LIMITLESS = 1.0
 """m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
 SURE = 1e-6
 """m: more than rounding takes away from a proof of distance."""
-GRID, FINER, LOWEST = 24, 3, 8
-"""Steps of each of two joints between meshes, rounds of finer ones, and places that they are taken around."""
-FIRST, BOXES, ROUNDS = 24, 2000, 40
-"""Postures tried before a proof is; boxes of joint positions that one may take with up to three joints between the
-bodies, and rounds of halving them."""
+
+
+@dataclass(frozen=True)
+class ProofSettings:
+    """How much is tried for a pair before it is checked in any case.
+
+    Attributes:
+        first_postures: That are tried before a proof is.
+        boxes: Of joint positions that a proof may take with up to three joints between the bodies.
+        rounds: Of halving the boxes.
+        grid: Steps of each of two joints between meshes. finer_grids: Rounds of finer ones. lowest: Places that these
+            are taken around.
+    """
+
+    first_postures: int = 24
+    boxes: int = 2000
+    rounds: int = 40
+    grid: int = 24
+    finer_grids: int = 3
+    lowest: int = 8
 
 
 @dataclass(frozen=True)
@@ -296,10 +311,11 @@ class _Between:
     other: Shape
     up: list[Step]
     down: list[Step]
+    settings: ProofSettings = ProofSettings()
 
     def settled(self, low: Array, high: Array, postures: Array, near: float, overhang: float) -> Reason | None:
         """ALWAYS, COVERED or NEVER, or None for bodies that are to be checked."""
-        touching = self.gaps(postures[:FIRST])[0] <= 0
+        touching = self.gaps(postures[: self.settings.first_postures])[0] <= 0
         if touching.all():
             farthest = float(self.below(*self._relative(postures)).max())
             if farthest <= 0:
@@ -314,16 +330,16 @@ class _Between:
         columns = sorted({self.robot.drives[step.joint.name].column for step in (*self.up, *self.down)})
         first = np.where(np.isfinite(low), low, -np.pi)[columns]
         last = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], first + 2 * np.pi)
-        step = (last - first) / GRID
-        places = np.stack(np.meshgrid(*(np.arange(GRID + 1) for _ in columns), indexing="ij"), axis=-1)
+        step = (last - first) / self.settings.grid
+        places = np.stack(np.meshgrid(*(np.arange(self.settings.grid + 1) for _ in columns), indexing="ij"), axis=-1)
         tried = first + places.reshape(-1, len(columns)) * step
-        for _ in range(FINER):
+        for _ in range(self.settings.finer_grids):
             q = np.zeros((len(tried), self.robot.dof))
             q[:, columns] = tried
             gaps = self.gaps(q)[0]
             if gaps.min() <= SURE:
                 return ALWAYS if gaps.max() <= 0 else None
-            nearest = tried[np.argsort(gaps)[:LOWEST]]
+            nearest = tried[np.argsort(gaps)[: self.settings.lowest]]
             around = np.stack(np.meshgrid(*(np.linspace(-1, 1, 9) for _ in columns), indexing="ij"), axis=-1)
             offsets = around.reshape(-1, len(columns)) * step
             tried = np.clip((nearest[:, None] + offsets).reshape(-1, len(columns)), first, last)
@@ -389,8 +405,9 @@ class _Between:
         centre, half = np.zeros((1, len(low))), np.zeros((1, len(low)))
         centre[0, columns] = (first[columns] + last[columns]) / 2
         half[0, columns] = (last[columns] - first[columns]) / 2
-        taken, most = 0, BOXES // 4 ** max(0, len(columns) - 3)  # halving many joints seldom leads anywhere
-        for _ in range(ROUNDS):
+        most = self.settings.boxes // 4 ** max(0, len(columns) - 3)  # halving many joints seldom leads anywhere
+        taken = 0
+        for _ in range(self.settings.rounds):
             slack = np.array([lever.moved(half[:, lever.column]) for lever in levers])  # (levers, boxes)
             need = slack.sum(axis=0)
             gaps, close = self.gaps(centre, need + near)
