@@ -56,7 +56,7 @@ LAZY = {
     ("ocp.planning.motion", "ocp.app.plots"),
 }
 """Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
-SEEN_BY_ALL = {"models.cache", "models.input_files"}
+SEEN_BY_ALL = {"models.cache", "models.input_files", "models.shapes.nearest"}
 """What all of ocp may import of models: they know no machine."""
 FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
 

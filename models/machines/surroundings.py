@@ -24,7 +24,7 @@ from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.pairs import ASSUMED, COVERED, SRDF, TOLD, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, SRDF, STILL, TOLD, Reason, checked_pairs
 from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
@@ -92,7 +92,7 @@ class Surroundings:
     bodies: tuple[Placed, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
-    left: dict[tuple[str, str], str] = field(init=False, repr=False)
+    left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
     _held: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
@@ -136,16 +136,16 @@ class Surroundings:
 
     def _beside_obstacles(
         self, own: Sequence[Body], told: set[tuple[str, str]]
-    ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], str]]:
+    ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], Reason]]:
         """Bodies and obstacles that may touch, by their numbers; and why others are left."""
-        pairs, left = [], {}
+        pairs, left = [], dict[tuple[str, str], Reason]()
         for number, one in enumerate(self.obstacles):
             name = f"obstacle {number}"
             for i, body in enumerate(own):
                 if {(body.link, name), (name, body.link)} & told:
                     left[body.link, name] = TOLD
                 elif not self._moves(body.link) and not isinstance(one, Moving):
-                    left[body.link, name] = "neither moves"
+                    left[body.link, name] = STILL
                 else:
                     pairs.append((i, number))
         return pairs, left
@@ -214,7 +214,7 @@ class Surroundings:
         """Pairs of links that are left out by assumption, "one and other": no proof says that they always touch."""
         looked_at = {frozenset(self.told_as(pair)) for pair in self._held}  # by their hulls
         return {
-            " and ".join(pair): why
+            " and ".join(pair): why.value
             for pair, why in self.left.items()
             if why in ASSUMED and frozenset(pair) not in looked_at
         }

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
 from itertools import combinations
 from typing import Any, NamedTuple
 from warnings import warn
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,32 +27,52 @@ from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
 from models.shapes.bodies import Body
-from models.shapes.distance import distance, pair_function
+from models.shapes.nearest import gap_along, nearest_directions
 from models.shapes.rigid_parts import RigidParts, Step, arms
-from models.shapes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
-from models.spatial import Frame
+from models.shapes.shapes import Box, Shape
 
-NEIGHBOURS, RIGID, ALWAYS, NEVER = "neighbours", "one rigid part", "always touch", "never touch"
-COVERED = "always touch, perhaps only in their covers"
-"""Where in some posture bodies overlap by no more than their covers stand out of what they cover: this may be apart."""
+
+class Reason(StrEnum):
+    """Why a pair of bodies is not checked."""
+
+    NEIGHBOURS = "neighbours"
+    RIGID = "one rigid part"
+    ALWAYS = "always touch"
+    COVERED = "always touch, perhaps only in their covers"
+    """In some posture bodies overlap by no more than their covers stand out of what they cover: this may be apart."""
+    NEVER = "never touch"
+    SRDF = "the SRDF file"
+    TOLD = "told"
+    STILL = "neither moves"
+
+
+NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, TOLD, STILL = Reason
 ASSUMED = (ALWAYS, COVERED)
 """Reasons that no proof stands behind: bodies touch in each of many configurations."""
-SRDF, TOLD = "the SRDF file", "told"
 LIMITLESS = 1.0
 """m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
 SURE = 1e-6
 """m: more than rounding takes away from a proof of distance."""
-MOST_NORMALS = 200
-"""Of a hull, along which gaps are looked at."""
-NO_DIRECTION = 1e-9
-"""A vector along which two bodies might be apart and that is no longer, in m or as a sine, is none."""
-AT_ONCE = 2**20
-"""Numbers of an array that bounds are computed in."""
-GRID, FINER, LOWEST = 24, 3, 8
-"""Steps of each of two joints between meshes, rounds of finer ones, and places that they are taken around."""
-FIRST, BOXES, ROUNDS = 24, 2000, 40
-"""Postures tried before a proof is; boxes of joint positions that one may take with up to three joints between the
-bodies, and rounds of halving them."""
+
+
+@dataclass(frozen=True)
+class ProofSettings:
+    """How much is tried for a pair before it is checked in any case.
+
+    Attributes:
+        first_postures: That are tried before a proof is.
+        boxes: Of joint positions that a proof may take with up to three joints between the bodies.
+        rounds: Of halving the boxes.
+        grid: Steps of each of two joints between meshes. finer_grids: Rounds of finer ones. lowest: Places that these
+            are taken around.
+    """
+
+    first_postures: int = 24
+    boxes: int = 2000
+    rounds: int = 40
+    grid: int = 24
+    finer_grids: int = 3
+    lowest: int = 8
 
 
 @dataclass(frozen=True)
@@ -61,14 +81,13 @@ class Pairs:
 
     Attributes:
         checked: Those that are checked, as indices of the bodies, the lower first.
-        left: Why pairs of links are not: "one rigid part", "neighbours", "told", "the SRDF file", "always touch",
-            "always touch, perhaps only in their covers" or "never touch", by their names in the order of the bodies. A
-            pair of links with several bodies may be in both where only some of their bodies always touch, and one of
-            meshes where their covers always touch and their convex hulls do not.
+        left: Why pairs of links are not, by their names in the order of the bodies. A pair of links with several bodies
+            may be in both where only some of their bodies always touch, and one of meshes where their covers always
+            touch and their convex hulls do not.
     """
 
     checked: tuple[tuple[int, int], ...]
-    left: Mapping[tuple[str, str], str]
+    left: Mapping[tuple[str, str], Reason]
 
 
 def checked_pairs(
@@ -122,53 +141,34 @@ def checked_pairs(
     count = checked_count(samples, owner, "samples")
     near = checked_nonnegative(clearance, owner, "clearance", "m") + SURE
     rng = np.random.default_rng(checked_count(seed, owner, "seed", least=0, most=2**63))
-    told = {frozenset(pair): TOLD for pair in _named(robot, ignored)}
-    named = ({} if srdf is None else dict.fromkeys(_disabled(robot, srdf), SRDF)) | told
+    named = dict.fromkeys([] if srdf is None else _disabled(robot, srdf), SRDF)
+    named |= dict.fromkeys(map(frozenset, _named(robot, ignored)), TOLD)
 
     key = _key(robot, bodies, low, high, named, near, count, seed)
     if (known := _read(kept(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
     close = parts.close({parts.of_link[body.link] for body in bodies})
-    placed = [body.shape.placed(*parts.place[body.link]) for body in bodies]
-    postures = _postures(robot, low, high, count, rng)
+    motions = _Motions(robot, parts, low, high, _postures(robot, low, high, count, rng), near)
     checked: list[tuple[int, int]] = []
-    left: dict[tuple[str, str], str] = {}
-    of_hulls: dict[tuple[int, int], str | None] = {}
+    left: dict[tuple[str, str], Reason] = {}
     for i, j in combinations(range(len(bodies)), 2):
-        one, other = bodies[i].link, bodies[j].link
-        sides = frozenset((parts.of_link[one], parts.of_link[other]))
-        if len(sides) == 1:
-            reason: str | None = RIGID
-        elif (reason := named.get(frozenset((one, other)))) is None and sides in close:
-            reason = NEIGHBOURS
+        links = bodies[i].link, bodies[j].link
+        sides = frozenset(parts.of_link[link] for link in links)
+        reason = RIGID if len(sides) == 1 else named.get(frozenset(links), NEIGHBOURS if sides in close else None)
         if reason is None:
-            ends = parts.path(*(parts.of_link[link] for link in (one, other)))
-            between = _Between(robot, placed[i], placed[j], *ends, _bound(placed[i], placed[j]))
-            reason = between.settled(low, high, postures, near, bodies[i].overhang + bodies[j].overhang)
-            one_mesh, other_mesh = bodies[i].mesh, bodies[j].mesh
-            two_joints = len(between.up) + len(between.down) == 2
-            near_by = reason != NEVER if two_joints else reason == COVERED
-            if near_by and one_mesh is not None and other_mesh is not None:
-                of_meshes = id(one_mesh), id(other_mesh)
-                if of_meshes not in of_hulls:
-                    one_hull = one_mesh.hull.placed(*parts.place[one])
-                    other_hull = other_mesh.hull.placed(*parts.place[other])
-                    hulls = _Between(robot, one_hull, other_hull, *ends, _bound(one_hull, other_hull))
-                    of_hulls[of_meshes] = hulls.seen(low, high) if two_joints else hulls.together(postures)
-                by_hull = reason == COVERED and of_hulls[of_meshes] is None
-                reason = of_hulls[of_meshes] or (None if by_hull else reason)
-                if by_hull and not two_joints:  # those are looked at by their hulls in any case
-                    left[one, other] = COVERED
+            reason, by_hulls = motions.reason(bodies[i], bodies[j])
+            if by_hulls:
+                left[links] = COVERED
         if reason is None:
             checked.append((i, j))
-        elif left.get((one, other)) not in ASSUMED or reason == COVERED:
-            left[one, other] = reason
+        elif left.get(links) not in ASSUMED or reason == COVERED:
+            left[links] = reason
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
     found = Pairs(
         tuple(checked), {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
     )
-    keep(key, {"checked": found.checked, "left": [[*pair, why] for pair, why in found.left.items()]})
+    keep(key, {"checked": found.checked, "left": [[*pair, why.value] for pair, why in found.left.items()]})
     return found
 
 
@@ -177,7 +177,7 @@ def _key(
     bodies: Sequence[Body],
     low: Array,
     high: Array,
-    named: Mapping[frozenset[str], str],
+    named: Mapping[frozenset[str], Reason],
     near: float,
     count: int,
     seed: int,
@@ -203,7 +203,7 @@ def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
     """Pairs as they were kept; None where it is something else."""
     try:
         checked = tuple((int(i), int(j)) for i, j in value["checked"])
-        left = {(str(one), str(other)): str(why) for one, other, why in value["left"]}
+        left = {(str(one), str(other)): Reason(why) for one, other, why in value["left"]}
     except (TypeError, ValueError, KeyError, AttributeError):
         return None
     sound = all(0 <= i < j < len(bodies) for i, j in checked)
@@ -264,68 +264,91 @@ class _Lever(NamedTuple):
 
 
 @dataclass(frozen=True)
+class _Motions:
+    """How the bodies of a robot may move: within limits, and postures at random that are tried before a proof is."""
+
+    robot: Robot
+    parts: RigidParts
+    low: Array
+    high: Array
+    postures: Array
+    near: float
+    _of_hulls: dict[tuple[int, int], Reason | None] = field(default_factory=dict)
+
+    def reason(self, one: Body, other: Body) -> tuple[Reason | None, bool]:
+        """Why a pair need not be checked, or None; and whether its covers always touch and it is checked by hulls.
+
+        Covers of meshes stand out: those whose links are two joints apart, or whose covers always touch, are judged by
+        their hulls.
+        """
+        between = self._between(one.link, one.shape, other.link, other.shape)
+        reason = between.settled(self.low, self.high, self.postures, self.near, one.overhang + other.overhang)
+        two_joints = len(between.up) + len(between.down) == 2
+        if one.mesh is None or other.mesh is None or not (reason != NEVER if two_joints else reason == COVERED):
+            return reason, False
+        key = id(one.mesh), id(other.mesh)
+        if key not in self._of_hulls:
+            hulls = self._between(one.link, one.mesh.hull, other.link, other.mesh.hull)
+            seen = hulls.seen(self.low, self.high) if two_joints else hulls.together(self.postures)
+            self._of_hulls[key] = seen
+        if (of_hulls := self._of_hulls[key]) is not None:
+            return of_hulls, False
+        by_hulls = reason == COVERED
+        return None if by_hulls else reason, by_hulls and not two_joints
+
+    def _between(self, link: str, shape: Shape, other_link: str, other: Shape) -> _Between:
+        parts = self.parts
+        up, down = parts.path(parts.of_link[link], parts.of_link[other_link])
+        return _Between(self.robot, shape.placed(*parts.place[link]), other.placed(*parts.place[other_link]), up, down)
+
+
+@dataclass(frozen=True)
 class _Between:
-    """Two bodies, in the frames of their rigid parts, the joints between them, and a bound of their distances."""
+    """Two bodies, in the frames of their rigid parts, and the joints between them."""
 
     robot: Robot
     one: Shape
     other: Shape
     up: list[Step]
     down: list[Step]
-    below: Callable[[Array, Array], Array]
+    settings: ProofSettings = ProofSettings()
 
-    def settled(self, low: Array, high: Array, postures: Array, near: float, overhang: float) -> str | None:
+    def settled(self, low: Array, high: Array, postures: Array, near: float, overhang: float) -> Reason | None:
         """ALWAYS, COVERED or NEVER, or None for bodies that are to be checked."""
-        touching = self.gaps(postures[:FIRST])[0] <= 0
+        touching = self.gaps(postures[: self.settings.first_postures])[0] <= 0
         if touching.all():
-            farthest = float(_distances(self.one, self.other, *self._relative(postures)).max())
+            farthest = float(self.below(*self._relative(postures)).max())
             if farthest <= 0:
                 return ALWAYS if overhang == 0 or farthest < -overhang else COVERED
         return None if touching.any() or not self._apart(low, high, near) else NEVER
 
-    def seen(self, low: Array, high: Array) -> str | None:
+    def seen(self, low: Array, high: Array) -> Reason | None:
         """NEVER for hulls two joints apart that are apart on a grid of both, refined where they are nearest.
 
-        ALWAYS for those of which everywhere on it a corner of one lies in the other, else None: that no gap was seen
-        is no evidence that there is none.
+        ALWAYS for those that overlap everywhere on it, else None.
         """
         columns = sorted({self.robot.drives[step.joint.name].column for step in (*self.up, *self.down)})
         first = np.where(np.isfinite(low), low, -np.pi)[columns]
         last = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], first + 2 * np.pi)
-        step = (last - first) / GRID
-        places = np.stack(np.meshgrid(*(np.arange(GRID + 1) for _ in columns), indexing="ij"), axis=-1)
+        step = (last - first) / self.settings.grid
+        places = np.stack(np.meshgrid(*(np.arange(self.settings.grid + 1) for _ in columns), indexing="ij"), axis=-1)
         tried = first + places.reshape(-1, len(columns)) * step
-        for _ in range(FINER):
+        for _ in range(self.settings.finer_grids):
             q = np.zeros((len(tried), self.robot.dof))
             q[:, columns] = tried
             gaps = self.gaps(q)[0]
             if gaps.min() <= SURE:
-                return ALWAYS if gaps.max() <= 0 and self._nested(q) else None
-            nearest = tried[np.argsort(gaps)[:LOWEST]]
+                return ALWAYS if gaps.max() <= 0 else None
+            nearest = tried[np.argsort(gaps)[: self.settings.lowest]]
             around = np.stack(np.meshgrid(*(np.linspace(-1, 1, 9) for _ in columns), indexing="ij"), axis=-1)
             offsets = around.reshape(-1, len(columns)) * step
             tried = np.clip((nearest[:, None] + offsets).reshape(-1, len(columns)), first, last)
             step = step / 4
         return NEVER
 
-    def together(self, postures: Array) -> str | None:
+    def together(self, postures: Array) -> Reason | None:
         """ALWAYS for bodies that touch in all postures, else None."""
         return None if (self.gaps(postures)[0] > 0).any() else ALWAYS
-
-    def _nested(self, q: Array) -> bool:
-        """Whether at all joint vectors (k, dof) a corner of one of two hulls lies in the other."""
-        assert isinstance(self.one, Mesh)
-        assert isinstance(self.other, Mesh)
-        one, other = self.one, self.other
-        for turn, shift in zip(*self._relative(q), strict=True):
-            there, here = other.core @ turn.T + shift, (one.core - shift) @ turn
-            held = [
-                ((points - mesh.position) @ mesh.rotation @ mesh.hull.normals.T <= mesh.hull.offsets).all(axis=1)
-                for points, mesh in ((there, one), (here, other))
-            ]
-            if not any(inside.any() for inside in held):
-                return False
-        return True
 
     def gaps(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
         """Bounds of the distance from below at joint vectors, shape (k, dof).
@@ -340,6 +363,13 @@ class _Between:
         if close.any():
             gaps[close] = np.maximum(gaps[close], self.below(turn[close], shift[close]))
         return gaps, close
+
+    def below(self, turn: Array, shift: Array) -> Array:
+        """Distances from below, exact where a direction was found that parts them, in frames of the other."""
+        core, points = (np.repeat(p, 2, axis=0) if len(p) == 1 else p for p in (self.one.core, self.other.core))
+        here, there = np.broadcast_to(core, (len(turn), *core.shape)), points @ turn.transpose(0, 2, 1) + shift[:, None]
+        along = nearest_directions(here, there, (isinstance(self.one, Box), isinstance(self.other, Box)))[0]
+        return gap_along(along, here, there) - (self.one.swelling + self.other.swelling)
 
     def _relative(self, q: Array) -> tuple[Array, Array]:
         """Frame of the other's rigid part in the one's. Shapes (k, 3, 3) and (k, 3)."""
@@ -375,8 +405,9 @@ class _Between:
         centre, half = np.zeros((1, len(low))), np.zeros((1, len(low)))
         centre[0, columns] = (first[columns] + last[columns]) / 2
         half[0, columns] = (last[columns] - first[columns]) / 2
-        taken, most = 0, BOXES // 4 ** max(0, len(columns) - 3)  # halving many joints seldom leads anywhere
-        for _ in range(ROUNDS):
+        most = self.settings.boxes // 4 ** max(0, len(columns) - 3)  # halving many joints seldom leads anywhere
+        taken = 0
+        for _ in range(self.settings.rounds):
             slack = np.array([lever.moved(half[:, lever.column]) for lever in levers])  # (levers, boxes)
             need = slack.sum(axis=0)
             gaps, close = self.gaps(centre, need + near)
@@ -425,61 +456,3 @@ def _ball(shape: Shape) -> tuple[Array, float]:
     core = shape.core
     centre = (core.min(axis=0) + core.max(axis=0)) / 2
     return centre, shape.reach(centre)
-
-
-def _distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
-    """Distances of two shapes from many frames of the other in the one's, shapes (k, 3, 3) and (k, 3)."""
-    rotation, position = ca.SX.sym("turn", 3, 3), ca.SX.sym("shift", 3)
-    gap = distance(one, other, None, Frame(rotation, position))
-    made = ca.Function("gap", [ca.vertcat(rotation.reshape((9, 1)), position)], [gap])
-    columns = np.concatenate([turn.transpose(0, 2, 1).reshape(-1, 9), shift], axis=1).T
-    return np.array(made(columns)).ravel()
-
-
-def _bound(one: Shape, other: Shape) -> Callable[[Array, Array], Array]:
-    """What bounds the distances of two shapes in such frames from below: of capsules they are exact."""
-    if isinstance(one, Sphere | Capsule) and isinstance(other, Sphere | Capsule):
-        return lambda turn, shift: _capsules(one, other, turn, shift)
-    core, second, swelling = one.core, other.core, one.swelling + other.swelling
-    (normals, edges), (other_normals, other_edges) = _directions(one), _directions(other)
-    each = len(core) * (len(normals) + len(other_normals) + len(edges) * len(other_edges) + 1)
-
-    def measured(turn: Array, shift: Array) -> Array:
-        """The largest gap along directions that may separate the two."""
-        pieces = np.array_split(np.arange(len(turn)), min(1 + len(turn) * each // AT_ONCE, max(len(turn), 1)))
-        return np.concatenate([gaps(turn[piece], shift[piece]) for piece in pieces])
-
-    def gaps(turn: Array, shift: Array) -> Array:
-        points = second @ turn.transpose(0, 2, 1) + shift[:, None]  # (k, points, 3)
-        crossed = np.cross(edges[:, None], (other_edges @ turn.transpose(0, 2, 1))[:, None]).reshape(len(turn), -1, 3)
-        apart = (points.mean(axis=1) - core.mean(axis=0))[:, None]
-        own = np.broadcast_to(normals, (len(turn), *normals.shape))
-        tried = np.concatenate([own, other_normals @ turn.transpose(0, 2, 1), crossed, apart], axis=1)
-        long = np.linalg.norm(tried, axis=2)
-        tried = tried / np.maximum(long, NO_DIRECTION)[:, :, None]
-        here, there = tried @ core.T, tried @ points.transpose(0, 2, 1)
-        ahead, behind = there.min(axis=2) - here.max(axis=2), here.min(axis=2) - there.max(axis=2)
-        found = np.where(long > NO_DIRECTION, np.maximum(ahead, behind), -np.inf)
-        return np.asarray(found.max(axis=1) - swelling)
-
-    return measured
-
-
-def _directions(shape: Shape) -> tuple[Array, Array]:
-    """Normals of a core's faces and directions of its edges, each once. Shapes (n, 3) and (e, 3)."""
-    if isinstance(shape, Box):
-        return np.asarray(shape.rotation.T), np.asarray(shape.rotation.T)
-    if isinstance(shape, Cylinder | Mesh):
-        some = shape.hull.normals[:: 1 + len(shape.hull.normals) // MOST_NORMALS]  # each gap is a bound by itself
-        return np.asarray(some @ shape.rotation.T), np.zeros((0, 3))
-    along = shape.core[-1:] - shape.core[:1]
-    length = float(np.linalg.norm(along))
-    return np.zeros((0, 3)), along / length if length > 0 else np.zeros((0, 3))
-
-
-def _capsules(one: Sphere | Capsule, other: Sphere | Capsule, turn: Array, shift: Array) -> Array:
-    """Distances of two spheres or capsules."""
-    points = other.core @ turn.transpose(0, 2, 1) + shift[:, None]
-    moved = np.column_stack([points.reshape(len(turn), -1), np.full(len(turn), other.radius)])
-    still = np.tile(np.append(one.core, one.radius)[:, None], len(turn))
-    return np.array(pair_function(type(one), type(other))(still, moved.T)).ravel()

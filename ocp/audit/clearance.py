@@ -32,6 +32,7 @@ from ocp.solution import Solution, check_belongs, in_order_of
 __all__ = [
     "Clearance",
     "Nearest",
+    "ProofSettings",
     "Track",
     "clearance",
     "clearance_along",
@@ -40,20 +41,29 @@ __all__ = [
     "placements_along",
 ]
 
-SETTLED = 0.02
-"""Of what the least distance is more or less than is asked: it is known to so much."""
-SHORT = 1e-6
-"""m: a distance is known to so much where less is asked."""
-HALVINGS = 26
-"""Of an interval of the mesh."""
-MOST = 400_000
-"""Intervals of pairs looked at, beyond which what is left is not proven."""
-BLOCKS = 128
-"""Intervals of the whole time that are looked at first, at most: of finer pieces several together."""
 SHOWN = 4
 """Pairs left out by assumption that are named in a line; all are in `Clearance.assumed`."""
-MOST_TIMES = 512
-"""Of those at which the balls about bodies are looked at first."""
+
+
+@dataclass(frozen=True)
+class ProofSettings:
+    """How far the halving of intervals goes.
+
+    Attributes:
+        share: Of what the least distance is more or less than is asked: it is known to so much.
+        finest: A distance is known to so much where less is asked, m.
+        halvings: Of an interval of the mesh: 1 s becomes 15 ns.
+        most_intervals: Of pairs that are bounded, beyond which what is left is not proven.
+        first_blocks: Intervals of the whole time that are bounded first, at most: of finer pieces several together.
+        first_times: At which the balls about bodies are compared first, at most.
+    """
+
+    share: float = 0.02
+    finest: float = 1e-6
+    halvings: int = 26
+    most_intervals: int = 400_000
+    first_blocks: int = 128
+    first_times: int = 512
 
 
 @dataclass(frozen=True)
@@ -160,11 +170,11 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
     return clearance_along(apart, _track_of(form, apart, solution, p)) if len(apart) else clearance_along(apart, None)
 
 
-def clearance_along(apart: Separation, track: Track | None) -> Clearance:
+def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:
     """How near each pair of bodies comes along any track, at any time; no track is needed where there are no pairs."""
     if not len(apart) or track is None:
         return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
-    return _Search(apart, track).run()
+    return _Search(apart, track, settings).run()
 
 
 def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | None:
@@ -239,10 +249,11 @@ class _Search:
     pieces, index 2^l and (index + 1) 2^l.
     """
 
-    def __init__(self, apart: Separation, track: Track) -> None:
+    def __init__(self, apart: Separation, track: Track, settings: ProofSettings = ProofSettings()) -> None:
+        self.settings = settings
         self.apart, self.track = apart, track
         self.breaks, self.pieces = track.breaks, len(track.breaks) - 1
-        self.top = max(0, int(np.ceil(np.log2(self.pieces / BLOCKS))))
+        self.top = max(0, int(np.ceil(np.log2(self.pieces / self.settings.first_blocks))))
         self.fastest = [(track.rates, track.seconds)]
         for level in range(self.top):
             rates, seconds = (_of_two(values) for values in self.fastest[level])
@@ -262,7 +273,7 @@ class _Search:
             looked += len(pair)
             bound, enough = self._bounds(pair, block, level)
             left = ~(bound >= enough[pair])
-            last = level == -HALVINGS or looked + 2 * left.sum() > MOST
+            last = level == -self.settings.halvings or looked + 2 * left.sum() > self.settings.most_intervals
             told = np.ones_like(left) if last else ~left
             np.minimum.at(lower, pair[told], bound[told])
             settled = not left.any()
@@ -285,7 +296,7 @@ class _Search:
             return ""
         stray, _ = self.track.prescribed.bounds(pair, begin, end)
         k = int(stray.argmax())
-        if not stray[k] > SHORT:
+        if not stray[k] > self.settings.finest:
             return ""
         names = " and ".join(self.apart.labels[pair[k]])
         how = f"jumps by up to {stray[k]:.3g} m" if np.isfinite(stray[k]) else "has no bound"
@@ -317,7 +328,7 @@ class _Search:
     def _look_where_balls_are_nearest(self) -> None:
         """At each pair at the node, or middle of an interval, where the balls about its bodies are nearest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
-        times = times[:: -(-len(times) // MOST_TIMES)]
+        times = times[:: -(-len(times) // self.settings.first_times)]
         n, frames = len(self.apart), self.track.frames(times)
         pair, at = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(len(times)), indexing="ij"))
         self._look(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
@@ -336,8 +347,9 @@ class _Search:
         """
         spare = self.best - self.apart.least
         least = max(float(spare.min()), 0.0)
-        missing = self.best - np.maximum(SETTLED * np.abs(spare), SHORT)
-        return np.where(spare >= 0, self.apart.least + max(least - max(SETTLED * least, SHORT), 0.0), missing)
+        share, finest = self.settings.share, self.settings.finest
+        missing = self.best - np.maximum(share * np.abs(spare), finest)
+        return np.where(spare >= 0, self.apart.least + max(least - max(share * least, finest), 0.0), missing)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
         """Lower bounds of the distances of pairs in intervals of a level (K,), and what is enough of each pair's (n,).

@@ -72,48 +72,33 @@ class Separation:
     def __post_init__(self) -> None:
         what = f"separation {checked_text('separation: its name', self.name)!r}"
         pairs = index_rows(what, "pairs", self.pairs, 3)
+        object.__setattr__(self, "pairs", pairs)
+        object.__setattr__(self, "covers", _checked_covers(what, self.covers, len(pairs)))
+        for other, why in checked_mapping(f"{what}: assumed", self.assumed).items():
+            checked_text(f"{what}: assumed", other)
+            checked_text(f"{what}: assumed", why)
+        self._check_bodies(what)
         n, k = len(pairs), sum(self.movers.values())
+        for label, shape in {"least": (n,), "levers": (n, k), "turns": (n, k)}.items():
+            object.__setattr__(self, label, _bounds(what, label, getattr(self, label), shape))
+
+    def _check_bodies(self, what: str) -> None:
+        """Raise unless all pairs are of bodies that there are, on frames that there are."""
         frames, rest = divmod(int(self.placements.numel()), 12)
         if rest:
             words = f"{what}: placements have {self.placements.numel()} entries, 12 for each frame expected"
             raise ProblemError(words, name="placements", value=self.placements.numel())
-        covers: dict[int, np.ndarray] = {}
-        for pair, both in checked_mapping(f"{what}: covers", self.covers).items():
-            if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < n:
-                words = f"{what}: covers: there is no pair {pair!r}, only {n}"
-                raise ProblemError(words, name="covers", value=pair, limit=n)
-            covers[int(pair)] = index_rows(what, "covers", both, 2)
-        for other, why in checked_mapping(f"{what}: assumed", self.assumed).items():
-            checked_text(f"{what}: assumed", other)
-            checked_text(f"{what}: assumed", why)
-        object.__setattr__(self, "covers", {pair: both for pair, both in covers.items() if len(both)})
-        for label, both in (("pairs", pairs[:, :2]), *(("covers", each) for each in covers.values())):
-            if both.size and (both.min() < 0 or both.max() >= len(self.hulls) or (both[:, 0] == both[:, 1]).any()):
-                words = f"{what}: {label}: a pair is not one of two of the {len(self.hulls)} bodies"
-                raise ProblemError(words, name=label)
-        riding = [hull.frame for hull in self.hulls.values()]
-        if not all(WORLD <= frame < frames for frame in [*riding, *pairs[:, 2]]):
-            raise ProblemError(f"{what}: a frame is none of the {frames} placed", name="frame", limit=frames)
         hulls = tuple(self.hulls.values())
-        if any(
-            hulls[k].normal.size and hulls[k].frame != seen
-            for *bodies, seen in Covered(pairs, self.covers).rows
-            for k in bodies
-        ):
+        for label, both in (("pairs", self.pairs[:, :2]), *(("covers", each) for each in self.covers.values())):
+            if both.size and (both.min() < 0 or both.max() >= len(hulls) or (both[:, 0] == both[:, 1]).any()):
+                words = f"{what}: {label}: a pair is not one of two of the {len(hulls)} bodies"
+                raise ProblemError(words, name=label)
+        if not all(WORLD <= frame < frames for frame in [*(hull.frame for hull in hulls), *self.pairs[:, 2]]):
+            raise ProblemError(f"{what}: a frame is none of the {frames} placed", name="frame", limit=frames)
+        rows = Covered(self.pairs, self.covers).rows
+        if any(hulls[k].normal.size and hulls[k].frame != seen for *bodies, seen in rows for k in bodies):
             words = f"{what}: a half-space has to be seen from the frame that it rides on, where it stands still"
             raise ProblemError(words, name="pairs")
-        object.__setattr__(self, "pairs", pairs)
-        shapes = {"least": (n,), "levers": (n, k), "turns": (n, k)}
-        for label, shape in shapes.items():
-            value = table(f"{what}: {label}", getattr(self, label))
-            value = np.broadcast_to(value, shape) if value.ndim == 0 else value.reshape(shape) if not n else value
-            if value.shape != shape:
-                words = f"{what}: {label} has shape {value.shape}, expected {shape}"
-                raise ProblemError(words, name=label, value=value.shape, limit=shape)
-            check_finite(f"{what}: {label}", value)
-            if label != "least" and (value < 0).any():
-                raise ProblemError(f"{what}: {label} is negative", name=label, value=float(value.min()), limit=0.0)
-            object.__setattr__(self, label, np.array(value))
 
     def __str__(self) -> str:
         least = f"{self.least.min():g} m" if len(self) else "nothing"
@@ -137,6 +122,30 @@ class Separation:
         return Separation(
             self.name, self.placements, self.hulls, movers=self.movers, covers=covers, assumed=self.assumed, **parts
         )
+
+
+def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
+    """Rows of pairs of bodies by the places of so many pairs; those without rows are left out."""
+    found: dict[int, np.ndarray] = {}
+    for pair, both in checked_mapping(f"{what}: covers", covers).items():
+        if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
+            words = f"{what}: covers: there is no pair {pair!r}, only {count}"
+            raise ProblemError(words, name="covers", value=pair, limit=count)
+        found[int(pair)] = index_rows(what, "covers", both, 2)
+    return {pair: both for pair, both in found.items() if len(both)}
+
+
+def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers of a shape, or one for all; levers and turns are not negative."""
+    found = table(f"{what}: {label}", value)
+    found = np.broadcast_to(found, shape) if found.ndim == 0 else found.reshape(shape) if not shape[0] else found
+    if found.shape != shape:
+        words = f"{what}: {label} has shape {found.shape}, expected {shape}"
+        raise ProblemError(words, name=label, value=found.shape, limit=shape)
+    check_finite(f"{what}: {label}", found)
+    if label != "least" and (found < 0).any():
+        raise ProblemError(f"{what}: {label} is negative", name=label, value=float(found.min()), limit=0.0)
+    return np.array(found)
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:

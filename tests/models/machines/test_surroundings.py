@@ -32,7 +32,7 @@ from models import (
 )
 from models.shapes.distance import distance
 from models.shapes.hull import convex_hull
-from ocp.problem.hulls import gap_along, nearest_directions
+from models.shapes.nearest import gap_along, nearest_directions
 from tests.models.machines.armoured import armoured_arm
 
 OBSTACLES = (

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Cylinder, Frame, HalfSpace, Mesh, ModelError, Sphere
-from models.shapes.distance import COLUMNS, column, distance, pair_columns, pair_function, pair_wrenches
+from models.shapes.distance import COLUMNS, column, distance, pair_function, pair_wrenches
 from models.shapes.shapes import SIDES, Shape
 from tests.models.shapes.shape_oracles import by_coal, by_differences, moved_distance, random_frame, random_shape
 
@@ -385,8 +385,6 @@ def test_wrenches_tell_at_what_rate_distances_grow(pair: tuple[type, type], roun
         sides = [ca.horzcat(*map(column, side)).T for side in zip(*shapes, strict=True)]
         gaps, wrenches = (np.array(part) for part in pair_wrenches(*kinds, rounding, 30)(*sides))
         np.testing.assert_allclose(gaps.ravel(), in_bulk(shapes, rounding), atol=1e-12)
-        beside = np.array(pair_columns(*kinds, rounding, 30)(*sides))
-        np.testing.assert_allclose(beside, gaps, atol=1e-12)
         twists = rng.normal(size=(30, 6))
 
         def moved(step: float, shapes: Any = shapes, twists: Any = twists) -> Any:

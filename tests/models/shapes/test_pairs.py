@@ -12,7 +12,7 @@ import coal
 import numpy as np
 import pytest
 
-from models import CollisionShape, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
+from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
 from models.arrays import Array
 from models.shapes.bodies import Body, LinkMesh, bodies_of
 from models.shapes.distance import distance
@@ -27,8 +27,6 @@ from models.shapes.pairs import (
     TOLD,
     Pairs,
     _Between,
-    _bound,
-    _distances,
     _postures,
     checked_pairs,
 )
@@ -149,9 +147,9 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
-        between = _Between(robot, one, other, *parts.path(bodies[i].link, bodies[j].link), _bound(one, other))
+        between = _Between(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
         turn, shift = between._relative(postures)
-        np.testing.assert_allclose(_distances(one, other, turn, shift), row, atol=1e-9)
+        np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
         assert (between.gaps(postures)[0] <= row + 1e-9).all()
 
 
@@ -228,6 +226,20 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
     assert checked_pairs(robot, (plate, between, inner)).left["plate", "link2"] == ALWAYS
 
 
+def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
+    """Distances as the proof has them."""
+    return _Between(chain(0.1)[0], one, other, [], []).below(turn, shift)
+
+
+def exact_distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
+    """Distances by the formulas, from many frames of the other in the one's, shapes (k, 3, 3) and (k, 3)."""
+    rotation, position = ca.SX.sym("turn", 3, 3), ca.SX.sym("shift", 3)
+    gap = distance(one, other, None, Frame(rotation, position))
+    function = ca.Function("gap", [ca.vertcat(rotation.reshape((9, 1)), position)], [gap])
+    columns = np.concatenate([turn.transpose(0, 2, 1).reshape(-1, 9), shift], axis=1).T
+    return np.array(function(columns)).ravel()
+
+
 @pytest.mark.parametrize("slope", [-2.0, 0.0, 0.5])
 def test_the_bound_is_exact_where_a_capsule_crosses_an_edge(slope: float) -> None:
     """Square across from the edge at x = y = 0.1 of a box, which lies along z; from each of the two shapes."""
@@ -236,8 +248,8 @@ def test_the_bound_is_exact_where_a_capsule_crosses_an_edge(slope: float) -> Non
     middle = np.array([0.1, 0.1, 0.05]) + 0.07 * out
     capsule = Capsule(0.02, middle - 0.1 * across, middle + 0.05 * across)
     turn, shift = np.eye(3)[None], np.zeros((1, 3))
-    assert _bound(box, capsule)(turn, shift) == pytest.approx([0.05], abs=1e-12)
-    assert _bound(capsule, box)(turn, shift) == pytest.approx([0.05], abs=1e-12)
+    assert bound(box, capsule, turn, shift) == pytest.approx([0.05], abs=1e-12)
+    assert bound(capsule, box, turn, shift) == pytest.approx([0.05], abs=1e-12)
 
 
 @pytest.mark.parametrize("one", KINDS, ids=lambda shape: type(shape).__name__)
@@ -249,15 +261,15 @@ def test_the_bound_is_no_more_than_the_distance(one: Shape, other: Shape) -> Non
     shift = np.concatenate(
         [np.array([(0, 0, 0), (0, 0, 0.1), (0.3, 0, 0), (0.3, 0.3, 0)]), rng.normal(size=(60, 3)) / 3]
     )
-    found, exact = _bound(one, other)(turn, shift), _distances(one, other, turn, shift)
+    found, exact = bound(one, other, turn, shift), exact_distances(one, other, turn, shift)
     assert (found <= exact + 1e-9).all()
     assert (found > -1).all()
 
 
 def test_the_bound_of_spheres_is_exact_and_that_of_boxes_beside_a_face() -> None:
     turn, shift = np.eye(3)[None], np.array([[0.0, 3.0, 4.0]])
-    assert _bound(Sphere(0.5, (1, 0, 0)), Sphere(0.25, (1, 0, 0)))(turn, shift) == pytest.approx([4.25], abs=1e-11)
-    assert _bound(Box((2, 2, 2)), Box((1, 9, 1)))(turn, shift) == pytest.approx([2.5], abs=1e-12)
+    assert bound(Sphere(0.5, (1, 0, 0)), Sphere(0.25, (1, 0, 0)), turn, shift) == pytest.approx([4.25], abs=1e-11)
+    assert bound(Box((2, 2, 2)), Box((1, 9, 1)), turn, shift) == pytest.approx([2.5], abs=1e-12)
 
 
 def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> None:

@@ -14,9 +14,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from models.shapes.nearest import gap_along, nearest_directions
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.audit.clearance import Clearance, Track, clearance_along, nearest_at
-from ocp.problem.hulls import Frames, Hull, frames_of, gap_along, nearest_directions
+from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, nearest_at
+from ocp.problem.hulls import Frames, Hull, frames_of
 from ocp.problem.separation import Separation
 
 EYE = np.eye(3).ravel()
@@ -320,7 +321,12 @@ def test_covers_are_saved_with_a_plan(tmp_path: Any) -> None:
 # ---- what bends, and how finely it is looked at --------------------------------------------------------------------
 
 
-def swinging(low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.0) -> Clearance:
+SETTINGS = ProofSettings()
+
+
+def swinging(
+    low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.0, settings: ProofSettings = SETTINGS
+) -> Clearance:
     """A point on a slide on an arm that turns, past a floor 1 m below where it passes the axis.
 
     Its distance from the axis grows by 1 m/s, the arm turns by 0.1 rad/s; it passes at a share of the 1 s. The height
@@ -340,7 +346,8 @@ def swinging(low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.
         return frames_of(np.hstack([np.tile(EYE, (len(at), 1)), places]))
 
     rates, seconds = np.tile([[1.0, 0.1]], (pieces, 1)), np.zeros((pieces, 2))
-    return clearance_along(apart, Track(np.linspace(0, 1, pieces + 1), 1.0, rates, seconds, smooth, frames))
+    track = Track(np.linspace(0, 1, pieces + 1), 1.0, rates, seconds, smooth, frames)
+    return clearance_along(apart, track, settings)
 
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -430,20 +437,17 @@ def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_b
     assert 1e-7 < worst.distance - worst.least <= 1e-6
 
 
-def test_what_would_take_too_long_is_not_proven(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_would_take_too_long_is_not_proven() -> None:
     """It is told from below all the same, and no more is looked at than may be."""
     assert swinging(0.3137, asked=-1e-5).settled
-    monkeypatch.setattr("ocp.audit.clearance.MOST", 12)
-    short = swinging(0.3137, asked=-1e-5)
+    short = swinging(0.3137, asked=-1e-5, settings=ProofSettings(most_intervals=12))
     assert not short.settled
     assert short.looked <= 12
     assert short.worst is not None
     assert short.worst.least <= 1.0
     assert short.worst.missed > 0
     assert str(short).startswith("not proven")
-    monkeypatch.setattr("ocp.audit.clearance.MOST", 400_000)
-    monkeypatch.setattr("ocp.audit.clearance.HALVINGS", 2)
-    assert not swinging(0.3137, asked=-1e-5).settled
+    assert not swinging(0.3137, asked=-1e-5, settings=ProofSettings(halvings=2)).settled
 
 
 def test_a_plan_of_held_controls_and_one_that_was_saved(tmp_path: Any) -> None:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from ocp.problem.hulls import Frames, Hull, frames_of, gap_along, grouped, nearest_directions
+from models.shapes.nearest import gap_along, is_box, nearest_directions
+from ocp.problem.hulls import Frames, Hull, PairsOfBodies, frames_of, grouped
 
 CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0
 
@@ -44,6 +45,26 @@ def test_the_gap_is_met_by_two_points(m: int, k: int) -> None:
         for d in rng.normal(size=(20, 3)):
             assert np.all(points @ d <= (hull @ d).max(axis=1) + 1e-9)
     del n, there_again, here_again
+
+
+def test_a_segment_beside_a_box_is_as_near_as_beside_the_hull_of_its_corners() -> None:
+    """Turned boxes of all sizes, segments that are short, long, along an edge, across, or points."""
+    rng = np.random.default_rng(11)
+    sizes = 10.0 ** rng.uniform(-2, 1, (500, 1, 3))
+    boxes = CORNERS * sizes @ turns(rng, 500) + rng.normal(size=(500, 1, 3))
+    rods = rng.normal(size=(500, 2, 3)) * 10.0 ** rng.uniform(-1, 1, (500, 1, 1))
+    rods[:50, 1] = rods[:50, 0]
+    rods[50:100, 1] = rods[50:100, 0] + 2 * (boxes[50:100, 1] - boxes[50:100, 0])
+    assert is_box(boxes[0])
+    assert not is_box(boxes[0][::-1][[1, 0, *range(2, 8)]])
+    known = found(rods, boxes)
+    way, here, there = nearest_directions(rods, boxes, (False, True))
+    gap = gap_along(way, rods, boxes)
+    assert ((known > 0) == (gap > 0)).all()
+    assert_allclose(gap[known > 0], known[known > 0], atol=1e-9)
+    back, there_again, here_again = nearest_directions(boxes, rods, (True, False))
+    for one, other in ((back, -way), (here_again, here), (there_again, there)):
+        assert_allclose(one[known > 0], other[known > 0], atol=1e-12)
 
 
 def test_boxes_that_are_placed_side_by_side() -> None:
@@ -135,17 +156,18 @@ def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
     pairs = np.array([[0, 1, -1], [1, 2, -1], [3, 2, 1], [0, 3, 0], [1, 3, 2], [4, 2, -1], [3, 4, -1]])
     places = np.concatenate([np.swapaxes(turns(rng, 150), 1, 2).reshape(-1, 9), rng.normal(size=(150, 3))], axis=1)
     frames = frames_of(places.reshape(50, 36))
+    bodies = PairsOfBodies([*hulls, ground], pairs, {})
     for kind in grouped([*hulls, ground], pairs):
         for pair in np.flatnonzero(kind.has):
             one, other = ([*hulls, ground][k] for k in pairs[pair, :2])
             at, row = np.arange(50), np.full(50, kind.row[pair])
             way, gap, points = kind.nearest(frames, at, row)
-            apart = kind.balls(frames, at, row)
+            apart = bodies.balls(frames, at, np.full(50, pair))
             widths = sum(np.linalg.norm(hull.core[:, None] - hull.core, axis=2).max() for hull in (one, other))
             assert (apart <= gap + 1e-9).all()
             assert kind.flat[row[0]] or (apart >= np.maximum(gap, -one.radius - other.radius) - widths - 1e-9).all()
             assert_allclose(kind.gaps(way, frames, at, row), gap, atol=1e-12)
-            sides = [placed(frames, hull) for hull in (one, other)]
+            sides = placed(frames, one), placed(frames, other)
             if not (one.normal.size or other.normal.size):
                 known = gap_along(nearest_directions(*sides)[0], *sides) - one.radius - other.radius
                 assert_allclose(gap[known > 0], known[known > 0], atol=1e-9)
