@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz moving faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz fresh moving faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -82,6 +82,9 @@ faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batche
 
 fuzz: $(VENV)/test.stamp ## read 2000 mutated files of each kind: none crashes, hangs, runs code or writes elsewhere (ARGS="--only csv,urdf")
 	$(BIN)/python -W ignore -m tests.sweep.fuzz $(ARGS)
+
+fresh: $(VENV)/test.stamp ## audit plans of the gallery and of the papers before they are files and again in another process (ARGS="--only blend")
+	$(BIN)/python -W ignore -m tests.sweep.fresh $(ARGS)
 
 browser: $(VENV)/test.stamp ## open pages of the viewer, and of the site, in a real browser (ARGS=--if-there: where there is one)
 	$(BIN)/python -W ignore -m tests.browser $(ARGS)

@@ -40,7 +40,8 @@ __all__ = [
 ]
 
 LOG = logging.getLogger("ocp")
-GRACE = 0.5  # s after Ctrl-C in which a call may end by itself, with what it has found
+GRACE = 0.5  # s of the processor after Ctrl-C in which a call may end by itself, with what it has found
+SHARED = 20  # times as long where others hold the processor, or nothing is at work
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -84,9 +85,13 @@ class _Call(threading.Thread):
     def end(self) -> None:
         """Ask it to end; if nothing listens, raise KeyboardInterrupt in it, at the next step that is Python's."""
         self.stop = True
-        began = time.monotonic()
+        began, worked = time.monotonic(), time.process_time()
         try:
-            while (self.listeners or self.heard) and time.monotonic() - began < GRACE:
+            while (
+                (self.listeners or self.heard)
+                and time.process_time() - worked < GRACE
+                and time.monotonic() - began < SHARED * GRACE
+            ):
                 if self.left.wait(0.02):
                     return
         finally:

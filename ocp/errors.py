@@ -40,6 +40,7 @@ __all__ = [
     "checked_time_limit",
     "floats",
     "real",
+    "sample_times",
     "told_apart",
     "unknown_name",
 ]
@@ -225,6 +226,20 @@ def told_apart(*numbers: float) -> list[str]:
     """Numbers for a message, in six digits, or in as many more as tell those apart that differ."""
     told = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     return next((each for each in told if len({*each}) == len({repr(number) for number in numbers})), told[-1])
+
+
+def sample_times(what: str, period: Any, duration: float) -> np.ndarray:
+    """Every `period` from 0 on, and the end of the duration, which comes as early as that says; s.
+
+    Raises:
+        ProblemError: A period that is not positive, or so short that there were more than MOST_NUMBERS.
+    """
+    step = checked_positive(what, period)
+    count = np.ceil(duration / step * (1 - 1e-12))  # but for rounding
+    if not count < MOST_NUMBERS:
+        words = f"{what} {step:g} s asks for {count:g} samples of {duration:g} s, more than {MOST_NUMBERS}"
+        raise ProblemError(words, name=_last(what), value=period, limit=duration / MOST_NUMBERS)
+    return np.append(np.arange(int(count)) * step, duration)
 
 
 def checked_text(what: str, value: Any) -> str:

@@ -120,7 +120,8 @@ def solve(
         check: Raise where the solver fails, after a second solve that finds what would have to give way; False runs it
             once, from the guess, and returns the unsuccessful solution with its status.
         time_limit: After so many seconds, the build and all starts included, the solver is stopped between two
-            iterations, which counts as a failure. None for no limit.
+            iterations, which counts as a failure; where it was not built by then there is no solution to return,
+            whatever `check` says. None for no limit.
 
     Raises:
         ProblemError: The problem, method or arguments cannot be right.

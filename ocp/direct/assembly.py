@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from ocp.console import check_time
 from ocp.direct.fragment import Block, Fragment
 from ocp.problem.values import symbols_of
 
@@ -166,7 +167,11 @@ class Derivatives(NamedTuple):
 
 
 def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """The program of a fragment, from the derivatives of its blocks, which are made where they are not given."""
+    """The program of a fragment, from the derivatives of its blocks, which are made where they are not given.
+
+    Raises:
+        OutOfTime: The time limit is over.
+    """
     blocks = fragment.blocks
     if functions is None:
         functions = [derivatives(block.function) for block in blocks]
@@ -285,6 +290,7 @@ def repeat(scalar: Any, block: Block) -> Any:
 
 def mapped(function: Any, block: Block, arguments: list[Any]) -> Any:
     """A block function over all its applications; the parameters (argument 2) are shared."""
+    check_time()
     count = block.variables.shape[1]
     if count == 1:
         return function.call(arguments)
@@ -328,6 +334,7 @@ def scatter_matrix(
 
 def sparse(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, shape: tuple[int, int]) -> Any:
     """A constant sparse matrix from triplets, duplicates summed."""
+    check_time()
     entries, number = np.unique(columns.astype(np.int64) * shape[0] + rows, return_inverse=True)
     summed = np.bincount(number, weights=values, minlength=entries.size)
     pattern = ca.Sparsity.triplet(*shape, (entries % shape[0]).tolist(), (entries // shape[0]).tolist())

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ocp.console import interruptible, limited
+from ocp.console import OutOfTime, check_time, interruptible, limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
@@ -33,6 +33,7 @@ from ocp.errors import (
     NOT_NUMBERS,
     Interrupted,
     ProblemError,
+    SolveError,
     about,
     checked_choice,
     checked_count,
@@ -92,8 +93,16 @@ class DirectMethod(ABC):
         compiled: bool = False,
         scaling: bool = True,
     ) -> Prepared:
-        """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`."""
-        return Prepared(problem, self, solver, options, compiled, scaling)
+        """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`.
+
+        Raises:
+            SolveError: The time limit of a call that this is part of is over.
+        """
+        try:
+            return Prepared(problem, self, solver, options, compiled, scaling)
+        except OutOfTime as error:
+            words = f"problem {problem.name!r} was still being built: {SolverStatus.TIME_LIMIT}: raise time_limit"
+            raise SolveError(words, name="time_limit") from error
 
     @property
     def fractions(self) -> np.ndarray:
@@ -199,7 +208,9 @@ class Prepared:
         # sleqp asks for products with the Hessian, which compiled functions do not have
         blocks = block_derivatives(self.fragment, compiled and solver != "sleqp")
         self.program = assemble(self.fragment, self.formulation.np, blocks)
+        check_time()
         self._solver, self._progress = self._built_solver(own)
+        check_time()
         self._pattern = Pattern(self.formulation, self.fragment, self.program)
         self._known = Known(self.formulation, self.fragment, self.program)
         self._most = largest_number_of_iterations(self.solver_name, own)

@@ -20,7 +20,7 @@ from models.spatial import quaternion_from_rotation
 from ocp.audit.audit import Finding
 from ocp.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, StorageWarning, checked_positive, floats, unknown_name
+from ocp.errors import NOT_NUMBERS, ProblemError, StorageWarning, floats, sample_times, unknown_name
 from ocp.planning.candidate import Candidate
 from ocp.planning.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
@@ -157,11 +157,9 @@ class Plan:
         those after the jump.
 
         Raises:
-            ProblemError: A period that is not positive.
+            ProblemError: A period that is not positive, or too short.
         """
-        checked_positive("sample: period", period)
-        count = int(np.ceil(self.horizon / period * (1 - 1e-12)))
-        return self.sampled(np.append(np.arange(count) * float(period), self.horizon))
+        return self.sampled(sample_times("sample: period", period, self.horizon))
 
     def sampled(self, times: Any) -> PlanSample:
         """The motion at times (M,), s."""

@@ -187,6 +187,12 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
         bad = float(array[wrong].flat[0]) if array.size else np.nan
         message = f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}"
         raise ProblemError(message, name=name, value=bad, limit=0.0)
+    numbers = np.finfo(float)
+    low, high = (float(end) ** 0.2 for end in (numbers.tiny, numbers.max))  # products of five are numbers
+    odd = array[np.isfinite(array) & ~((low < array) & (array < high))]
+    if odd.size:
+        message = f"{name} limit {odd[0]:g} is no size to compute with, {low:.0e} to {high:.0e}: is its unit right?"
+        raise ProblemError(message, name=name, value=float(odd[0]), limit=(low, high))
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:

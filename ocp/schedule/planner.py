@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_flag, checked_positive
+from ocp.errors import ProblemError, checked_flag, sample_times
 from ocp.schedule.grid import Grid, make_grid, nodes_only
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
@@ -102,11 +102,9 @@ class Schedule:
         """LineMotion every `period` s from the start; the last sample, at the end, comes as early as the duration says.
 
         Raises:
-            ProblemError: A period that is not positive, or nan.
+            ProblemError: A period that is not positive, or nan, or too short.
         """
-        checked_positive("sample period", period)
-        times = np.arange(int(np.ceil(self.duration / period * (1 - 1e-12)))) * period
-        return self.at(np.append(times, self.duration))
+        return self.at(sample_times("sample period", period, self.duration))
 
     def function(self) -> Any:
         """casadi Function of the time, see SpeedProfile.function."""

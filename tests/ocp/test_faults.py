@@ -22,6 +22,7 @@ import ocp.tightening
 from ocp import (
     Collocation,
     Indirect,
+    MultipleShooting,
     Problem,
     ProblemError,
     RefinementWarning,
@@ -84,7 +85,10 @@ def interrupted(name, call, after=0.3):
     # Ctrl-C comes from another process, for a thread may wait long for its turn; sooner where the call ends before it
     while True:
         stopped.clear()
-        sender = subprocess.Popen(["sh", "-c", f"sleep {after}; kill -INT {os.getpid()}"], **SILENT)
+        ticks, own = int(os.sysconf("SC_CLK_TCK") * (time.process_time() + after)), os.getpid()
+        worked = f"$(awk '{{print $14 + $15}}' /proc/{own}/stat)"  # of the processor: others may hold it
+        wait = f"while [ {worked} -lt {ticks} ]; do sleep 0.01; done; kill -INT {own}"
+        sender = subprocess.Popen(["sh", "-c", wait], **SILENT)
         try:
             call()
             word = "returned"
@@ -330,6 +334,18 @@ def long() -> Problem:
     return van_der_pol((1.0, 0.0), horizon=20.0, upper=1.0, lower=-1.0)
 
 
+@pytest.mark.parametrize("method", [Collocation(4000), MultipleShooting(4000)], ids=str)
+def test_a_build_ends_at_the_time_limit(
+    monkeypatch: pytest.MonkeyPatch, method: Collocation | MultipleShooting
+) -> None:
+    """After one of its parts: none is a large share of it, and the solver is never made."""
+    made: list[str] = []
+    monkeypatch.setattr("ocp.direct.prepared.build_solver", lambda *_: made.append("solver"))
+    with pytest.raises(SolveError, match="still being built: Maximum_WallTime_Exceeded: raise time_limit") as caught:
+        solve(van_der_pol(), method, time_limit=1e-9)
+    assert (caught.value.name, caught.value.solution, made) == ("time_limit", None, [])
+
+
 def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int, module: Any = ocp.refinement) -> None:
     """A function that the time limit, whatever it is, overtakes at that call; ``module`` looks at the time then."""
     real, calls = getattr(owner, name), []
@@ -381,7 +397,7 @@ def test_refinement_keeps_the_last_audited_plan_whatever_the_limit_meets(
 def test_refinement_without_a_plan_at_its_time_limit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         refine(long(), Collocation(200), time_limit=1e-6)
-    assert caught.value.solution.status is SolverStatus.TIME_LIMIT
+    assert (caught.value.name, caught.value.solution) == ("time_limit", None)  # it was still being built
     overtaken(monkeypatch, ocp.refinement, "judge", 1)
     with pytest.raises(
         SolveError, match="audit of its first plan with Maximum_WallTime_Exceeded: raise time"
@@ -404,7 +420,7 @@ def test_a_failure_within_the_time_limit_is_no_matter_of_time() -> None:
 def test_tightening_ends_at_its_time_limit_with_its_best_plan() -> None:
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         tighten(long(), Collocation(200), time_limit=1e-6)
-    assert caught.value.solution.status is SolverStatus.TIME_LIMIT
+    assert (caught.value.name, caught.value.solution) == ("time_limit", None)  # it was still being built
 
 
 @pytest.mark.parametrize("rounds", [1, 2])
@@ -515,8 +531,9 @@ def test_without_a_terminal_a_solve_logs_its_start_and_its_end(solver: str, capl
     assert start == f"solving 'energy': {plan.variables.size} variables, {plan.multipliers.size} rows"
     assert end.startswith(f"solved 'energy': {plan.status}, cost {plan.cost:.6g}, {plan.iterations} iterations, ")
     caplog.clear()
+    prepared = prepare(van_der_pol(horizon=20.0), Collocation(100), solver=solver)
     with caplog.at_level(logging.INFO, "ocp"):
-        solve(van_der_pol(horizon=20.0), Collocation(100), solver=solver, time_limit=1e-3, check=False)
+        prepared.solve(time_limit=1e-3, check=False)
     assert "Maximum_WallTime_Exceeded" in caplog.records[-1].getMessage()
 
 

@@ -14,7 +14,7 @@ from models.arrays import Array
 from models.cts.clearance import Surroundings, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
-from ocp import Collocation, roll_problem, solve
+from ocp import Collocation, Problem, roll_problem, solve
 from scripts.drawing import ASSUMING, COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep
@@ -62,9 +62,9 @@ def obstacle() -> Surroundings:
     return Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
 
-def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
-    """Solve and audit the plan; evaluate it and the roll of each target by itself on a fine grid."""
-    problem = roll_problem(
+def sweep_problem(rig: Rig, tunnel: Tunnel) -> Problem:
+    """The problem of the plan."""
+    return roll_problem(
         rig,
         tunnel,
         targets,
@@ -77,7 +77,11 @@ def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
         clearance=CLEARANCE,
         symbols=ca.SX,
     )
-    solution = solve(problem, METHOD)
+
+
+def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
+    """Solve and audit the plan; evaluate it and the roll of each target by itself on a fine grid."""
+    solution = solve(sweep_problem(rig, tunnel), METHOD)
     audit = solution.audit()
     t = np.linspace(0, HORIZON, 401)
     rows = np.array([np.broadcast_to(part, len(t)) for part in targets(t)])

@@ -542,4 +542,4 @@ def test_the_bound_is_exact_where_a_ball_lies_off_a_corner() -> None:
     diagonal, middle = np.ones(3) / np.sqrt(3), np.array([0.3, -0.2, 0.5])
     box, ball = Box((0.2, 0.2, 0.2), middle), Sphere(0.05, (0.0, 0.7, 0.0))
     turn, shift = np.eye(3)[None], (middle + 0.4 * diagonal - [0.0, 0.7, 0.0])[None]
-    assert _bound(box, ball)(turn, shift) == pytest.approx([0.4 - 0.1 * np.sqrt(3) - 0.05], abs=1e-12)
+    assert bound(box, ball, turn, shift) == pytest.approx([0.4 - 0.1 * np.sqrt(3) - 0.05], abs=1e-12)

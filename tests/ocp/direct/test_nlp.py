@@ -259,9 +259,9 @@ def run(code: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
 
 
 INTERRUPTED = """
-import os, signal, subprocess, time
+import os, signal, time
 import casadi as ca
-from ocp import Collocation, Problem, prepare
+from ocp import Collocation, Problem, console, prepare
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs with Ctrl-C ignored
 problem = Problem("long")
@@ -275,17 +275,30 @@ never = {"max_iter": 1000000}
 if SOLVER != "fatrop":
     never |= {"tol": 1e-300, "acceptable_iter": 0 if SOLVER == "ipopt" else 1000000}
 prepared = prepare(problem, Collocation(600, 4), solver=SOLVER, options=never)
+
+
+def stopping(kind):
+    real = kind.eval
+
+    def eval(self, arguments):
+        if self.stops and self.iterations == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(self, arguments)
+
+    kind.eval, kind.stops = eval, True
+
+
+stopping(console.Progress)
+stopping(console.Watch)
 before = signal.getsignal(signal.SIGINT)
 for check in (False, True):
-    # from another process, for a thread may wait long for its turn
-    stop = subprocess.Popen(["sh", "-c", f"sleep 0.05; kill -INT {os.getpid()}"])
     try:
         prepared.solve(check=check)
         print("returned")
     except KeyboardInterrupt as error:
         print(error.solution.success, error.solution.message, error.solution["x"].shape)
-    stop.wait()
     print("restored", signal.getsignal(signal.SIGINT) is before)
+console.Progress.stops = console.Watch.stops = False
 again = prepare(problem, Collocation(20), solver=SOLVER).solve()
 print("afterwards", again.success)
 try:
