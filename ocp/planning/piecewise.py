@@ -17,6 +17,7 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp.builders.clearance import Clear, keeping_clear, touching_error
+from ocp.builders.tool_motion import stretches_of
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
@@ -222,11 +223,10 @@ def _piece(asked: Asked, begin: float, end: float) -> Plan:
     Raises:
         ProblemError, SolveError: As `plan`.
     """
-    tasks = [part for task in asked.tasks if (part := _part(task, begin, end)) is not None]
+    tasks = tuple(part for task in asked.tasks if (part := _part(task, begin, end)) is not None)
+    stretches = stretches_of(asked.machine, tasks, end - begin)
     start = asked.start if begin == 0 else None
-    told = (asked.drives or asked.limits, "global", asked.seed, 1.0)
-    own = checked_asked(asked.machine, tasks, end - begin, start, None, False, asked.weights, *told)
-    return planned(replace(own, clear=asked.clear))
+    return planned(replace(asked, tasks=tasks, horizon=end - begin, stretches=stretches, start=start))
 
 
 def _part(task: TipTask, begin: float, end: float) -> TipTask | None:

@@ -176,7 +176,7 @@ def _through_cells(
 
 
 def _alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Candidates whose motions collide, each from its own local motion; then with starts that are clear and fixed.
+    """Run candidates whose motions collide, each from its own local motion; then with starts that are clear and fixed.
 
     Where nothing is in the way postures slide along their self-motion into one motion, however clear they were. Their
     local motions pass on other sides; those that are clear, or nearest to it, come first. And a start that may slide is
@@ -187,11 +187,11 @@ def _alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Ca
     ways = []
     for seed in seeds:
         end = ended[id(seed.seed)]
-        if end.reason is not None and end.reason.kind in (Rejection.COLLISION, Rejection.DUPLICATE):
-            touching = solver.local_collisions(seed.seed)
-            assert end.clear is not None
-            clear = end.clear.holding([touch.pair for touch in touching])
-            ways.append((min((touch.distance for touch in touching), default=np.inf), replace(seed, clear=clear)))
+        colliding = solver.collisions(end)
+        if end.clear is not None and (colliding or end.clear.margins):
+            local = solver.local_collisions(seed.seed)
+            clear = end.clear.holding([touch.pair for touch in (*colliding, *local)])
+            ways.append((min((touch.distance for touch in local), default=np.inf), replace(seed, clear=clear)))
     others = [seed for _, seed in sorted(ways, key=lambda way: -way[0])[:most]]
     if request.start is None:
         touching_starts = touches_at_the_start(request, np.array([seed.start for seed in seeds]))
