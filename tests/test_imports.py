@@ -32,8 +32,8 @@ FLOORS = {
         ["papers"],
     ],
     "ocp": [
-        ["errors", "curves", "status", "tolerances"],
-        ["console"],
+        ["errors", "status", "tolerances"],
+        ["console", "curves"],
         ["storage", "libraries", "tables"],
         ["problem", "schedule", "tasks"],
         ["solution"],
