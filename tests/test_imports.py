@@ -34,7 +34,7 @@ FLOORS = {
     "ocp": [
         ["errors", "curves", "status", "tolerances"],
         ["console"],
-        ["storage", "libraries", "tables"],
+        ["storage", "libraries", "tables", "solution_data"],
         ["problem", "schedule", "tasks"],
         ["solution"],
         ["direct", "audit", "local"],
