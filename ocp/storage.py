@@ -110,10 +110,10 @@ def new_part(target: Path) -> IO[bytes]:
 
 def remove_left(target: Path) -> None:
     """Remove what killed writers of the target have left."""
-    part = re.compile(re.escape(target.name) + r"\.[0-9a-f]{8}\.part")
+    begin = f"{target.name}."
     with suppress(OSError):
         for name in os.listdir(target.parent):
-            if part.fullmatch(name):
+            if name.startswith(begin) and re.fullmatch(r"[0-9a-f]{8}\.part", name.removeprefix(begin)):
                 left = target.with_name(name)
                 with suppress(OSError), open_regular(left, sys.maxsize) as stream:
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives

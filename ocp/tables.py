@@ -1,12 +1,13 @@
-"""Heads of tables of joints as CSV: names in them mean nothing to a spreadsheet or a shell, and are read back."""
+"""Tables as CSV: names and texts in them mean nothing to a spreadsheet or a shell, and are read back."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 from urllib.parse import unquote
 
-__all__ = ["column_name", "joint_name", "table_head", "table_joints"]
+__all__ = ["cell", "column_name", "joint_name", "table_head", "table_joints"]
 
 ENDS = ("", ".velocity", ".acceleration")
 STRANGE = re.compile(r"[^\w./: -]|^[^\w]| $")
@@ -16,9 +17,22 @@ At the beginning `-` would begin a formula, `/` a command, and blanks at the end
 """
 
 
+FORMULA = re.compile(r"^[=+\-@\t\r%]")
+"""What begins a formula in a spreadsheet, and the sign by which it is written in a cell."""
+
+
 def column_name(name: str) -> str:
     """Return a joint's name as it stands in the head of a table, with strange characters as %XX of their UTF-8."""
-    return STRANGE.sub(lambda sign: "".join(f"%{byte:02X}" for byte in sign[0].encode(errors="surrogatepass")), name)
+    return STRANGE.sub(_quoted, name)
+
+
+def cell(value: Any) -> Any:
+    """Return a value as it stands in a cell: a text that a spreadsheet would take for a formula begins with %XX."""
+    return FORMULA.sub(_quoted, value) if isinstance(value, str) else value
+
+
+def _quoted(sign: re.Match[str]) -> str:
+    return "".join(f"%{byte:02X}" for byte in sign[0].encode(errors="surrogatepass"))
 
 
 def joint_name(column: str) -> str:

@@ -32,9 +32,9 @@ FLOORS = {
         ["papers"],
     ],
     "ocp": [
-        ["errors", "status", "tolerances"],
-        ["console", "curves"],
-        ["storage", "libraries", "tables"],
+        ["errors", "curves", "status", "tolerances"],
+        ["console"],
+        ["storage", "libraries", "tables", "solution_data"],
         ["problem", "schedule", "tasks"],
         ["solution"],
         ["direct", "audit", "local"],

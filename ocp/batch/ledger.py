@@ -3,7 +3,7 @@
     batch.json              the function, its version, the format
     results/ab/KEY.json     a record: task, status, value, cost, verdict, seconds, message
     results/ab/KEY.0.npz    plans and solutions of its value
-    claims/, owners/, lock  who is at what (`ocp.batch.claims`)
+    lock                    which the driver at work holds; when it ends, whatever ends it, the system lets go
 
 Files are there whole or not at all. They are not waited for to reach the disk: after a loss of power the last of them
 may be empty or cut short, which is seen, and counts as missing.
@@ -11,16 +11,18 @@ may be empty or cut short, which is seen, and counts as missing.
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from ocp.batch.claims import locked
 from ocp.batch.content import Parcel, key_of, text_of, unpacked
+from ocp.console import LOG
 from ocp.errors import ProblemError
 from ocp.storage import END, checked_path, open_unlinked, write_whole
 
@@ -28,7 +30,8 @@ __all__ = ["ENDS", "Ledger"]
 
 FORMAT = 2
 HEAD = "batch.json"
-OWN = {HEAD, "results", "claims", "owners", "lock"}
+LOCK = "lock"
+OWN = {HEAD, "results", LOCK}
 ENDS = ("done", "failed", "killed")
 PARTS = {
     "key": str,
@@ -103,17 +106,20 @@ class Ledger:
             if strange:
                 words = f"{path} holds {strange[0]!r} and is no folder of a batch; take a new or an empty one"
                 raise ProblemError(words, name="folder", value=str(path))
-            with locked(path / "lock"):
+            begun = cls(path, function, version)
+            with begun.alone():
                 if not os.path.lexists(path / HEAD):
-                    cls(path, function, version)._begin()
+                    begun._begin()
             (path / "results").mkdir(exist_ok=True)
         found = cls.at(path)
         if found.function != function:
             words = f"{path} holds results of {found.function}, not of {function}; take another folder"
             raise ProblemError(words, name="folder", value=function, limit=found.function)
         if found.version != version and not found._keeps():
-            found = cls(path, function, version)
-            found._begin()
+            with found.alone():  # a driver that is waited for may have written one
+                if not found._keeps():
+                    found = cls(path, function, version)
+                    found._begin()
         if found.version != version:
             words = f"{path} holds results of version {found.version!r} of {function}, this is {version!r}; "
             words += "take another folder" if chosen else "its source has changed: take another folder, or, where the "
@@ -126,10 +132,33 @@ class Ledger:
         write_whole(self.folder / HEAD, lambda stream: stream.write(text))
 
     def _keeps(self) -> bool:
-        """Whether a result is there, or a driver that may be about to write one."""
-        drivers = self.folder / "owners"
+        """Whether a result is there."""
         records = (self.read(key) for key in self.recorded())
-        return (drivers.is_dir() and any(drivers.iterdir())) or any(one and one["status"] == "done" for one in records)
+        return any(record and record["status"] == "done" for record in records)
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Inside, no other driver is at work in this folder; one that is so is waited for.
+
+        Raises:
+            ProblemError: The folder's file system has no locks.
+            OSError: The folder cannot be written.
+        """
+        file = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o644)
+        try:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                LOG.warning("another driver is at work in %s: waiting for its end", self.folder)
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                    raise
+                words = f"the file system of {self.folder} has no locks, which keep two drivers apart; take another"
+                raise ProblemError(words, name="folder", value=str(self.folder)) from error
+            yield
+        finally:
+            os.close(file)
 
     # ---- records -----------------------------------------------------------------------------------------------
 

@@ -9,32 +9,24 @@ import json
 import os
 import sys
 import textwrap
-import time
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import ExitStack
 from functools import cache
 from typing import Any, Literal
 
 from tqdm import tqdm
 
-from ocp.batch.claims import Claims
-from ocp.batch.cluster import Cluster, checked_cluster
 from ocp.batch.content import Parcel, digest_of, key_of, text_of
+from ocp.batch.engine import Engine, Job, checked_cluster
 from ocp.batch.ledger import ENDS, Ledger
 from ocp.batch.neighbours import neighbours
-from ocp.batch.processes import Job, Processes, Source
 from ocp.batch.table import Batch, Result, row_of
-from ocp.batch.worker import Function, failed, loading
+from ocp.batch.worker import Function, failed
 from ocp.errors import MOST, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
 
 __all__ = ["run_batch"]
 
-MOST_DEATHS = 3
-"""Workers that one task may end."""
 MOST_WORKERS = 4096
-PAUSE = 0.2
-"""s between two looks at what another driver is at."""
 
 
 def run_batch(
@@ -52,7 +44,8 @@ def run_batch(
     """Call a function with each of many tasks, and keep each result in a folder as soon as it is there.
 
     What the folder holds is not done again: after whatever ended it the same call does what is missing, and a longer
-    list of tasks what is new. Several calls on one folder, also from several machines that share it, share the work.
+    list of tasks what is new. A call that finds another one at work in its folder waits for its end, and then does what
+    is missing.
 
     Args:
         function: ``function(task)``, at the top level of a module or of the script that was started (which then calls
@@ -63,7 +56,8 @@ def run_batch(
             and the other tasks go on.
         tasks: Data each: parameters by name, a seed, the text of a task's file. Tasks of the same content are one.
         folder: New, empty, or of an earlier call with this function.
-        workers: Processes on this machine; one for each core where it is None.
+        workers: Processes on this machine, a Dask cluster that is begun and ended here; one for each core where it is
+            None.
         cluster: Address of a Dask scheduler, ``"tcp://host:8786"``, or a `distributed.Client`: its workers do the
             tasks, and have to have this package and the function's module. Results come back to this process. Take
             workers of one thread: those of a process take turns.
@@ -83,15 +77,13 @@ def run_batch(
 
     Raises:
         BatchError: Tasks failed; says how many and why the first did, and carries the results.
-        ProblemError: A task is no data, the function cannot be found by a worker, the folder is another function's.
+        ProblemError: A task is no data, the function cannot be found by a worker, the folder is another function's, or
+            Dask is not installed.
         OSError: The folder cannot be written; what is done is kept.
         SolveError: The scheduler of the cluster is gone; what is done is kept.
         KeyboardInterrupt: Ctrl-C. The workers are gone, what is done is kept.
     """
-    source = source_of(function)
-    if loading():
-        words = "run_batch: its workers read the script that calls it; call it under if __name__ == '__main__':"
-        raise ProblemError(words, name="function", value=source.name)
+    name = name_of(function)
     texts = texts_of(tasks)
     count = workers_of(workers, cluster)
     names = names_of("near", near)
@@ -100,29 +92,30 @@ def run_batch(
         checked_choice("again", end, ENDS[1:])
     checked_choice("failures", failures, ("raise", "return"))
     told = source_version(function) if version is None else checked_text("version", version)
-    ledger = Ledger.of(folder, f"{title(source)}:{source.name}", told, version is not None)
+    ledger = Ledger.of(folder, name, told, version is not None)
     parents = neighbours(tasks_of(texts), names) if names else dict.fromkeys(texts)
-    before = {key: record for key in texts if (record := ledger.read(key)) is not None}
-    source_digest, digests = module_version(function), cache(digest_of)
+    source, digests = source_version(sys.modules[function.__module__]), cache(digest_of)
 
     def counts(record: dict[str, Any]) -> bool:
         """Whether a record is what the task would come to."""
         files = record["inputs"].get("kept")
-        same = record["inputs"].get("source") == source_digest and isinstance(files, dict)
+        same = record["inputs"].get("source") == source and isinstance(files, dict)
         same = same and all(digests(file) == digest for file, digest in files.items())
         return record["status"] == "done" or (same and record["status"] not in ends)
 
-    results = {key: row_of(record, ledger) for key, record in before.items() if counts(record)}
+    def recorded(keys: Iterable[str]) -> dict[str, Result]:
+        records = [record for key in keys if (record := ledger.read(key)) is not None and counts(record)]
+        return {record["key"]: row_of(record, ledger) for record in records}
+
+    results = recorded(texts)
     if len(results) < len(texts):
         try:
-            with ExitStack() as opened:
-                claims = opened.enter_context(Claims(ledger.folder))
-                crew: Processes | Cluster
-                if cluster is None:
-                    crew = opened.enter_context(Processes(source, count))
-                else:
-                    crew = opened.enter_context(Cluster(cluster, function))
-                Missing(ledger, claims, texts, parents, results, before, bool(names), source_digest).do(crew)
+            with ledger.alone():
+                results |= recorded([key for key in texts if key not in results])  # of a driver that was waited for
+                missing = Missing(ledger, texts, parents, results, source)
+                if len(results) < len(texts):
+                    with Engine(function, bool(names), min(count, len(texts) - len(results)), cluster) as engine:
+                        missing.do(engine)
         except OSError as error:
             if isinstance(error, ConnectionError):
                 raise
@@ -142,21 +135,18 @@ class Missing:
     def __init__(
         self,
         ledger: Ledger,
-        claims: Claims,
         texts: dict[str, str],
         parents: dict[str, str | None],
         results: dict[str, Result],
-        before: dict[str, dict[str, Any]],
-        near: bool,
         source: str,
     ) -> None:
-        self.source, self.failures = source, 0
-        self.ledger, self.claims, self.texts, self.parents, self.near = ledger, claims, texts, parents, near
-        self.results, self.before = results, {key: before[key] for key in before if key not in results}
+        self.ledger, self.texts, self.parents, self.results, self.source = ledger, texts, parents, results, source
+        self.failures = 0
         self.after: defaultdict[str, list[str]] = defaultdict(list)  # tasks that wait for a neighbour
         self.ready: deque[str] = deque()
-        self.others: deque[str] = deque()  # tasks that another driver is at
-        self.deaths: defaultdict[str, list[str]] = defaultdict(list)
+        self.suspects: deque[str] = deque()  # tasks that were sent when a worker ended
+        self.alone = ""  # of them the one that is sent by itself
+        self.deaths: Counter[str] = Counter()
         for key, parent in parents.items():
             if key not in results:
                 if parent is None or parent in results:
@@ -164,59 +154,47 @@ class Missing:
                 else:
                     self.after[parent].append(key)
 
-    def do(self, crew: Processes | Cluster) -> None:
+    def do(self, engine: Engine) -> None:
         """Do them, until none is missing."""
-        looked = time.monotonic()
         told: dict[str, Any] = {"desc": self.ledger.folder.name, "unit": "task", "disable": None, "leave": False}
         with tqdm(total=len(self.texts), initial=len(self.results), file=sys.stderr, **told) as bar:
             while len(self.results) < len(self.texts):
-                self._submit(crew)
-                pause = PAUSE if self.others else 1.0
-                outcomes = crew.wait(pause, len(self.texts) - len(self.results))
-                self._submit(crew)  # before anything is written: workers shall not wait
+                self._submit(engine)
+                outcomes = engine.wait(1.0)
+                for lost in (outcome for outcome in outcomes if outcome.parcel is None):
+                    if lost.deaths:
+                        self._suspect(lost.key, lost.deaths, engine.settings.deaths)
+                    else:
+                        self.ready.appendleft(lost.key)
+                self._submit(engine)  # before anything is written: workers shall not wait
                 for outcome in outcomes:
                     if outcome.parcel is not None:
                         self._end(outcome.key, outcome.parcel)
-                    elif self._is_deadly(outcome.key, outcome.why, outcome.deaths):
-                        words = f"it ended {MOST_DEATHS} workers: {'; '.join(self.deaths[outcome.key])}"
-                        self._end(outcome.key, failed("killed", "", words))
-                    else:
-                        self.ready.appendleft(outcome.key)
-                if self.others and time.monotonic() - looked > PAUSE:
-                    looked = time.monotonic()
-                    self.ready.extend(self.others)
-                    self.others.clear()
-                self.claims.sign()
                 bar.update(len(self.results) - bar.n)
                 if self.failures:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
-    def _submit(self, crew: Processes | Cluster) -> None:
-        room = crew.room()
-        while room and self.ready:
-            key = self.ready.popleft()
-            if not self._is_ours(key):
-                continue
-            crew.submit(Job(key, self.texts[key], self.near, self._guess(key)))
-            room -= 1
+    def _suspect(self, key: str, deaths: int, most: int) -> None:
+        """Try again by itself what was sent when a worker ended, or set it aside where it has been so."""
+        self.deaths[key] += deaths
+        if key == self.alone and self.deaths[key] >= most:
+            self._end(key, failed("killed", "", f"it ended {self.deaths[key]} workers"))
+        else:
+            self.suspects.append(key)
 
-    def _is_ours(self, key: str) -> bool:
-        """Whether a task is to be done, and by us."""
-        if key in self.deaths:  # it is ours since it was begun
-            return True
-        if not self.claims.take(key):
-            self.others.append(key)
-            return False
-        record = self.ledger.read(key)  # after the claim: who had it may have done it
-        if record is None or record == self.before.get(key):
-            return True
-        self.claims.release(key)
-        self._take_note(record)
-        return False
-
-    def _is_deadly(self, key: str, why: str, deaths: int) -> bool:
-        self.deaths[key] += [why] * deaths
-        return len(self.deaths[key]) >= MOST_DEATHS
+    def _submit(self, engine: Engine) -> None:
+        if self.suspects or self.alone:
+            if not engine.is_idle or not engine.room():
+                return
+            self.alone = self.suspects.popleft() if self.suspects else ""
+            if self.alone:
+                engine.submit([Job(self.alone, self.texts[self.alone], self._guess(self.alone))])
+                return
+        for _ in range(engine.room()):
+            keys = [self.ready.popleft() for _ in range(min(engine.share(len(self.ready)), len(self.ready)))]
+            if not keys:
+                break
+            engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
     def _guess(self, key: str) -> Parcel | None:
         """The result of the nearest neighbour that has one."""
@@ -231,18 +209,10 @@ class Missing:
         return parent
 
     def _end(self, key: str, parcel: Parcel) -> None:
-        """Keep what came of a task, unless another driver that took us for gone has done so."""
-        known = self.ledger.read(key)
-        if known is None or known == self.before.get(key):
-            task = tasks_of({key: self.texts[key]})[key]
-            known = {"key": key, "task": task, "neighbour": self._neighbour(key), **parcel.record}
-            known["inputs"] = {"source": self.source, **known["inputs"]}
-            self.ledger.write(known, parcel.files)
-        self.claims.release(key)
-        self._take_note(known)
-
-    def _take_note(self, record: dict[str, Any]) -> None:
-        key = record["key"]
+        """Keep what came of a task."""
+        record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **parcel.record}
+        record["inputs"] = {"source": self.source, **record["inputs"]}
+        self.ledger.write(record, parcel.files)
         self.results[key] = row_of(record, self.ledger)
         self.failures += record["status"] != "done"
         self.ready.extend(self.after.pop(key, ()))
@@ -297,13 +267,16 @@ def names_of(what: str, names: Any) -> tuple[str, ...]:
     return tuple(checked_text(what, name) for name in names)
 
 
-def source_of(function: Any) -> Source:
-    """Where a worker finds a function.
+def name_of(function: Any) -> str:
+    """The name of a function for its folder: ``module:name``; of a script, that of its file for the module.
 
     Raises:
-        ProblemError: It does not: it has no name there, as a lambda, a function within another, a method, and what was
-            typed at a prompt.
+        ProblemError: A worker does not find it by a name, as a lambda, a function within another, a method, and what
+            was typed at a prompt; or this process is itself a worker, which reads the script that calls run_batch.
     """
+    if sys.modules.get("__mp_main__") not in (None, sys.modules["__main__"]):  # a worker reads its driver's script
+        words = "run_batch: its workers read the script that calls it; call it under if __name__ == '__main__':"
+        raise ProblemError(words, name="function", value=function)
     name, module = getattr(function, "__qualname__", None), getattr(function, "__module__", None)
     if not callable(function) or not isinstance(name, str) or not isinstance(module, str):
         words = f"function must be a function with a name, not {function!r}; what it needs besides goes into the tasks"
@@ -315,25 +288,15 @@ def source_of(function: Any) -> Source:
         words = f"function: a worker cannot find {name} of {module} by its name; put it at the top level of a module"
         raise ProblemError(words, name="function", value=function)
     if module != "__main__":
-        return Source(module, name, None)
+        return f"{module}:{name}"
     main = sys.modules["__main__"]
     if main.__spec__ is not None:  # python -m
-        return Source(main.__spec__.name, name, None)
+        return f"{main.__spec__.name}:{name}"
     file = getattr(main, "__file__", None)
     if file is None:
         words = f"function: {name} was typed at a prompt, where no worker can read it; import it from a file"
         raise ProblemError(words, name="function", value=function)
-    return Source(module, name, os.path.abspath(file))
-
-
-def title(source: Source) -> str:
-    """The module's name; a script's is that of its file."""
-    return source.module if source.file is None else os.path.splitext(os.path.basename(source.file))[0]
-
-
-def module_version(function: Function) -> str:
-    """Digits that change with the source of the function's module."""
-    return source_version(sys.modules[function.__module__])
+    return f"{os.path.splitext(os.path.basename(file))[0]}:{name}"
 
 
 def source_version(function: Any) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from ocp.batch.ledger import Ledger
 from ocp.errors import Detailed, ProblemError, SolveError, checked_each, checked_instance, unknown_name
 from ocp.storage import checked_path, write_text, write_whole
+from ocp.tables import cell
 
 __all__ = ["Batch", "BatchError", "Result", "read_batch", "row_of"]
 
@@ -180,6 +181,9 @@ class Batch:
     def write_csv(self, path: str | os.PathLike[str]) -> None:
         """Write the rows as a table, in full precision; empty where there is nothing.
 
+        A text that a spreadsheet would take for a formula, which begins with = + - @ or a tab, begins with the %XX of
+        that sign; so does one that begins with %.
+
         Raises:
             ProblemError: path is no path of a file.
             OSError: It cannot be written.
@@ -189,7 +193,7 @@ class Batch:
         stream = io.StringIO()
         writer = csv.DictWriter(stream, rows[0] if rows else COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: cell(value) for name, value in row.items()} for row in rows)
         write_text(path, stream.getvalue())
 
     def write_parquet(self, path: str | os.PathLike[str]) -> None:

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from typing import Any
@@ -49,7 +48,7 @@ def deadly(task: Any) -> float:
 
 
 def endings(task: str) -> Any:
-    """Each way in which a function ends that is no result, or leaves a process behind."""
+    """Each way in which a function ends that is no result."""
     if task == "problem":
         raise ProblemError("the arm is too short", name="arm")
     if task == "solve":
@@ -60,12 +59,6 @@ def endings(task: str) -> Any:
         sys.exit("left")
     if task == "interrupt":
         raise KeyboardInterrupt
-    if task == "fork" and os.fork():  # what is left behind is a copy of the worker
-        os._exit(3)
-    if task == "fork":
-        time.sleep(60)
-    if task == "child":
-        return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]).pid
     if task == "set":
         return {"found": {1, 2}}
     return {"nan": math.nan, "inf": [1.0, math.inf], "inside": {"a": {"b": [0.0, math.nan]}}, "good": 1.5}[task]

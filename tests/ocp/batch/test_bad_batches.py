@@ -10,6 +10,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 import pytest
+from distributed import Client, LocalCluster
 
 from ocp.batch import Batch, kept, read_batch, run_batch
 from ocp.batch.ledger import Ledger
@@ -88,7 +89,9 @@ def folder() -> str:
     """Of a batch in which nothing is left to be done."""
     path = mkdtemp()
     atexit.register(rmtree, path)
-    run_batch(same, TASKS_DONE, path, workers=1)
+    own: Any = {"processes": False, "n_workers": 1, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**own) as cluster, Client(cluster, set_as_default=False) as client:
+        run_batch(same, TASKS_DONE, path, cluster=client)
     return path
 
 

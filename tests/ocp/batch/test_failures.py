@@ -64,13 +64,13 @@ def test_a_script_whose_file_is_missing_ends_with_status_1_and_is_done_when_the_
     assert stored(tmp_path / "b") == before
 
 
-def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_path: Path) -> None:
+def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_path: Path, here: Any) -> None:
     good, bad = tmp_path / "good", tmp_path / "bad"
     good.write_text("1")
     tasks = [{"file": str(file), "x": x} for file in (good, bad) for x in (0, 1)]
 
     def counts(**options: Any) -> dict[str, int]:
-        return run_batch(functions.of_file, tasks, tmp_path / "b", workers=1, failures="return", **options).counts
+        return run_batch(functions.of_file, tasks, tmp_path / "b", cluster=here, failures="return", **options).counts
 
     assert counts() == {"done": 2, "failed": 2}
     kept_results = {name: text for name, text in stored(tmp_path / "b").items() if b'"done"' in text[1]}
@@ -113,21 +113,21 @@ if __name__ == "__main__":
     assert "its source has changed" in changed.stderr, "results of two functions are not mixed"
 
 
-def test_again_tries_failures_though_nothing_has_changed(tmp_path: Path) -> None:
+def test_again_tries_failures_though_nothing_has_changed(tmp_path: Path, here: Any) -> None:
     gate = tmp_path / "gate"
     tasks = [{"until": str(gate)}]
     before = ["problem", "good"]
-    run_batch(functions.endings, before, tmp_path / "b", workers=1, failures="return")
+    run_batch(functions.endings, before, tmp_path / "b", cluster=here, failures="return")
     first = stored(tmp_path / "b")
     with pytest.raises(BatchError):
-        run_batch(functions.endings, before, tmp_path / "b", workers=1, again="failed")
+        run_batch(functions.endings, before, tmp_path / "b", cluster=here, again="failed")
     again = stored(tmp_path / "b")
     assert sum(again[name][0] != first[name][0] for name in first) == 1
-    assert run_batch(functions.without_room, tasks, tmp_path / "c", workers=1).counts == {"done": 1}
+    assert run_batch(functions.without_room, tasks, tmp_path / "c", cluster=here).counts == {"done": 1}
 
 
-def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path) -> None:
-    batch = run_batch(functions.endings, ["good", "problem", "solve"], tmp_path / "b", workers=1, failures="return")
+def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path, here: Any) -> None:
+    batch = run_batch(functions.endings, ["good", "problem", "solve"], tmp_path / "b", cluster=here, failures="return")
     with pytest.raises(BatchError) as caught:
         batch.check()
     assert str(caught.value) == (
@@ -135,7 +135,7 @@ def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path) -> N
     )
     assert (caught.value.batch, caught.value.value, caught.value.limit) == (batch, 2, 0)
     assert caught.value.name == "b"
-    run_batch(functions.endings, ["good"], tmp_path / "b").check()
+    run_batch(functions.endings, ["good"], tmp_path / "b", cluster=here).check()
 
 
 def test_what_kept_raises_names_the_function_and_its_arguments(tmp_path: Path) -> None:
@@ -158,14 +158,14 @@ def record_of(folder: Path) -> Path:
     return place
 
 
-@pytest.mark.parametrize("linked", ["record", "file", "shard", "head", "results", "claims", "owners", "lock", "part"])
-def test_links_lead_nothing_out_of_the_folder(linked: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("linked", ["record", "file", "shard", "head", "results", "lock", "part"])
+def test_links_lead_nothing_out_of_the_folder(linked: str, tmp_path: Path, here: Any) -> None:
     """What they point at is neither changed nor removed nor taken for a result."""
     folder, outside = tmp_path / "b", tmp_path / "outside"
     outside.mkdir()
     (outside / "marker").write_text("mine")
     task = {"mass": 1.0, "stiffness": 0.0}
-    run_batch(functions.spring, [task], folder, workers=1)
+    run_batch(functions.spring, [task], folder, cluster=here)
     record = record_of(folder)
     places = {
         "record": record,
@@ -184,64 +184,47 @@ def test_links_lead_nothing_out_of_the_folder(linked: str, tmp_path: Path) -> No
         place.unlink(missing_ok=True)
     place.symlink_to(target)
     before = marked(outside)
-    if linked in ("head", "results", "claims", "owners", "lock"):
+    if linked in ("head", "results", "lock"):
         with pytest.raises(ProblemError, match="is a link") as caught:
-            run_batch(functions.spring, [task], folder, workers=1)
+            run_batch(functions.spring, [task], folder, cluster=here)
         assert caught.value.name == "folder"
     else:
-        batch = run_batch(functions.spring, [task], folder, workers=1)
+        batch = run_batch(functions.spring, [task], folder, cluster=here)
         assert batch[0].value["plan"].cost == batch[0].cost
         assert not record.is_symlink()
     assert marked(outside) == before
 
 
-def test_a_claim_that_names_a_place_elsewhere_removes_nothing(tmp_path: Path) -> None:
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    task = {"x": 1}
-    run_batch(functions.square, [task], tmp_path / "b", workers=1)
-    record = record_of(tmp_path / "b")
-    for owner in (str(victim), ".."):
-        record.unlink()
-        (tmp_path / "b" / "claims" / record.stem).symlink_to(owner)
-        assert len(run_batch(functions.square, [task], tmp_path / "b", workers=1)) == 1
-        assert victim.read_text() == "mine"
-
-
-@pytest.mark.parametrize("kind", ["record", "file", "head", "owner", "part"])
-def test_pipes_are_not_waited_for(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["record", "file", "head", "part"])
+def test_pipes_are_not_waited_for(kind: str, tmp_path: Path, here: Any) -> None:
     task = {"mass": 1.0, "stiffness": 0.0}
     folder = tmp_path / "b"
-    run_batch(functions.spring, [task], folder, workers=1)
+    run_batch(functions.spring, [task], folder, cluster=here)
     record = record_of(folder)
     places = {
         "record": record,
         "file": record.with_suffix(".0.npz"),
         "head": folder / "batch.json",
-        "owner": folder / "owners" / "gone",
         "part": record.with_name(f"{record.name}.01234567.part"),
     }
     places[kind].unlink(missing_ok=True)
     os.mkfifo(places[kind])
-    if kind == "owner":
-        record.unlink()
-        (folder / "claims" / record.stem).symlink_to("gone")
     if kind == "head":
         with pytest.raises(ProblemError, match="no file, but a folder, a pipe or a device"):
             read_batch(folder)
     elif kind in ("record", "file"):
         assert len(read_batch(folder)) == 0
     else:
-        assert run_batch(functions.spring, [task], folder, workers=1).counts == {"done": 1}
+        assert run_batch(functions.spring, [task], folder, cluster=here).counts == {"done": 1}
 
 
 def changed(record: dict[str, Any], **parts: Any) -> str:
     return json.dumps({**record, **parts})
 
 
-def test_records_that_nobody_wrote_are_none_and_values_that_do_not_fit_are_named(tmp_path: Path) -> None:
+def test_records_that_nobody_wrote_are_none_and_values_that_do_not_fit_are_named(tmp_path: Path, here: Any) -> None:
     folder, task = tmp_path / "b", {"mass": 1.0, "stiffness": 0.0}
-    batch = run_batch(functions.spring, [task], folder, workers=1)
+    batch = run_batch(functions.spring, [task], folder, cluster=here)
     place = record_of(folder)
     text = place.read_text()
     record = json.loads(text)
@@ -274,11 +257,11 @@ def test_records_that_nobody_wrote_are_none_and_values_that_do_not_fit_are_named
     source = record["inputs"]["source"]
     inputs = {"source": source, "kept": {"\0": None, "/dev/zero": "a", "../../x": 7}}
     place.write_text(changed(record, status="failed", inputs=inputs))
-    assert run_batch(functions.spring, [task], folder, workers=1).counts == {"done": 1}
+    assert run_batch(functions.spring, [task], folder, cluster=here).counts == {"done": 1}
     assert batch[0].value["plan"].cost == batch[0].cost
 
 
-def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(tmp_path: Path) -> None:
+def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(tmp_path: Path, here: Any) -> None:
     import numpy as np
 
     class Touch:
@@ -286,7 +269,7 @@ def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(t
             return os.mkdir, (str(tmp_path / "run"),)
 
     folder, task = tmp_path / "b", {"mass": 1.0, "stiffness": 0.0}
-    run_batch(functions.spring, [task], folder, workers=1)
+    run_batch(functions.spring, [task], folder, cluster=here)
     place = record_of(folder)
     file = place.with_suffix(".0.npz")
     np.savez(file, head=np.array([Touch()], dtype=object), allow_pickle=True)

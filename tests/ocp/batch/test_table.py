@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -77,6 +78,18 @@ def test_a_table_has_a_row_for_each_result_and_every_digit(tmp_path: Path) -> No
         assert text["result.note"] == (value.get("note", "") if isinstance(value, dict) else "")
     assert batch.counts == {"done": 4, "failed": 2}
     assert "1 x failed: ValueError too far, by 1 m" in str(batch)
+
+
+def test_no_text_in_a_table_begins_a_formula_and_numbers_stay(tmp_path: Path) -> None:
+    texts = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "%3D1", "a=1", ""]
+    results = [({"name": text, "x": -1.5}, {"note": text, "cost": -2.0}) for text in texts]
+    written(tmp_path / "b", results).write_csv(tmp_path / "a.csv")
+    with open(tmp_path / "a.csv", encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        assert not any(row[name].startswith(tuple("=+-@\t\r")) for name in ("task.name", "result.note"))
+        assert unquote(row["task.name"][:3]) + row["task.name"][3:] in texts
+        assert (float(row["task.x"]), float(row["cost"])) == (-1.5, -2.0)
 
 
 def test_the_best_of_a_group_is_the_cheapest_that_is_done_and_of_no_bad_verdict(tmp_path: Path) -> None:

@@ -1,0 +1,249 @@
+"""Dask does the tasks: a cluster of this machine's cores, begun and ended here, or one that is given.
+
+Results come back to the driver, so no folder has to be seen by all machines.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import secrets
+import signal
+import sys
+import time
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ocp.batch.content import Parcel
+from ocp.batch.worker import Broken, Function, attempts
+from ocp.errors import ProblemError, SolveError
+
+__all__ = ["Engine", "EngineSettings", "Job", "Outcome", "checked_cluster"]
+
+SCHEMES = ("tcp", "tls", "ucx", "ws", "wss", "inproc")
+"""Of a scheduler's address."""
+
+
+@dataclass(frozen=True)
+class EngineSettings:
+    """How Dask is used.
+
+    Attributes:
+        deaths: Workers that one task may end before it is set aside.
+        chunk: Work that is sent at a time, s: Dask takes some ms for what it sends, so short tasks go together.
+        patience: After so many s a scheduler that does not answer is gone.
+        recount: s between two counts of the workers.
+    """
+
+    deaths: int = 3
+    chunk: float = 0.05
+    patience: float = 10.0
+    recount: float = 2.0
+
+
+class Job(NamedTuple):
+    """A task to be done: its key, its text, and a neighbour's result."""
+
+    key: str
+    task: str
+    guess: Parcel | None
+
+
+class Outcome(NamedTuple):
+    """What came of a task: a parcel, or None where it has to be sent again.
+
+    ``deaths``: How many workers ended that had it, because of it or of another task.
+    """
+
+    key: str
+    parcel: Parcel | None
+    deaths: int = 0
+
+
+class Engine:
+    """Workers of a Dask cluster; a context, at whose end they have nothing of ours to do, or are gone.
+
+    Args:
+        function: Dask carries it to the workers: by its name, or a script's own by its code.
+        near: Whether it takes a neighbour's result.
+        workers: How many processes are begun on this machine, where no cluster is given.
+        cluster: As :func:`checked_cluster` gives it, or None.
+
+    Raises:
+        ProblemError: Dask is not installed, no worker begins, or a worker cannot load the function.
+        SolveError: The scheduler is gone.
+        Broken: A worker's disk is full.
+    """
+
+    def __init__(
+        self, function: Function, near: bool, workers: int, cluster: Any, settings: EngineSettings = EngineSettings()
+    ) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            words = "run_batch: Dask is not installed; pip install 'selfmotion[cluster]'"
+            raise ProblemError(words, name="cluster", value=cluster) from error
+        self._dask: Any = distributed
+        self._function, self._near, self._workers, self._cluster = function, near, workers, cluster
+        self.settings = settings
+        self._lost = (distributed.CancelledError, TimeoutError, self._dask.comm.CommClosedError)
+        self._own: Any = None
+        self._rules = ExitStack()
+        self._ended: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._sent: dict[int, tuple[Any, list[Job]]] = {}
+        self._name, self._count = secrets.token_hex(4), 0
+        self._threads, self._counted, self._heard = 0, -settings.recount, time.monotonic()
+        self._pace = settings.chunk  # s that a task takes
+        self._most = 1  # tasks sent at a time
+
+    def __enter__(self) -> Engine:
+        if self._cluster is not None and not isinstance(self._cluster, str):
+            self._client = self._cluster
+            return self
+        try:
+            address = self._begin() if self._cluster is None else self._cluster
+            patience = self.settings.patience
+            self._client = self._dask.Client(address, timeout=patience, set_as_default=False)
+        except (OSError, ValueError) as error:
+            words = f"cluster: no scheduler answers at {self._cluster}: {error}"
+            raise ProblemError(words, name="cluster", value=self._cluster) from error
+        return self
+
+    def _begin(self) -> Any:
+        """Begin workers on this machine."""
+        import dask
+
+        rules = {
+            "distributed.scheduler.allowed-failures": 0,
+            "distributed.scheduler.worker-ttl": None,  # one call of CasADi may keep a worker silent for long
+            "distributed.deploy.lost-worker-timeout": "1000 days",  # a worker that ended begins again, however late
+        }
+        try:
+            self._rules.enter_context(dask.config.set(rules))
+            self._own = self._dask.LocalCluster(
+                n_workers=self._workers,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                memory_limit=0,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:
+            words = f"workers: none can be started: {error}; what they wrote says more"
+            raise ProblemError(words, name="workers", value=self._workers) from error
+        return self._own
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(Exception):  # the cluster may be gone, in whatever way
+            self._client.cancel([future for future, _ in self._sent.values()], force=True)
+        self._sent = {}
+        if self._own is not None:
+            for nanny in self._own.workers.values():  # at once, whatever they are at
+                nanny.auto_restart = False
+                with suppress(Exception):
+                    os.kill(nanny.pid, signal.SIGKILL)
+        if self._client is not self._cluster:
+            with suppress(Exception):
+                self._client.close(timeout=2.0)
+        if self._own is not None:
+            with suppress(Exception):
+                self._own.close(timeout=2.0)
+        self._rules.close()
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is sent that has not come to its end."""
+        return not self._sent
+
+    def room(self) -> int:
+        """How many chunks of jobs may be sent now: one for each thread of the workers that has none.
+
+        No more: a worker that ends takes with it what it had, begun or not.
+        """
+        if self._client.status != "running":
+            return 0
+        now = time.monotonic()
+        if now - self._counted > self.settings.recount:
+            self._counted = now
+            with suppress(*self._lost):
+                self._threads = sum(self._client.nthreads().values())
+        return max(0, self._threads - len(self._sent))
+
+    def share(self, ready: int) -> int:
+        """How many of the jobs that are ready are sent together, so that each thread gets several times some."""
+        return max(1, min(self._most, ready // (4 * max(1, self._threads))))
+
+    def submit(self, jobs: list[Job]) -> None:
+        """Begin jobs, one after the other on one worker."""
+        self._count += 1
+        number = self._count
+        future = self._client.submit(
+            attempts,
+            self._function,
+            [(job.task, job.guess) for job in jobs],
+            self._near,
+            self.settings.chunk,
+            key=f"{self._function.__name__}-{jobs[0].key}-{self._name}-{number}",
+            pure=False,
+        )
+        self._sent[number] = future, jobs
+        future.add_done_callback(lambda _: self._ended.put(number))
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """What came to its end within so many seconds, no longer than until something did."""
+        self._check_scheduler()
+        numbers = []
+        with suppress(queue.Empty):
+            numbers.append(self._ended.get(timeout=seconds))
+            while True:
+                numbers.append(self._ended.get_nowait())
+        ended = [self._sent.pop(number) for number in numbers if number in self._sent]
+        return [outcome for future, jobs in ended for outcome in self._outcomes(future, jobs)]
+
+    def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
+        try:
+            parcels = [Parcel(*each) for each in future.result(timeout=self.settings.patience)]
+        except Broken:
+            raise
+        except self._dask.KilledWorker as error:
+            self._most = 1
+            return [Outcome(job.key, None, error.allowed_failures + 1) for job in jobs]
+        except self._lost:  # with its worker or the scheduler
+            return [Outcome(job.key, None) for job in jobs]
+        except Exception as error:  # the function's own errors are in the parcel: it cannot be loaded
+            module, why = self._function.__module__, str(error.__cause__ or error).partition("\n")[0]
+            words = (
+                f"function: a worker cannot load it: {type(error).__name__}: {why} (this package and {module} have to "
+                "be installed there; Client.upload_file brings a single file)"
+            )
+            raise ProblemError(words, name="function", value=self._function.__name__) from error
+        seconds = sum(parcel.record["seconds"] for parcel in parcels) / len(parcels)
+        self._pace += (seconds - self._pace) / 4
+        self._most = max(1, min(2 * self._most, int(self.settings.chunk / max(self._pace, 1e-6))))
+        done = [Outcome(job.key, parcel) for job, parcel in zip(jobs, parcels, strict=False)]
+        return done + [Outcome(job.key, None) for job in jobs[len(parcels) :]]  # there was no time for them
+
+    def _check_scheduler(self) -> None:
+        now = time.monotonic()
+        if self._client.status == "running":
+            self._heard = now
+        elif now - self._heard > self.settings.patience or self._client.status == "closed":
+            words = "cluster: the scheduler is gone; what is done is kept, run again with a cluster that answers"
+            raise SolveError(words, name="cluster", value=str(self._cluster))
+
+
+def checked_cluster(cluster: Any) -> Any:
+    """The address of a scheduler, or a `distributed.Client`, which stays open when we are done.
+
+    Raises:
+        ProblemError: It is neither.
+    """
+    dask = sys.modules.get("distributed")
+    if dask is not None and isinstance(cluster, dask.Client):
+        return cluster
+    if isinstance(cluster, str) and cluster.partition("://")[0] in SCHEMES and cluster.partition("://")[2]:
+        return cluster
+    words = f"cluster must be the address of a scheduler such as tcp://host:8786, or a Client, not {cluster!r}"
+    raise ProblemError(words, name="cluster", value=cluster)
