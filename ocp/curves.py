@@ -12,8 +12,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats
-
 __all__ = [
     "PiecewisePolynomial",
     "barycentric_weights",
@@ -62,21 +60,11 @@ class PiecewisePolynomial:
         pieces, nodes, columns = self.values.shape
         return f"<PiecewisePolynomial of {pieces} pieces of {nodes} nodes, {columns} columns>"
 
-    def __call__(self, at: Any) -> np.ndarray:
-        """Values at ``at`` (M,), continuous from the right at breaks, clipped to the ends. Shape (M, n).
-
-        Raises:
-            ProblemError: No row of numbers.
-        """
-        try:
-            row = at if isinstance(at, np.ndarray) and at.dtype == float else floats(at)
-        except NOT_NUMBERS as error:
-            raise ProblemError(f"a row of numbers is expected, not {at!r}", name="at", value=at) from error
-        if row.ndim != 1 or np.isnan(row).any():
-            raise ProblemError(f"a row of numbers is expected, not {at!r}", name="at", value=at)
-        piece = np.clip(np.searchsorted(self.breaks, row, side="right") - 1, 0, len(self.breaks) - 2)
+    def __call__(self, at: np.ndarray) -> np.ndarray:
+        """Values at ``at`` (M,), continuous from the right at breaks, clipped to the ends. Shape (M, n)."""
+        piece = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[piece], self.breaks[piece + 1]
-        return self.within(piece, np.clip((row - start) / (end - start), 0.0, 1.0))
+        return self.within(piece, np.clip((at - start) / (end - start), 0.0, 1.0))
 
     def derivative(self) -> PiecewisePolynomial:
         """Its derivative, by what the breaks are made of; zero where a piece has one node."""

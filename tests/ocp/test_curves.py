@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ocp import ProblemError
 from ocp.curves import PiecewisePolynomial, differentiation_matrix, integrator, lagrange, lagrange_expressions, rk4_step
 from tests.ocp.problems import Array, order
 
@@ -117,13 +115,3 @@ def test_integrators_keep_their_tolerance(smooth: bool) -> None:
     found = integrator("swung", dae, places.tolist(), smooth=smooth)(x0=[1.0, 0.0])
     np.testing.assert_allclose(found["xf"].full()[0], (4 * np.cos(places) - np.cos(2 * places)) / 3, atol=1e-9)
     np.testing.assert_allclose(found["qf"].full()[0], (4 * np.sin(places) - np.sin(2 * places) / 2) / 3, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "wrong", [None, 0.5, np.nan, [np.nan], "half", [[0.1]], {}, True, 1 + 2j, ca.SX.sym("s")], ids=str
-)
-def test_what_is_no_row_of_numbers_is_refused(wrong: Any) -> None:
-    curve = PiecewisePolynomial(np.array([0.0, 0.4, 1.0]), np.array([0.0, 1.0]), np.zeros((2, 2, 3)))
-    with pytest.raises(ProblemError, match="a row of numbers is expected"):
-        curve(wrong)
-    assert curve([0, 1]).shape == (2, 3)
