@@ -22,15 +22,10 @@ from ocp.tasks.tip_task import TipTask
 
 __all__ = ["check_floating_reach"]
 
-TIMES = 17
-"""At which poses are looked at."""
 STARTS = 64
-"""Random joints and attitudes to search from at each of them."""
-ITERATIONS = 100
-TOLERANCE = 1e-4
+"""Random joints and attitudes to search from at each time."""
+PLACE_TOLERANCE = 1e-4
 """m or rad: of a pose that is met."""
-HALVINGS = 10
-"""Of the time between one that is in reach and one that is not."""
 
 
 def check_floating_reach(
@@ -44,6 +39,7 @@ def check_floating_reach(
     lower: Array,
     upper: Array,
     seed: int = 0,
+    looks: int = 17,
 ) -> None:
     """Raise where poses of the tasks are out of reach in any attitude, by multi-start inverse kinematics.
 
@@ -56,85 +52,65 @@ def check_floating_reach(
         begin, end: s, between which it is looked.
         lower, upper: Limits of the joints. Shape (n,).
         seed: Of the random starts.
+        looks: Times at which poses are looked at, and 2**10 times closer where one is out of reach.
 
     Raises:
         Unreachable: Names the time from which on a pose is out of reach, and the nearest miss.
     """
-    look = _Looks(machine, tasks, base, start, lower, upper, seed)
-    reached = begin
-    for time in np.linspace(begin, end, TIMES).tolist():
-        error = look.at(time)
-        if error is None:
-            reached = time
-            continue
-        last = time
-        for _ in range(HALVINGS if last > reached else 0):
-            middle = (reached + last) / 2
-            missed = look.at(middle)
-            if missed is None:
-                reached = middle
-            else:
-                last, error = middle, missed
-        error.time = last
-        raise error
+    n, turns = machine.joint_size, 1 if machine.base_size == 3 else 4
+    rng = np.random.default_rng(seed)
+    attitudes = rng.normal(size=(STARTS, 4)) if turns == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
+    starts = np.hstack([starts_of(machine, lower, upper, STARTS, None, seed), attitudes])
+    free = np.full(turns, np.inf)
+    limits = np.concatenate([lower, -free]), np.concatenate([upper, free])
+    known = np.zeros((0, n + turns))  # where the poses of the time before were met
 
-
-class _Looks:
-    """Looks at poses at one time after the other, each from where those before were met, too."""
-
-    def __init__(
-        self,
-        machine: FreeFloating,
-        tasks: Sequence[TipTask],
-        base: Array,
-        start: Array,
-        lower: Array,
-        upper: Array,
-        seed: int,
-    ) -> None:
-        self.machine, self.tasks, self.base, self.start = machine, tasks, base, start
-        n, self._turns = machine.joint_size, 1 if machine.base_size == 3 else 4
-        rng = np.random.default_rng(seed)
-        joints = starts_of(machine, lower, upper, STARTS, None, seed)
-        turns = rng.normal(size=(STARTS, 4)) if self._turns == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
-        self._known = np.zeros((0, n + self._turns))
-        self._random = np.hstack([joints, turns])
-        free = np.full(self._turns, np.inf)
-        self.lower, self.upper = np.concatenate([lower, -free]), np.concatenate([upper, free])
-
-    def at(self, time: float) -> Unreachable | None:
-        """What is out of reach at a time, or None."""
+    def missed_at(time: float) -> Unreachable | None:
+        """What is out of reach at a time."""
+        nonlocal known
         poses = []
-        for task in self.tasks:
+        for task in tasks:
             if task.begin <= time <= task.end and (task.is_pose or not task.begin):
-                pose = as_pose(self.machine, task, self.start, time, self.base)
+                pose = as_pose(machine, task, start, time, base)
                 poses += [] if pose is None else [pose]
         if not poses:
             return None
-        equations, n = bind(self.machine, poses), self.machine.joint_size
+        equations = bind(machine, poses)
         targets = np.array(equations.target_function()(time)).ravel()
-        z = ca.SX.sym("z", n + self._turns)
-        misfit = equations.misfit(self._placed(z[:n], z[n:], time), z[:n], ca.SX(ca.DM(targets)))
+        z = ca.SX.sym("z", n + turns)
+        misfit = equations.misfit(_placed(machine, base, start, z, time), z[:n], ca.SX(ca.DM(targets)))
         function = ca.Function("misfit", [z], [misfit, ca.densify(ca.jacobian(misfit, z))], {"cse": True})
-        first = np.vstack([self._known, self._random])
-        found, off = gauss_newton(function, first, self.lower, self.upper, TOLERANCE, ITERATIONS)
-        good = off <= TOLERANCE
+        found, off = gauss_newton(function, np.vstack([known, starts]), *limits, PLACE_TOLERANCE, 100)
+        good = off <= PLACE_TOLERANCE
         if good.any():
-            self._known = found[good][:STARTS]
+            known = found[good][:STARTS]
             return None
         best = int(off.argmin())
-        limits = self.lower[:n], self.upper[:n]
-        return unreachable(self.machine, equations, found[best, :n], float(off[best]), *limits)
+        return unreachable(machine, equations, found[best, :n], float(off[best]), lower, upper)
 
-    def _placed(self, joints: Any, turn: Any, time: float) -> Any:
-        """The base with such an attitude and the centre of mass where it is at a time."""
-        machine = self.machine
-        robot, frame = machine.robot, machine.world_from_base(ca.DM(self.base))
-        center = center_of_mass(robot, ca.DM(self.start), frame)
-        momentum = np.zeros(6)
-        momentum[machine.twist_rows] = np.asarray(machine.conserved_momentum)
-        center += time * ca.DM(momentum[3:]) / robot.total_mass
-        if self._turns == 1:
-            place = center - ca.mtimes(rotation((0, 0, 1), turn), center_of_mass(robot, joints))
-            return ca.vertcat(place[:2], turn)
-        return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(turn), center_of_mass(robot, joints)), turn)
+    reached = begin
+    for time in np.linspace(begin, end, looks).tolist():
+        if (error := missed_at(time)) is None:
+            reached = time
+            continue
+        while time - reached > (end - begin) / (looks - 1) / 2**10:
+            middle = (reached + time) / 2
+            if (missed := missed_at(middle)) is None:
+                reached = middle
+            else:
+                time, error = middle, missed
+        error.time = time
+        raise error
+
+
+def _placed(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
+    """The base at a time where joints and its attitude, both in z, have the centre of mass where it is then."""
+    robot, frame, n = machine.robot, machine.world_from_base(ca.DM(base)), machine.joint_size
+    joints, turn = z[:n], z[n:]
+    momentum = np.zeros(6)
+    momentum[machine.twist_rows] = np.asarray(machine.conserved_momentum)
+    center = center_of_mass(robot, ca.DM(start), frame) + time * ca.DM(momentum[3:]) / robot.total_mass
+    if turn.numel() == 1:
+        place = center - ca.mtimes(rotation((0, 0, 1), turn), center_of_mass(robot, joints))
+        return ca.vertcat(place[:2], turn)
+    return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(turn), center_of_mass(robot, joints)), turn)

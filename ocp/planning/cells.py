@@ -3,8 +3,8 @@
 What such a machine can reach is no set of postures at each instant: the base's attitude depends on the way. So states
 are kept that were reached, each integrated so that it does its tasks, and of those that fall into one cell of joints
 and attitude the one that was reached at the least cost. From each a fan of self-motions goes on. Cells are as large as
-leaves so many states as are kept. First searches with few states say what a motion costs, the last one, with many,
-looks for all motions within a multiple of that.
+leaves so many states as are kept. Rates are tried in proportion to what a motion may cost: searches with few states
+say how much that is, the last one, with many, looks for all motions within a multiple of it.
 
 Every state at the end has its way; the ways that are cheaper than all that are near to them are the classes of motions,
 the first guesses of the whole motion's problem. Nothing is proven by this: a motion through a passage narrower than a
@@ -30,42 +30,49 @@ from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import distances_along
 from ocp.planning.dead_end import DeadEnd
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
-from ocp.planning.reduced import SLOW, ReducedKinematics, Slopes, within
+from ocp.planning.reduced import ReducedKinematics, Side, Slopes, within
 
 __all__ = ["CellSearch", "follows"]
 
 Indices = NDArray[np.intp]
 
-STATES = 2000
-"""Kept at each instant, of 1 kB each."""
-FIRST = 4
-"""The first searches keep so many times fewer."""
-STEPS = 40
-"""Over the motion, at least."""
-HALVINGS = 6
-"""Of a step after which no state would be left."""
-LEVELS = 15
-"""Rates of a self-motion of one direction; of more directions so many times more are drawn."""
-LONGEST = 1.0
-"""rad or m: that a joint goes in one step."""
-WIDER = 1.2
-"""By which cells are widened or narrowed until the states fit in."""
-NARROWEST = 1e-3
-"""rad or m: of a cell."""
-FAR = 10.0
-"""Motions that many times as dear as the best are not looked for."""
-TRIES = 5
-"""Searches, each with ten times the cost, before it is said that nothing goes on."""
-JUMP = 12
-"""Newton steps from where a motion is to the poses of tasks that begin."""
-NEIGHBOURS = 8
-"""Ways to which a way is compared, for each direction that is free."""
-SEATS = 5
-"""Instants at which ways are compared."""
-MISSED = 0.1
+OFF_SHARE = 0.1
 """Share of the way of a tip that a local motion may miss of it where velocities are asked for."""
-CLASSES = 48
-"""Ways that are told, the cheapest first."""
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """How closely states are looked at.
+
+    Attributes:
+        states: Kept at each instant, of 1 kB each.
+        few: Share of these that the searches keep which say what a motion costs.
+        searches: At most, with those in which nothing goes on; each of these is followed by one with `far` the cost.
+        far: Motions so many times as dear as the best are not looked for.
+        steps: Over the motion, at least.
+        halvings: Of a step after which no state would be left.
+        levels: Rates of a self-motion of one direction; of more directions so many times more are drawn.
+        longest: That a joint goes in one step, rad or m.
+        wider, narrowest: By which cells are widened or narrowed until the states fit in, and rad or m of a cell.
+        corrections: Newton steps from where a motion is to the poses of tasks that begin.
+        neighbours: Ways to which a way is compared, for each direction that is free, at so many instants: `seats`.
+        classes: Ways that are told, the cheapest first.
+    """
+
+    states: int = 2000
+    few: float = 0.25
+    searches: int = 6
+    far: float = 10.0
+    steps: int = 40
+    halvings: int = 6
+    levels: int = 15
+    longest: float = 1.0
+    wider: float = 1.2
+    narrowest: float = 1e-3
+    corrections: int = 12
+    neighbours: int = 8
+    seats: int = 5
+    classes: int = 48
 
 
 def follows(asked: Asked, followed: Sequence[Followed]) -> NDArray[np.bool_]:
@@ -78,7 +85,7 @@ def follows(asked: Asked, followed: Sequence[Followed]) -> NDArray[np.bool_]:
             base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (part.base, part.joints))
             speeds = kinematics.missed(base, joints, part.rates[:, k], part.t[k] + step / 2)
             missed, way = missed + step * speeds[0], way + step * speeds[1]
-    return np.asarray((np.array(misfits_of(list(followed))) <= OUT_OF_REACH) & (missed <= MISSED * way))
+    return np.asarray((np.array(misfits_of(list(followed))) <= OUT_OF_REACH) & (missed <= OFF_SHARE * way))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,58 +108,42 @@ class _Layer:
 
 
 class CellSearch:
-    """Motions from some postures through all stretches of what is asked.
+    """Motions from some postures through all stretches of what is asked."""
 
-    Attributes:
-        cost: Of the cheapest way that was found.
-    """
-
-    def __init__(self, asked: Asked, postures: Array) -> None:
+    def __init__(self, asked: Asked, postures: Array, settings: CellSettings = CellSettings()) -> None:
         """
         Args:
             asked: What is asked.
             postures: Joints to start from. Shape (K, n).
+            settings: How closely states are looked at.
 
         Raises:
             Unreachable: From some time on a task is out of reach in any attitude of the base.
             DeadEnd: Nothing goes on from some time on.
         """
-        self.asked, self.root = asked, np.sqrt(asked.weights)
+        self.asked, self._settings, self._found = asked, settings, list[_Cells]()
         self._kinematics = [ReducedKinematics(asked.machine, each.equations, asked.weights) for each in asked.stretches]
-        self._found: list[_Cells] = []
-        known = self._speed(postures)
-        for number in range(TRIES):
+        most, whole = settings.far * self._speed(postures), False
+        for number in range(settings.searches):
+            last = number == settings.searches - 1
+            cells = _Cells(asked, self._kinematics, most, whole or last, asked.seed + number, settings)
             try:
-                self._search(postures, FAR * known, STATES if number == TRIES - 1 else STATES // FIRST)
-                break
+                with np.errstate(all="ignore"):  # states that run away are left out
+                    cells.search(postures)
             except DeadEnd as stuck:
                 if not number:
                     self._check_reach(stuck)
-                if number == TRIES - 1:
+                if not self._found and last:
                     raise
-                known *= FAR
-        while self.cost < known / 2:  # rates are tried in proportion to what a motion may cost
-            known = self.cost
-            self._search_on(postures, STATES // FIRST)
-        self._search_on(postures, STATES)
-
-    @property
-    def cost(self) -> float:
-        """Of the cheapest way that was found."""
-        return min(cells.cost for cells in self._found)
-
-    def _search(self, postures: Array, most: float, states: int) -> None:
-        cells = _Cells(self.asked, self._kinematics, most, states, self.asked.seed + len(self._found))
-        with np.errstate(all="ignore"):  # states that run away are left out
-            cells.search(postures)
-        self._found.append(cells)
-
-    def _search_on(self, postures: Array, states: int) -> None:
-        """As `_search` among motions within a multiple of the best; nothing is found where fewer states end."""
-        try:
-            self._search(postures, FAR * self.cost, states)
-        except DeadEnd:
-            return
+                if whole:
+                    break
+                most, whole = (most, True) if self._found else (settings.far * most, False)
+                continue
+            self._found.append(cells)
+            if whole:
+                break
+            needed = settings.far * min(each.cost for each in self._found)
+            most, whole = needed, needed >= most / 2
 
     def _check_reach(self, stuck: DeadEnd) -> None:
         """Raise Unreachable where that is why nothing goes on."""
@@ -167,12 +158,12 @@ class CellSearch:
 
     def _speed(self, postures: Array) -> float:
         """What the tasks would cost if the machine moved at each instant as well as it can at the start, about."""
-        asked, total = self.asked, 0.0
+        asked, total, count = self.asked, 0.0, self._settings.seats
         base = np.tile(asked.base, (len(postures), 1))
         for stretch, kinematics in zip(asked.stretches, self._kinematics, strict=True):
-            for time in np.linspace(stretch.begin, stretch.end, SEATS + 2)[1:-1].tolist():
+            for time in np.linspace(stretch.begin, stretch.end, count + 2)[1:-1].tolist():
                 least = float(kinematics.speed(base, postures, time).min())
-                total += least / 2 * stretch.duration / SEATS
+                total += least / 2 * stretch.duration / count
         return total
 
     def followed(self) -> list[list[Followed]]:
@@ -192,12 +183,19 @@ class _Cells:
     """
 
     def __init__(
-        self, asked: Asked, kinematics: Sequence[ReducedKinematics], most: float, states: int, seed: int
+        self,
+        asked: Asked,
+        kinematics: Sequence[ReducedKinematics],
+        most: float,
+        whole: bool,
+        seed: int,
+        settings: CellSettings,
     ) -> None:
-        """Among motions that cost at most so much, with so many states kept at each instant."""
-        self.asked, self.kinematics, self.most, self.states = asked, kinematics, most, states
+        """Among motions that cost at most so much, with all states that may be kept or with a few."""
+        self.asked, self.kinematics, self.most, self._settings = asked, kinematics, most, settings
+        self.states = settings.states if whole else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(asked.weights), np.random.default_rng(seed)
-        self._fastest, self._width = np.sqrt(2 * most / asked.horizon), NARROWEST
+        self._fastest, self._width = np.sqrt(2 * most / asked.horizon), settings.narrowest
         self._begins = list[int]()
         self.layers = list[_Layer]()
         self.cost = np.inf
@@ -215,9 +213,9 @@ class _Cells:
             if stretch.begin > 0 and any(stretch.new):
                 layers.append(self._begun(layers[-1], kinematics))
             self._begins.append(len(layers) - 1)
-            steps = max(int(np.ceil(STEPS * stretch.duration / asked.horizon)), 1)
+            steps = max(int(np.ceil(self._settings.steps * stretch.duration / asked.horizon)), 1)
             ahead = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)[:0:-1].tolist()
-            shortest = stretch.duration / steps / 2**HALVINGS
+            shortest = stretch.duration / steps / 2**self._settings.halvings
             slopes = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
             while ahead:
                 last = layers[-1]
@@ -254,7 +252,7 @@ class _Cells:
             rates[why[:, 0] >= 0] = np.nan
         far = np.abs(rates / root).max(axis=1) * step
         cost = layer.cost[before] + step / 2 * (rates**2).sum(axis=1)
-        good = np.flatnonzero((cost <= self.most) & (far <= LONGEST))
+        good = np.flatnonzero((cost <= self.most) & (far <= self._settings.longest))
         if not good.size:
             return None, told
         before, rates, cost = before[good], rates[good], cost[good]
@@ -265,7 +263,7 @@ class _Cells:
         exact = OUT_OF_REACH / 10
         base, joints, off = kinematics.stepped(start, first, slopes.of(before), rates, layer.time, time, exact)
         cost = layer.cost[before] + ((root * (joints - first)) ** 2).sum(axis=1) / (2 * step)
-        near = np.isfinite(base).all(axis=1) & (np.abs(joints - first).max(axis=1) <= LONGEST)
+        near = np.isfinite(base).all(axis=1) & (np.abs(joints - first).max(axis=1) <= self._settings.longest)
         made = _Layer(time, base, joints, cost, before)
         made = made.of(np.flatnonzero(near & (cost <= self.most) & (off <= OUT_OF_REACH)))
         made = made.of(np.flatnonzero(self._allowed(kinematics, made)))
@@ -275,11 +273,12 @@ class _Cells:
 
     def _fan(self, count: int, r: int) -> Array:
         """Self-motions that are tried from each of some states, in their null spaces. Shape (count, C, r)."""
-        share = np.linspace(-1.0, 1.0, LEVELS)
+        many = self._settings.levels
+        share = np.linspace(-1.0, 1.0, many)
         levels = self._fastest * np.sign(share) * share**2  # finer where most motions are
         if r <= 1:
             return np.tile(levels[None, :, None] if r else np.zeros((1, 1, 0)), (count, 1, 1))
-        way = self._rng.normal(size=(count, LEVELS * r, r))
+        way = self._rng.normal(size=(count, many * r, r))
         way *= self._rng.choice(np.abs(levels), size=(*way.shape[:2], 1)) / np.linalg.norm(way, axis=2, keepdims=True)
         way[:, 0] = 0.0
         return np.asarray(way)
@@ -297,10 +296,14 @@ class _Cells:
 
         found = winners(self._width)
         while len(found) > self.states:
-            self._width *= WIDER
+            self._width *= self._settings.wider
             found = winners(self._width)
-        while tight and self._width > NARROWEST and len(finer := winners(self._width / WIDER)) <= self.states:
-            self._width, found = self._width / WIDER, finer
+        while (
+            tight
+            and self._width > self._settings.narrowest
+            and len(finer := winners(self._width / self._settings.wider)) <= self.states
+        ):
+            self._width, found = self._width / self._settings.wider, finer
         return found
 
     def _allowed(self, kinematics: ReducedKinematics, layer: _Layer) -> NDArray[np.bool_]:
@@ -317,7 +320,9 @@ class _Cells:
 
     def _begun(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
         """States at the poses that begin at a time, each as near as it comes to where it was."""
-        moved = kinematics.corrected(layer.base, layer.joints, layer.time, OUT_OF_REACH / 10, most=JUMP)
+        moved = kinematics.corrected(
+            layer.base, layer.joints, layer.time, OUT_OF_REACH / 10, most=self._settings.corrections
+        )
         base, joints, off = moved
         cost = layer.cost + ((self.root * (joints - layer.joints)) ** 2).sum(axis=1) / (2 * layer.time)
         good = np.flatnonzero(off <= OUT_OF_REACH)
@@ -332,7 +337,7 @@ class _Cells:
         if why:
             (joint, which), _ = why.most_common(1)[0]
             limit = float((bounds.lower, bounds.upper, -bounds.velocity, bounds.velocity)[which][joint])
-            what = "can go no faster than" if which >= SLOW else "can go no farther than"
+            what = "can go no faster than" if which >= Side.SLOW else "can go no farther than"
             words = f"{names[joint]!r} {what} {limit:g}"
             value = float(layer.joints[layer.cost.argmin(), joint])
             details |= {"name": names[joint], "value": value, "limit": limit}
@@ -353,13 +358,13 @@ class _Cells:
         if asked.cyclic:
             back = final.joints - layers[0].joints[ways[0]]
             cost += ((self.root * back) ** 2).sum(axis=1) / (2 * asked.horizon)
-        seats = np.unique(np.linspace(0, len(layers) - 1, SEATS + 1).astype(int)).tolist()
+        seats = np.unique(np.linspace(0, len(layers) - 1, self._settings.seats + 1).astype(int)).tolist()
         place = np.hstack([layers[k].joints[ways[k]] * self.root for k in seats])
         free = max(asked.machine.joint_size - max(each.rows for each in self.kinematics), 1)
-        near = min(NEIGHBOURS * free + 1, len(cost))
+        near = min(self._settings.neighbours * free + 1, len(cost))
         beside = np.reshape(cKDTree(place).query(place, k=near)[1], (len(cost), near))
         least = np.flatnonzero((cost[:, None] <= cost[beside]).all(axis=1))
-        chosen = least[np.argsort(cost[least])][:CLASSES]
+        chosen = least[np.argsort(cost[least])][: self._settings.classes]
         found, ends = [], [*self._begins[1:], len(layers) - 1]
         for begin, end in zip(self._begins, ends, strict=True):
             # what is met where others begin belongs to these

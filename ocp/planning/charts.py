@@ -12,93 +12,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from models import Machine
 from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.local.branches import Branches, branches_of
+from ocp.local.inverse_kinematics import Unreachable, postures_of
+from ocp.planning.joint_space import TOLERANCE, JointSpace
 from ocp.problem.formulation import Sampler
 from ocp.tasks.equations import TaskEquations
+from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Charts", "Held", "Instant", "JointSpace", "Parts", "SelfMotions", "point"]
+__all__ = ["ChartSettings", "Charts", "Instant", "Parts", "SelfMotions", "point"]
 
 Indices = NDArray[np.intp]
 
-EXACT = 1e-9
-"""m and rad: what a posture may miss its task by."""
-CORRECTIONS = 12
-"""Newton steps at most; from a tangent space a few are enough."""
-SINGULAR = 1e-9
-"""Singular value of a task's Jacobian relative to the largest below which a row counts as dependent."""
-REACH = 0.9
-"""Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by the rest."""
-BENT = (0.1, 0.1, 0.15)
-"""Share of its radius by which the set may leave a chart at its edge, by the directions that are free; the radius is
-halved until it does not. With one, half or four times as much changed neither plan nor bound nor time. With two, half
-as much takes two to three times as long, and with twice as much one of two tasks had no bound any more.
-"""
-HALVINGS = 7
-"""Of the radius, at most: nearer to singular postures the cover ends, and says so."""
-LISTED = 64
-"""Places of what is free at which closed forms list all postures of an instant."""
-NEIGHBOURS = 12
-"""Charts in which a point of an edge is looked for."""
-APART = 1e3
-"""Distance between the sets of two instants in the tree that neighbours are looked up in."""
-TURN = 2 * np.pi
 
-
-class JointSpace:
-    """Where postures lie: joints that turn without end come round, and distances are those of the squared rates.
+@dataclass(frozen=True)
+class ChartSettings:
+    """How sets of postures are covered.
 
     Attributes:
-        scale: Square roots of the weights: the metric is |scale * dq|. Shape (n,).
-        periodic: Which joints turn without end; two turns within their limits do, since one of these can be chosen.
-        lower, upper: Limits of the others. Shape (n,).
+        corrections: Newton steps at most; from a tangent space a few are enough.
+        beyond: Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by
+            the rest.
+        bent: Share of its radius by which the set may leave a chart at its edge, by the directions that are free; the
+            radius is halved until it does not. Of two directions half as much takes two to three times as long, and
+            twice as much loses bounds.
+        halvings: Of the radius, at most: nearer to singular postures the cover ends.
+        listed: Places of what is free at which closed forms list all postures of an instant.
+        starts: Random starts of inverse kinematics at an instant.
+        neighbours: Charts in which a point of an edge is looked for.
     """
 
-    def __init__(self, machine: Machine, lower: Array, upper: Array, weights: Array) -> None:
-        robot = machine.robot
-        coupled = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
-        turns = [joint.kind != "prismatic" and joint.name not in coupled for joint in robot.moving_joints]
-        self.scale = np.sqrt(weights)
-        self.periodic = np.array(turns) & ~(upper - lower < 2 * TURN - 1e-6)
-        self.lower = np.where(self.periodic, -np.inf, lower)
-        self.upper = np.where(self.periodic, np.inf, upper)
-
-    def difference(self, to: Array, of: Array) -> Array:
-        """to - of, (..., n), the shorter way round for joints that turn without end."""
-        apart = to - of
-        around = apart[..., self.periodic]
-        apart[..., self.periodic] = around - TURN * np.round(around / TURN)
-        return np.asarray(apart)
-
-    def length(self, way: Array) -> Array:
-        """Of ways (..., n) in the metric."""
-        return np.asarray(np.linalg.norm(way * self.scale, axis=-1))
-
-    def within(self, joints: Array) -> NDArray[np.bool_]:
-        """Whether postures (..., n) keep the limits."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(((joints >= self.lower - EXACT) & (joints <= self.upper + EXACT)).all(axis=-1))
-
-    def tree(self, joints: Array, layer: Indices | None = None) -> Any:
-        """Tree of postures (M, n), to be asked with what `placed` says; those of other layers are far."""
-        size = np.append(0.0, np.where(self.periodic, TURN * self.scale, 0.0))
-        return cKDTree(self.placed(joints, layer), boxsize=size if self.periodic.any() else None)  # None is faster
-
-    def placed(self, joints: Array, layer: Indices | None = None) -> Array:
-        """Points of the tree."""
-        wrapped = joints.copy()
-        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], TURN)
-        return np.column_stack([np.zeros(len(joints)) if layer is None else APART * layer, wrapped * self.scale])
+    corrections: int = 12
+    beyond: float = 0.9
+    bent: tuple[float, float, float] = (0.1, 0.1, 0.15)
+    halvings: int = 7
+    listed: int = 64
+    starts: int = 16
+    neighbours: int = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +86,6 @@ class Charts:
     def of(self, chosen: Any) -> Charts:
         """Some of them."""
         return Charts(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
-
-    def by_layer(self, count: int) -> list[Charts]:
-        """Those of each of so many instants."""
-        order = np.argsort(self.layer, kind="stable")
-        ends = np.searchsorted(self.layer[order], np.arange(count + 1))
-        return [self.of(order[first:last]) for first, last in pairwise(ends.tolist())]
 
     @property
     def spans(self) -> Array:
@@ -203,39 +155,6 @@ class _Edges(NamedTuple):
         return _Edges(*(part[chosen] for part in self))
 
 
-@dataclass(frozen=True, eq=False)
-class Held(TaskEquations):
-    """Equations of tasks and last rows: some joints are to be where the last of the targets say.
-
-    Attributes:
-        held: Numbers of these joints.
-    """
-
-    held: tuple[int, ...]
-
-    @property
-    def size(self) -> int:
-        return super().size + len(self.held)
-
-    def _rows(self, joints: Any, targets: Any) -> Any:
-        return targets[targets.numel() - len(self.held) :] - joints[list(self.held)]
-
-    def error(self, base: Any, joints: Any, targets: Any) -> Any:
-        return ca.vertcat(super().error(base, joints, targets), self._rows(joints, targets))
-
-    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
-        return ca.vertcat(super().misfit(base, joints, targets), self._rows(joints, targets))
-
-    def jacobian(self, base: Any, joints: Any) -> Any:
-        rows = ca.DM.eye(self.machine.joint_size)[list(self.held), :]
-        return ca.vertcat(super().jacobian(base, joints), rows)
-
-    @property
-    def _symbols(self) -> tuple[Any, Any, Any]:
-        base, joints, targets = super()._symbols
-        return base, joints, ca.SX.sym("targets", targets.numel() + len(self.held))
-
-
 class SelfMotions:
     """The sets of postures that do a task at some instants.
 
@@ -245,13 +164,17 @@ class SelfMotions:
         lost: Edges of charts beyond which nothing was found, near singular postures.
     """
 
-    def __init__(self, space: JointSpace, equations: TaskEquations, targets: Array) -> None:
+    def __init__(
+        self, space: JointSpace, equations: TaskEquations, targets: Array, settings: ChartSettings = ChartSettings()
+    ) -> None:
         """
         Args:
             space: Of the machine's joints, which stands on a fixed base.
             equations: Of poses.
             targets: Of the equations at each instant. Shape (K, size).
+            settings: How they are covered.
         """
+        self.settings = settings
         self.space, self.equations, self.targets = space, equations, targets
         n = equations.machine.joint_size
         self.size, self.lost = n - equations.size, 0
@@ -265,17 +188,27 @@ class SelfMotions:
     def _branches(self) -> Branches | None:
         return branches_of(self.equations, self.space.lower, self.space.upper)
 
-    def listed(self, number: int) -> Array:
-        """Postures of an instant by closed forms, some of every branch, within limits; none where there are no such.
+    def seeds(self, number: int, limits: Any, seed: int) -> Array:
+        """Postures of an instant within limits, of as many parts of the set as are found. Shape (K, n).
 
-        Returns:
-            Shape (K, n).
+        Some of every branch by closed forms, and those of inverse kinematics from random starts.
+
+        Raises:
+            Unreachable: None is found.
         """
-        if self._branches is None:
-            return np.zeros((0, len(self.space.scale)))
-        found = self._branches.postures(self.targets[number], LISTED, LISTED * number)
-        on, good = self.corrected(np.full(len(found), number), found)
-        return np.asarray(on[good & self.space.within(on)])
+        listed, count = np.zeros((0, len(self.space.scale))), self.settings.listed
+        if self._branches is not None:
+            found = self._branches.postures(self.targets[number], count, count * number)
+            on, good = self.corrected(np.full(len(found), number), found)
+            listed = on[good & self.space.within(on)]
+        told: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
+        try:
+            sought = [one.joints for one in postures_of(self.equations, self.targets[number], **told)]
+        except Unreachable:
+            if not len(listed):
+                raise
+            sought = []
+        return np.vstack([listed, *sought])
 
     def linearised(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
         """What the tasks miss (M, m), and their Jacobian by joints of the metric (M, m, n)."""
@@ -288,12 +221,12 @@ class SelfMotions:
         found = joints.copy()
         good = np.zeros(len(found), dtype=bool)
         busy = np.arange(len(found))
-        for _ in range(CORRECTIONS):
+        for _ in range(self.settings.corrections):
             if not busy.size:
                 break
             error, jacobian = self.linearised(layer[busy], found[busy])
             worst = np.abs(error).max(axis=1, initial=0.0)
-            done = worst < EXACT
+            done = worst < TOLERANCE
             good[busy[done]] = True
             on = ~done & np.isfinite(worst)
             busy, error, jacobian = busy[on], error[on], jacobian[on]
@@ -331,13 +264,13 @@ class SelfMotions:
         strays = np.zeros((len(joints), len(rim), joints.shape[1]))
         points = np.full_like(strays, np.nan)
         busy = np.arange(len(joints))
-        for halving in range(HALVINGS + 1):
+        for halving in range(self.settings.halvings + 1):
             if not busy.size:
                 break
             on, apart = self._strays(layer[busy], joints[busy], tangents[busy], radii[busy])
             points[busy], strays[busy] = on, apart
-            far = ~(self.space.length(apart) <= BENT[tangents.shape[2]] * radii[busy, None]).all(axis=1)
-            if halving < HALVINGS:
+            far = ~(self.space.length(apart) <= self.settings.bent[tangents.shape[2]] * radii[busy, None]).all(axis=1)
+            if halving < self.settings.halvings:
                 radii[busy[far]] /= 2
             busy = busy[far]
         return self._within(layer, joints, tangents, radii, strays), points
@@ -350,7 +283,7 @@ class SelfMotions:
         others = reach.sum(axis=2)[:, :, None] - reach
         up, down = self.space.upper - joints + stray, joints - self.space.lower + stray
         room = np.stack([up, down])[:, :, :, None] + others
-        room[(room < 0) & (room >= -EXACT)] = 0.0  # a joint that is held at its limit is there up to rounding
+        room[(room < 0) & (room >= -TOLERANCE)] = 0.0  # a joint that is held at its limit is there up to rounding
         with np.errstate(divide="ignore", invalid="ignore"):
             far = room / np.abs(tangents)
         far[np.isnan(far)] = np.inf
@@ -411,10 +344,10 @@ class SelfMotions:
         charts = charts if known is None else together([known, charts])
         edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
         while len(edges.layer):
-            beyond = edges.points + REACH * edges.radii[:, None] * edges.ways
+            beyond = edges.points + self.settings.beyond * edges.radii[:, None] * edges.ways
             joints, good = self.corrected(edges.layer, beyond)
             shift = self.space.length(joints - beyond)
-            good &= shift <= 2 * BENT[charts.tangents.shape[2]] * edges.radii
+            good &= shift <= 2 * self.settings.bent[charts.tangents.shape[2]] * edges.radii
             chosen = np.flatnonzero(good)
             chosen = chosen[self._apart(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
             like = charts.tangents[edges.owners[chosen]]
@@ -430,16 +363,12 @@ class SelfMotions:
                 )
                 raise ProblemError(words, name="postures", value=len(charts), limit=most)
             kept = edges._replace(radii=tight)
-            narrow = tight < radius / 2**HALVINGS
+            narrow = tight < radius / 2**self.settings.halvings
             self.lost += int(narrow.sum())
             kept = kept.of(~narrow)
             edges = _Edges(*(np.concatenate(pair) for pair in zip(kept, ends, strict=True)))
             edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
         return charts
-
-    def halved(self, charts: Charts) -> Charts:
-        """Charts of half the radius in their place."""
-        return self.parts(charts).charts
 
     def parts(self, charts: Charts) -> Parts:
         """Charts of half the radius in their place, and what of these they are."""
@@ -490,7 +419,7 @@ class SelfMotions:
         r = charts.tangents.shape[2]
         within = 2 * float(charts.radii.max()) * np.sqrt(max(r, 1)) + 1e-6
         tree = self.space.tree(charts.centers, charts.layer)
-        count = min(NEIGHBOURS * 2 ** max(r - 1, 0), len(charts))
+        count = min(self.settings.neighbours * 2 ** max(r - 1, 0), len(charts))
         _, near = tree.query(self.space.placed(joints, layer), k=count, distance_upper_bound=within)
         near = np.reshape(near, (len(layer), -1))
         found = np.zeros(len(layer), dtype=bool)
@@ -503,7 +432,7 @@ class SelfMotions:
             flat = np.einsum("kn,knr->kr", apart, charts.tangents[which] * self.space.scale[:, None])
             normal = np.sqrt(np.maximum((apart**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
             radii = charts.radii[which]
-            near = normal <= 2 * BENT[r] * radii + 1e-6
+            near = normal <= 2 * self.settings.bent[r] * radii + 1e-6
             found[rows] = near & (np.abs(flat) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
         return found
 
@@ -558,4 +487,5 @@ def _solved(square: Array, right: Array) -> Array:
     if not m:
         return right
     size = np.trace(square, axis1=1, axis2=2)[:, None, None]
-    return np.asarray(np.linalg.solve(square + (SINGULAR**2 * size + 1e-300) * np.eye(m), right[:, :, None])[:, :, 0])
+    soft = ROUNDING_SHARE**2 * size + np.finfo(float).tiny
+    return np.asarray(np.linalg.solve(square + soft * np.eye(m), right[:, :, None])[:, :, 0])

@@ -8,6 +8,7 @@ for from there on: what it needs is no bound, another one may need less.
 
 from __future__ import annotations
 
+from enum import StrEnum
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,37 +21,51 @@ from ocp.builders.clearance import LOOKS, MARGIN, ROUNDING
 from ocp.errors import SolveError
 from ocp.local.touching import distances_along, touches
 from ocp.planning.charts import Charts
-from ocp.planning.search import MOST, Search
+from ocp.planning.joint_space import TOLERANCE
+from ocp.planning.search import Search
+from ocp.planning.value import Graph
 
 __all__ = ["DeadEnd", "Give", "Stop", "dead_end"]
 
 Indices = NDArray[np.intp]
 
-TRIED = 3
+WORST = 3
 """Postures from which each chart is tried to be reached; and stops that are told in words."""
-WHOLE = 1e-9
-"""rad or m: limits are kept up to this."""
-KINDS = {"deviation": "the tip may be {0:.3g} m off", "lean": "the tip may be turned by {1:.3g} deg"}
-SMOOTH = 1e-4
-"""m or rad: what the whole roughness of a motion that gives way counts beside how far it does."""
-NOTHING = 1e-9
-"""m or rad, and (rad/s)^2 s: what counts as none."""
-SOLVER = {"print_level": 0, "sb": "yes", "max_iter": 100, "bound_relax_factor": 0.0}
+NEGLIGIBLE = 1e-9
+"""m or rad: a motion that gives way by less has not been asked to."""
+
+
+class StopKind(StrEnum):
+    """What stops motions: the position of a joint, how far it can go, bodies, what is out of reach, what is narrow."""
+
+    LIMIT = "limit"
+    STEP = "step"
+    TOUCH = "touch"
+    REACH = "reach"
+    NARROW = "narrow"
+
+
+class GiveKind(StrEnum):
+    """What gives way: the tip's place, its axes, or the clearance."""
+
+    DEVIATION = "deviation"
+    LEAN = "lean"
+    CLEARANCE = "clearance"
 
 
 class Stop(NamedTuple):
     """What stops motions where none goes on.
 
     Attributes:
-        kind: "limit" of a joint's position; "step": how far it can go until the next instant; "touch"; "reach"; or
-            "narrow": what leads on passes no limit, and was not followed.
+        kind: A limit of a joint's position; a step, how far it can go until the next instant; bodies that touch; what
+            is out of reach; or narrow: what leads on passes no limit, and was not followed.
         name: The joint; two bodies, "one and other"; or "tip".
         value: What it would be: a position, a way, a distance or a miss, rad or m.
         limit: What it may be.
         before, after: Postures, the last one that is reached and where it would have to go. Shape (n,).
     """
 
-    kind: str
+    kind: StopKind
     name: str
     value: float
     limit: float
@@ -64,11 +79,11 @@ class Stop(NamedTuple):
 
     def __str__(self) -> str:
         return {
-            "limit": f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
-            "step": f"{self.name!r} would have to go {self.value:.3g} in one step, {self.limit:.3g} at most",
-            "touch": f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
-            "narrow": "what leads on is too narrow to be followed",
-            "reach": f"the tip stays {self.value:.3g} off from there",
+            StopKind.LIMIT: f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
+            StopKind.STEP: f"{self.name!r} would have to go {self.value:.3g} in one step, {self.limit:.3g} at most",
+            StopKind.TOUCH: f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
+            StopKind.NARROW: "what leads on is too narrow to be followed",
+            StopKind.REACH: f"the tip stays {self.value:.3g} off from there",
         }[self.kind]
 
 
@@ -76,19 +91,21 @@ class Give(NamedTuple):
     """A motion that would do the task if it gave way.
 
     Attributes:
-        kind: "deviation" of the tip's place, m; "lean" of its axes, rad; or "clearance", m, which it would have to be.
+        kind: Deviation of the tip's place, m; lean of its axes, rad; or the clearance, m, which it would have to be.
         amount: How far. times: The instants, s, or numbers of waypoints. Shape (K,). joints: There. Shape (K, n).
     """
 
-    kind: str
+    kind: GiveKind
     amount: float
     times: Array
     joints: Array
 
     def __str__(self) -> str:
-        if self.kind == "clearance":
-            return f"the clearance is {self.amount:.3g} m"
-        return KINDS[self.kind].format(self.amount, np.degrees(self.amount))
+        return {
+            GiveKind.DEVIATION: f"the tip may be {self.amount:.3g} m off",
+            GiveKind.LEAN: f"the tip may be turned by {np.degrees(self.amount):.3g} deg",
+            GiveKind.CLEARANCE: f"the clearance is {self.amount:.3g} m",
+        }[self.kind]
 
 
 class DeadEnd(SolveError):
@@ -140,20 +157,20 @@ def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True, pieces
         return None
     stops = _stops(search, front)
     worst, gives = stops[0], list[Give]()
-    if any(stop.kind == "touch" for stop in stops) and np.isfinite(front.width[-1].max(initial=-np.inf)):
+    if any(stop.kind is StopKind.TOUCH for stop in stops) and np.isfinite(front.width[-1].max(initial=-np.inf)):
         best = int(front.width[-1].argmax())
         joints = front.way(len(search.times) - 1, best)
-        gives.append(Give("clearance", float(front.width[-1][best]), search.times, joints))
-    back = _Walk(search, back=True)
-    for turning, kind in ((False, "deviation"), (True, "lean")):
-        if (give := _given(search, _joined(front, back, stops[0]), turning, kind)) is not None:
+        gives.append(Give(GiveKind.CLEARANCE, float(front.width[-1][best]), search.times, joints))
+    path = _carried_on(search, front, stops[0].before)
+    for turning, kind in ((False, GiveKind.DEVIATION), (True, GiveKind.LEAN)):
+        if (give := _given(search, path, turning, kind)) is not None:
             gives.append(give)
     there = unit.format(search.times[last + 1])
     where = (
         f"from {unit.format(search.times[last])} on none goes on to {there}" if last >= 0 else f"none begins at {there}"
     )
     first = "no motion does the tasks" if proven else "no motion was found, though the search does not rule one out"
-    words = f"{first}: {where}; {'; '.join(map(str, stops[:TRIED]))}"
+    words = f"{first}: {where}; {'; '.join(map(str, stops[:WORST]))}"
     if gives:
         words += f"; one does if {', or '.join(map(str, gives))}"
     if pieces is not None:
@@ -173,41 +190,38 @@ class _Walk:
         parent: Charts that they are reached from. Shapes (N,).
     """
 
-    def __init__(self, search: Search, back: bool = False) -> None:
+    def __init__(self, search: Search) -> None:
         self.search = search
-        self.order = list(range(len(search.times)))[:: -1 if back else 1]
         self.asked = np.inf if search.surroundings is None else search.surroundings.clearance
         self.layers = _narrow(search)
-        count, n = len(self.order), len(search.space.scale)
+        count, n = len(search.times), len(search.space.scale)
         self.at = [np.full((len(charts), n), np.nan) for charts in self.layers]
         self.width = [np.full(len(charts), -np.inf) for charts in self.layers]
         self.parent = [np.zeros(len(charts), dtype=np.intp) for charts in self.layers]
-        first = self.order[0]
-        charts = self.layers[first]
+        charts = self.layers[0]
         middle = np.clip(0.0, charts.low, charts.high)
         own = np.arange(len(charts))
-        self._reached(first, own, charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle), own, None)
+        self._reached(0, own, charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle), own)
         graph = search.graph(self.layers, np.full(count - 1, np.inf))
-        for k, other in zip(self.order[:-1], self.order[1:], strict=True):
-            self._gone_on(graph, k, other)
+        for k in range(count - 1):
+            self._gone_on(graph, k)
 
     @property
     def last(self) -> int:
         """The last instant that is reached by what is wide enough, -1 if none."""
-        wide = [k for k in self.order if (self.width[k] >= self.asked).any()]
-        return wide[-1] if wide else -1
+        return max((k for k, width in enumerate(self.width) if (width >= self.asked).any()), default=-1)
 
     def way(self, k: int, chart: int) -> Array:
         """Joints from the first instant of the walk to a posture. Shape (K', n)."""
         found = []
-        for instant in reversed(self.order[: self.order.index(k) + 1]):
+        for instant in range(k, -1, -1):
             found.append(self.at[instant][chart])
             chart = int(self.parent[instant][chart])
         return np.array(found[::-1])
 
-    def _gone_on(self, graph: Any, k: int, other: int) -> None:
-        """From all postures of an instant to the charts of one beside it, the nearest of the widest first."""
-        space, limit = self.search.space, self.search.limits[min(k, other)]
+    def _gone_on(self, graph: Graph, k: int) -> None:
+        """From all postures of an instant to the charts of the next one, the nearest of the widest first."""
+        space, limit, other = self.search.space, self.search.limits[k], k + 1
         parts = [(i[np.isfinite(self.at[k][i, 0])], j[np.isfinite(self.at[k][i, 0])]) for i, j in graph.steps(k, other)]
         if not parts:
             return
@@ -216,16 +230,16 @@ class _Walk:
         delta = space.difference(into.centers, self.at[k][i])
         place = -np.einsum("pnr,pn->pr", into.tangents, space.scale**2 * delta)
         way = delta + np.einsum("pnr,pr->pn", into.tangents, np.clip(place, into.low, into.high))
-        near = (np.abs(way) <= limit + into.most_stray + WHOLE).all(axis=1)
+        near = (np.abs(way) <= limit + into.most_stray + TOLERANCE).all(axis=1)
         i, j, way = i[near], j[near], way[near]
         order = np.lexsort((space.length(way), -self.width[k][i], j))
         i, j, way = i[order], j[order], way[order]
         nth = np.arange(len(j)) - np.searchsorted(j, j)
-        for trial in range(TRIED):
+        for trial in range(WORST):
             chosen = nth == trial
-            self._reached(other, j[chosen], self.at[k][i[chosen]] + way[chosen], i[chosen], k)
+            self._reached(other, j[chosen], self.at[k][i[chosen]] + way[chosen], i[chosen])
 
-    def _reached(self, k: int, charts: Indices, joints: Array, parents: Indices, before: int | None) -> None:
+    def _reached(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
         """Hold what does the task and keeps limits, where it is wider than what was held before."""
         search = self.search
         instant, clearance = search.instants[k], self.asked
@@ -235,10 +249,10 @@ class _Walk:
             joints, good = instant.sets.corrected(np.full(len(charts), instant.number), joints)
             good &= search.space.within(joints)
         width = np.full(len(charts), np.inf)
-        if before is not None:
-            width = self.width[before][parents]
-            way = np.abs(joints - self.at[before][parents])
-            good &= (way <= search.limits[min(k, before)] + WHOLE).all(axis=1)
+        if k:
+            width = self.width[k - 1][parents]
+            way = np.abs(joints - self.at[k - 1][parents])
+            good &= (way <= search.limits[k - 1] + TOLERANCE).all(axis=1)
         if search.surroundings is not None:
             wide = width > self.width[k][charts]
             good &= wide
@@ -259,7 +273,7 @@ def _narrow(search: Search) -> list[Charts]:
     while True:
         wide = [k for k, charts in enumerate(layers) if len(charts) and (charts.radii > far[k]).any()]
         more = sum((2 ** layers[k].tangents.shape[2] - 1) * len(layers[k]) for k in wide)
-        if not more or sum(map(len, layers)) + more > MOST:
+        if not more or sum(map(len, layers)) + more > search.settings.charts:
             return layers
         layers = [search.halved(charts, k) if k in wide else charts for k, charts in enumerate(layers)]
 
@@ -267,93 +281,84 @@ def _narrow(search: Search) -> list[Charts]:
 def _stops(search: Search, front: _Walk) -> list[Stop]:
     """What stops motions at the last instant that is reached, the least first; of each kind and name the least."""
     space, around, last = search.space, search.surroundings, front.last
-    names, n = search.instants[0].sets.equations.machine.robot.joint_names, len(space.scale)
-    there = last + 1
-    wide = front.width[max(last, 0)] >= front.asked if last >= 0 else np.ones(len(front.at[0]), dtype=bool)
-    before = front.at[max(last, 0)][wide]
-    if last < 0:
-        before = front.layers[0].centers
-    if not len(before):
-        before = front.layers[max(last, 0)].centers
-    instant = search.instants[there]
-    nearest, on = instant.sets.corrected(np.full(len(before), instant.number), before)
-    found = [(before, nearest, on)]
-    # postures at the next instant that keep all limits but are too far
-    known = front.width[there] >= front.asked
-    charts = front.layers[there].of(~known) if last >= 0 else front.layers[there].of(slice(0, 0))
-    if len(charts):
-        middle = np.clip(0.0, charts.low, charts.high)
-        flat = charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle)
-        ways, good = instant.sets.corrected(np.full(len(flat), instant.number), flat)
-        tree = space.tree(before)
-        _, near = tree.query(space.placed(ways))
-        own = before[near]
-        found.append((own, own + space.difference(ways, own), good))
-    before, after, on = (np.concatenate(part) for part in zip(*found, strict=True))
+    names, n, there = search.instants[0].sets.equations.machine.robot.joint_names, len(space.scale), last + 1
+    before, after, on = _onward(search, front)
+    instant, clearance = search.instants[there], 0.0 if around is None else around.clearance
     miss = np.where(on, 0.0, np.abs(instant.sets.linearised(np.full(len(after), instant.number), after)[0]).max(axis=1))
     limit = search.limits[last] if last >= 0 else np.full(n, np.inf)
-    over, under, far = after - space.upper, space.lower - after, np.abs(after - before) - limit
     apart = np.full((len(after), 1), np.inf)
-    clearance = 0.0
     if around is not None:
-        clearance = around.clearance
         apart = distances_along(around, np.zeros(0), after, np.full(len(after), search.times[there]), clearance)
-    excess = np.column_stack([miss, over, under, far, clearance - apart])
+    ways = np.abs(after - before)
+    excess = np.column_stack([miss, after - space.upper, space.lower - after, ways - limit, clearance - apart])
     excess[~on, 1:] = 0.0
     worst = excess.argmax(axis=1)
-    best: dict[tuple[str, str], Stop] = {}
-    for row in np.argsort(excess[np.arange(len(worst)), worst], kind="stable").tolist():
-        what, column = divmod(int(worst[row]) - 1, n)
+    most = excess[np.arange(len(worst)), worst]
+
+    def stop(row: int) -> Stop:
+        """What stops the motion of a row, by its column."""
+        kind, joint = divmod(int(worst[row]) - 1, n)
         here, next_ = before[row], after[row]
-        if excess[row, worst[row]] <= WHOLE:
-            continue
         if worst[row] == 0:
-            stop = Stop("reach", "tip", float(miss[row]), 0.0, here, next_)
-        elif what < 2:
-            bound = float((space.upper, space.lower)[what][column])
-            stop = Stop("limit", names[column], float(next_[column]), bound, here, next_)
-        elif what == 2:
-            way = float(abs(next_[column] - here[column]))
-            stop = Stop("step", names[column], way, float(limit[column]), here, next_)
-        else:
-            assert around is not None
-            pair = int(worst[row]) - 1 - 3 * n
-            stop = Stop("touch", " and ".join(around.labels[pair]), float(apart[row, pair]), clearance, here, next_)
-        best.setdefault((stop.kind, stop.name), stop)
+            return Stop(StopKind.REACH, "tip", float(miss[row]), 0.0, here, next_)
+        if kind < 2:
+            bound = float((space.upper, space.lower)[kind][joint])
+            return Stop(StopKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
+        if kind == 2:
+            return Stop(StopKind.STEP, names[joint], float(ways[row, joint]), float(limit[joint]), here, next_)
+        assert around is not None
+        pair = int(worst[row]) - 1 - 3 * n
+        bodies = " and ".join(around.labels[pair])
+        return Stop(StopKind.TOUCH, bodies, float(apart[row, pair]), clearance, here, next_)
+
+    best: dict[tuple[StopKind, str], Stop] = {}
+    for row in np.argsort(most, kind="stable").tolist():
+        if most[row] > TOLERANCE:
+            own = stop(row)
+            best.setdefault((own.kind, own.name), own)
     if not best:  # postures go on, but none that was followed
-        own = front.layers[there].centers[0] if len(front.layers[there]) else before[0]
-        return [Stop("narrow", "tip", 0.0, 0.0, before[0], own)]
+        charts = front.layers[there].centers
+        return [Stop(StopKind.NARROW, "tip", 0.0, 0.0, before[0], charts[0] if len(charts) else before[0])]
     return list(best.values())
+
+
+def _onward(search: Search, front: _Walk) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Postures that are reached last, where each would have to go on to, and which of these do the task.
+
+    That is to the posture nearest to each, and to those of the next instant that keep all limits but are too far.
+    """
+    space, last = search.space, front.last
+    instant, seat = search.instants[last + 1], max(last, 0)
+    before = front.at[last][front.width[last] >= front.asked] if last >= 0 else front.layers[0].centers
+    if not len(before):
+        before = front.layers[seat].centers
+    nearest, on = instant.sets.corrected(np.full(len(before), instant.number), before)
+    charts = front.layers[last + 1].of(front.width[last + 1] < front.asked)
+    if last < 0 or not len(charts):
+        return before, nearest, on
+    middle = np.clip(0.0, charts.low, charts.high)
+    flat = charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle)
+    ways, good = instant.sets.corrected(np.full(len(flat), instant.number), flat)
+    own = before[space.tree(before).query(space.placed(ways))[1]]
+    there = own + space.difference(ways, own)
+    return np.concatenate([before, own]), np.concatenate([nearest, there]), np.concatenate([on, good])
 
 
 # ---- what gives way ----------------------------------------------------------------------------------------------
 
 
-def _joined(front: _Walk, back: _Walk, stop: Stop) -> Array:
-    """Joints at all instants, (K, n): as far as is reached, and from where the end is reached, straight between."""
-    space, count, last = front.search.space, len(front.order), max(front.last, 0)
-    apart = np.nan_to_num(space.length(front.at[last] - stop.before), nan=np.inf)
-    first = front.way(last, int(apart.argmin())) if np.isfinite(apart).any() else stop.before[None]
-    known = [k for k in range(count) if (back.width[k] >= back.asked).any()]
-    later = min((k for k in known if k >= len(first)), default=count)
-    path = np.full((count, len(stop.before)), np.nan)
-    path[: len(first)] = first
-    if later < count:
-        ways = back.at[later].copy()
-        ways[back.width[later] < back.asked] = np.nan
-        far = np.nan_to_num(space.length(space.difference(ways, first[-1])), nan=np.inf)
-        end = back.way(later, int(far.argmin()))[::-1]
-        path[later:] = first[-1] + space.difference(end[0], first[-1]) + (end - end[0])
-        numbers = np.arange(count)
-        blank = np.isnan(path[:, 0])
-        for column in path.T:
-            column[blank] = np.interp(numbers[blank], numbers[~blank], column[~blank])
-    else:
-        path[len(first) :] = first[-1]
-    return path
+def _carried_on(search: Search, front: _Walk, stopped: Array) -> Array:
+    """Joints at all instants, (K, n): as far as is reached, then straight to the nearest chart of the last instant."""
+    space, last, count = search.space, max(front.last, 0), len(search.times)
+    apart = np.nan_to_num(space.length(front.at[last] - stopped), nan=np.inf)
+    first = front.way(last, int(apart.argmin())) if np.isfinite(apart).any() else stopped[None]
+    ways = space.difference(front.layers[-1].centers, np.repeat(first[-1:], len(front.layers[-1]), axis=0))
+    onward = ways[space.length(ways).argmin()] if len(ways) else np.zeros(len(stopped))
+    share = np.arange(1, count - len(first) + 1)[:, None] / max(count - len(first), 1)
+    return np.vstack([first, first[-1] + share * onward])
 
 
-def _given(search: Search, path: Array, turning: bool, kind: str) -> Give | None:
+def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give | None:
     """A motion like one of joints (K, n) whose tips are off in places, or turned, by as little as is found; else None.
 
     All else is done, at the instants, limits are kept and everything is clear.
@@ -366,7 +371,7 @@ def _given(search: Search, path: Array, turning: bool, kind: str) -> Give | None
         rough = program.solved(path, None)  # row by row, which is smooth where nothing gives way
         if rough is None:
             return None
-        made = program.solved(rough, max(program.amount(rough), NOTHING))
+        made = program.solved(rough, max(program.amount(rough), NEGLIGIBLE))
         path = rough if made is None else made
         missing = [] if around is None else [touch.pair for touch in touches(around, np.zeros(0), path, search.times)]
         if not missing:
@@ -428,13 +433,16 @@ class _Giving:
         steps = self.joints[:, 1:] - self.joints[:, :-1]
         seconds = np.diff(search.times)
         rough = ca.sum2(ca.sum1(steps**2) / seconds[None, :])
-        size = max(float((np.diff(path, axis=0) ** 2 / seconds[:, None]).sum()), NOTHING)
+        # a motion that gives way is the smoother of those that do by as little, as good as
+        size = max(float((np.diff(path, axis=0) ** 2 / seconds[:, None]).sum()), NEGLIGIBLE)
         program = {
             "x": ca.vertcat(ca.vec(self.joints), slack),
-            "f": slack + SMOOTH * rough / size,
+            "f": slack + 1e-4 * rough / size,
             "g": ca.vertcat(self._rest, over, self._apart, ca.vec(steps)),
         }
-        solver = ca.nlpsol("give", "ipopt", program, {"print_time": False, "ipopt": SOLVER, "error_on_fail": False})
+        options = {"print_level": 0, "sb": "yes", "max_iter": 100, "bound_relax_factor": 0.0}
+        told = {"print_time": False, "ipopt": options, "error_on_fail": False}
+        solver = ca.nlpsol("give", "ipopt", program, told)
         sizes = [part.numel() for part in (self._rest, over, self._apart)]
         far, space, count = search.limits.ravel(), search.space, self.shape[0]
         found = solver(

@@ -11,6 +11,7 @@ by one until none that is left can be cheaper. Fewest first, then cheapest, as o
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +24,18 @@ __all__ = ["Piece", "Span", "farthest", "fewest_pieces"]
 Span = tuple[int, int]
 """First and last instant of a piece."""
 
-SEARCHED = 40
-"""Pieces at most: beyond that the best that is known is taken, and the bound stays what it is."""
-NEAR = 0.005
-"""Share of the cost by which what is left would have to be cheaper."""
+
+@dataclass(frozen=True)
+class PieceSettings:
+    """How long it is looked for the cheapest of the fewest pieces.
+
+    Attributes:
+        searched: Chains at most: beyond that the best that is known is taken, and the bound stays what it is.
+        gap: Share of the cost by which what is left would have to be cheaper.
+    """
+
+    searched: int = 40
+    gap: float = 0.005
 
 
 class Piece(NamedTuple):
@@ -44,16 +53,47 @@ class Piece(NamedTuple):
     bound: float
 
 
-def fewest_pieces(search: Search, gap: int = 1, barred: Collection[Span] = ()) -> tuple[list[Piece], float] | None:
+def fewest_pieces(
+    search: Search, gap: int = 1, barred: Collection[Span] = (), settings: PieceSettings = PieceSettings()
+) -> tuple[list[Piece], float] | None:
     """The cheapest of the fewest pieces through all instants, one after the other, and what none cost less than.
 
     Args:
         gap: From the last instant of a piece to the first of the next: 1; or 0, of instants of a time that runs on.
         barred: What is known not to be done in one piece, nor is what it is a part of.
+        settings: How long it is looked for the cheapest.
 
     Returns:
         None where nothing goes on somewhere: with a gap where an instant has no posture that is found, in a piece of
         its own.
+    """
+    ranges = _ranges(search, gap, barred)
+    if ranges is None:
+        return None
+    least = {span: cost for span, cost in _bounds(search, *ranges).items() if not _without(span, gap, barred)}
+    known = dict[Span, Piece | None]()
+
+    def cheapest(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
+        """The cheapest chain of what is known, by its costs or bounds; with the bounds of all else, or without."""
+        own = {key: np.inf if one is None else one.bound if bounds else one.cost for key, one in known.items()}
+        return _cheapest(*ranges, gap, (least if bounded else {}) | own)
+
+    for _ in range(settings.searched):
+        chain, total = cheapest(True)
+        missing = [key for key in chain if key not in known]
+        if not missing or total >= (1 - settings.gap) * cheapest(False)[1]:
+            break
+        known |= {key: _piece(search, *key) for key in missing}
+    chain, total = cheapest(False)
+    if not np.isfinite(total):
+        return None
+    return [one for key in chain if (one := known[key]) is not None], cheapest(True, bounds=True)[1]
+
+
+def _ranges(search: Search, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
+    """Where each of the fewest pieces may begin and end; None where nothing goes on somewhere.
+
+    Pieces that each go as far as they can tell how late each may end, those followed back how early it may begin.
     """
     last = len(search.times) - 1
     ends, starts = farthest(search, gap, barred), list[int]()
@@ -64,26 +104,11 @@ def fewest_pieces(search: Search, gap: int = 1, barred: Collection[Span] = ()) -
         if start is None or len(starts) > len(ends):
             return None
         starts.append(start)
-    # where each piece may begin and end; the other way round fewer could only have been missed
+    # the other way round fewer could only have been missed
     first = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + gap for end in ends[:-1])]
     begins = [range(first[m], (ends[m - 1] + gap if m else 0) + 1) for m in range(len(ends))]
     stops = [range(begins[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)] + [range(last, last + 1)]
-    least = {span: cost for span, cost in _bounds(search, begins, stops).items() if not _without(span, gap, barred)}
-    known = dict[Span, Piece | None]()
-    for _ in range(SEARCHED):
-        chain, total = _cheapest(begins, stops, gap, {**least, **{key: _cost(one) for key, one in known.items()}})
-        found = _cheapest(begins, stops, gap, {key: _cost(one) for key, one in known.items()})[1]
-        missing = [key for key in chain if key not in known]
-        if not missing or total >= (1 - NEAR) * found:
-            break
-        for key in missing:
-            known[key] = _piece(search, *key)
-    chain, total = _cheapest(begins, stops, gap, {key: _cost(one) for key, one in known.items()})
-    if not np.isfinite(total):
-        return None
-    told = {key: (np.inf if one is None else one.bound) for key, one in known.items()}
-    bound = _cheapest(begins, stops, gap, {**least, **told})[1]
-    return [one for key in chain if (one := known[key]) is not None], bound
+    return begins, stops
 
 
 def farthest(search: Search, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False) -> list[int]:
@@ -107,10 +132,6 @@ def farthest(search: Search, gap: int = 1, barred: Collection[Span] = (), ruled_
 def _without(span: Span, gap: int, barred: Collection[Span]) -> bool:
     """Whether there is no such piece: it goes nowhere, or a part of it is barred."""
     return (span[0] == span[1] and not gap) or any(span[0] <= one[0] and one[1] <= span[1] for one in barred)
-
-
-def _cost(piece: Piece | None) -> float:
-    return np.inf if piece is None else piece.cost
 
 
 def _piece(search: Search, first: int, last: int) -> Piece | None:

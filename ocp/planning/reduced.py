@@ -7,6 +7,7 @@ and any in the null space of A, its self-motion; the base moves along as its mom
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -15,17 +16,21 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
+from ocp.planning.joint_space import TOLERANCE
 from ocp.problem.formulation import Sampler
 from ocp.tasks.equations import TaskEquations
+from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ReducedKinematics", "Slopes", "within"]
+__all__ = ["ReducedKinematics", "Side", "Slopes", "within"]
 
-SINGULAR = 1e-9
-"""Relative to the largest: what counts as a dependent row."""
-NEARLY = 1e-9
-"""rad/s or m/s: what rates may pass a limit by."""
-LOW, HIGH, SLOW, FAST = range(4)
-"""Limits of a joint: of its position, and of its rate."""
+
+class Side(IntEnum):
+    """Limits of a joint: of its position, and of its rate."""
+
+    LOW = 0
+    HIGH = 1
+    SLOW = 2
+    FAST = 3
 
 
 class Slopes(NamedTuple):
@@ -105,7 +110,7 @@ class ReducedKinematics:
         whole, upper = np.linalg.qr(matrix.reshape(count, n, self.rows) / self.root[:, None], mode="complete")
         lower = upper[:, : self.rows].transpose(0, 2, 1).copy()
         for i in range(self.rows):  # rows that depend on others give what they can
-            least = SINGULAR * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
+            least = ROUNDING_SHARE * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
             lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < least, least, lower[:, i, i])
         if self.equations is not None:
             error = np.where(self.equations.posed, error, 0.0)
@@ -204,14 +209,14 @@ def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> t
         fast: Limits of the rates alone. Shape (n,).
 
     Returns:
-        The rates, and of each the joint that cannot keep a limit and which one (LOW, HIGH, SLOW, FAST), or -1. (K, 2).
+        The rates, and of each the joint that cannot keep a limit and which `Side`, or -1. (K, 2).
     """
     rates, why = rates.copy(), np.full((len(rates), 2), -1, dtype=np.intp)
     busy = np.arange(len(rates))
     for _ in range(2 * rates.shape[1] + 1):  # of each joint both limits
         over = np.maximum(rates[busy] - high[busy], low[busy] - rates[busy])
         worst = over.argmax(axis=1)
-        beyond = over[np.arange(len(busy)), worst] > NEARLY
+        beyond = over[np.arange(len(busy)), worst] > TOLERANCE
         why[busy[~beyond]] = -1
         busy, worst = busy[beyond], worst[beyond]
         if not busy.size:
@@ -219,9 +224,12 @@ def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> t
         below = rates[busy, worst] < low[busy, worst]
         limit = np.where(below, low[busy, worst], high[busy, worst])
         of_rate = np.abs(limit) >= fast[worst]
-        why[busy, 0], why[busy, 1] = worst, np.where(below, LOW, HIGH) + np.where(of_rate, SLOW, LOW)
+        why[busy, 0], why[busy, 1] = (
+            worst,
+            np.where(below, Side.LOW, Side.HIGH) + np.where(of_rate, Side.SLOW, Side.LOW),
+        )
         turn = null[busy, worst]
         lever = (turn**2).sum(axis=1)
-        share = np.where(lever > SINGULAR, (limit - rates[busy, worst]) / np.maximum(lever, SINGULAR), 0.0)
+        share = np.where(lever > ROUNDING_SHARE, (limit - rates[busy, worst]) / np.maximum(lever, ROUNDING_SHARE), 0.0)
         rates[busy] += share[:, None] * (null[busy] @ turn[:, :, None])[:, :, 0]
     return rates, why

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from warnings import warn
 
 import numpy as np
@@ -27,39 +27,45 @@ from models.arrays import Array
 from ocp.errors import BoundWarning
 from ocp.local.inverse_kinematics import Unreachable
 from ocp.local.touching import distances_along
-from ocp.planning.charts import Charts, Instant, JointSpace, Parts, point
-from ocp.planning.steps import StepCost, Values, least_in_box
-from ocp.planning.tight import DEAR, drawn_tight
-from ocp.planning.value import FARTHEST, Graph
+from ocp.planning.charts import Charts, Instant, Parts, point
+from ocp.planning.joint_space import FARTHEST, TOLERANCE, JointSpace
+from ocp.planning.steps import StepCost, Values
+from ocp.planning.tight import PENALTY, drawn_tight
+from ocp.planning.value import Graph
+from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["FREE", "MOST", "Search", "checked_bound"]
+__all__ = ["FREE", "Search", "SearchSettings", "checked_bound"]
 
 FREE = 2
 """Directions that a task may leave free: of more there are too many postures."""
-RADII = (0.07, 0.07, 0.2)
-"""rad or m, of the charts that the search begins with, by the number of directions that are free."""
-MOST = 40_000
-"""Charts of all instants together, of 1 kB each with what is known of their steps."""
-FIRST = 10_000
-"""Of these, before there is any motion: where one has hardly room, neither it nor that there is none may be found."""
-FINEST = 1e-6
-"""rad or m: smaller charts are not halved."""
-GAPS = (0.01, 0.01, 0.04)
-"""Share of what a plan's steps cost that the bound may stay below, by the directions that are free."""
-MOTIONS = 12
-"""Classes of motions that are followed up, the cheapest first."""
-FAR = 3.0
-"""Share of the least cost beyond which they are not."""
-SAME = 0.1
-"""rad or m: motions nearer to each other than this everywhere are one."""
-WHOLE = 1e-9
-"""rad or m: limits are kept up to this."""
-INWARDS = (0.0, 0.25, 0.5, 1.0)
-"""Shares of the way to the middle of a chart at which a posture is tried that keeps the limits."""
-ROUNDED = 1e-9
-"""Share of its cost by which a motion may be cheaper than a bound of all."""
-SEATS = 5
-"""Instants at which the cheapest motions through all charts are compared."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How far a search goes.
+
+    Attributes:
+        radii: Of the charts that the search begins with, rad or m, by the number of directions that are free.
+        charts: Of all instants together at most, of 1 kB each with what is known of their steps.
+        first: Of these, before there is any motion: where one has hardly room, neither it nor that there is none may be
+            found.
+        finest: Smaller charts are not halved, rad or m.
+        gaps: Share of what a plan's steps cost that the bound may stay below, by the directions that are free.
+        motions: Classes of motions that are followed up, the cheapest first.
+        far: Share of the least cost beyond which they are not.
+        same: Motions nearer to each other than this everywhere are one, rad or m.
+        seats: Instants at which the cheapest motions through all charts are compared.
+    """
+
+    radii: tuple[float, float, float] = (0.07, 0.07, 0.2)
+    charts: int = 40_000
+    first: int = 10_000
+    finest: float = 1e-6
+    gaps: tuple[float, float, float] = (0.01, 0.01, 0.04)
+    motions: int = 12
+    far: float = 3.0
+    same: float = 0.1
+    seats: int = 5
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
@@ -68,7 +74,7 @@ def checked_bound(bound: float, cost: float) -> float | None:
     Warns:
         BoundWarning: That it does.
     """
-    if bound <= cost * (1 + ROUNDED):
+    if bound <= cost * (1 + ROUNDING_SHARE):
         return bound
     words = f"a motion costs {cost:.9g}, less than the bound {bound:.9g} of all motions, which is left out: report this"
     warn(BoundWarning(words, name="bound", value=cost, limit=bound), stacklevel=2)
@@ -93,6 +99,7 @@ class Search:
         seeds: Callable[[int], Array],
         start: Array | None = None,
         surroundings: Surroundings | None = None,
+        settings: SearchSettings = SearchSettings(),
     ) -> None:
         """
         Args:
@@ -104,13 +111,14 @@ class Search:
             seeds: Postures at an instant, of as many parts of the set as are found, shape (M, n); raises Unreachable.
             start: The posture of the first instant, where it is given. Shape (n,).
             surroundings: What has to be clear.
+            settings: How far it goes.
 
         Raises:
             Unreachable: An instant at which no posture does the tasks within limits, and clear.
             ProblemError: More postures than memory is for.
         """
         self.space, self.instants, self.times, self.cost, self.limits = space, instants, times, cost, limits
-        self.start, self.surroundings = start, surroundings
+        self.start, self.surroundings, self.settings = start, surroundings, settings
         self._known: tuple[Graph, list[Values], list[Values] | None] | None = None
         self.covered = self._cover(seeds)
         self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
@@ -132,7 +140,7 @@ class Search:
                     if not found:
                         raise
             layer, joints = (np.array(part) for part in zip(*found, strict=True))
-            charts = sets.cover(layer, joints, RADII[sets.size], MOST)
+            charts = sets.cover(layer, joints, self.settings.radii[sets.size], self.settings.charts)
             covered += [charts.of(charts.layer == self.instants[k].number) for k in own]
         if self.start is not None:
             covered[0] = point(self.start)
@@ -172,6 +180,11 @@ class Search:
         own.start = self.start if first == 0 else None
         return own
 
+    def ways(self) -> tuple[list[Array], float]:
+        """Joints at the instants, (K, n), of motions by rising cost of their steps, and what none costs less than."""
+        path, bound = self.best(np.inf)
+        return [] if path is None else [path], bound
+
     def steps(self, path: Array) -> float:
         """What straight steps through joints (K, n) at the instants cost."""
         return float(self.cost.of(np.diff(path, axis=0), np.diff(self.times)[:, None]).sum())
@@ -193,7 +206,7 @@ class Search:
         graph, to_come, passed = self._known
         passed = passed or graph.passed()
         seats = []
-        for k in np.unique(np.linspace(0, len(graph.layers) - 1, SEATS).astype(int)).tolist():
+        for k in np.unique(np.linspace(0, len(graph.layers) - 1, self.settings.seats).astype(int)).tolist():
             charts = graph.layers[k]
             total = graph.through(passed, to_come, k)
             lowest = np.isfinite(total)
@@ -203,10 +216,11 @@ class Search:
             seats += [(float(total[i]), k, i) for i in np.flatnonzero(lowest).tolist()]
         found: list[tuple[float, Array]] = []
         for bound, k, chart in sorted(seats):
-            if len(found) == MOTIONS or (found and bound > FAR * found[0][0]):
+            if len(found) == self.settings.motions or (found and bound > self.settings.far * found[0][0]):
                 break
             path = self._path(graph, k, chart, passed, to_come)
-            if path is None or any(np.abs(self.space.difference(path, other)).max() < SAME for _, other in found):
+            same = (np.abs(self.space.difference(path, other)).max() for _, other in found if path is not None)
+            if path is None or any(apart < self.settings.same for apart in same):
                 continue
             found.append((self.steps(path), path))
         return [path for _, path in sorted(found, key=lambda one: one[0])]
@@ -236,7 +250,8 @@ class Search:
         Boxes end beyond the limits, by how far the set strays from them.
         """
         middle = (box.low[0] + box.high[0]) / 2
-        ways = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in INWARDS)
+        inwards = (0.0, 0.25, 0.5, 1.0)
+        ways = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in inwards)
         return next((good for way in ways if (good := self._on(k, way)) is not None), None)
 
     def _on(self, k: int, joints: Array) -> Array | None:
@@ -244,14 +259,7 @@ class Search:
         if k == 0 and self.start is not None:
             return self.start
         found, good = self.instants[k].sets.corrected(np.array([self.instants[k].number]), joints[None])
-        if not good[0] or not self.space.within(found)[0]:
-            return None
-        around = self.surroundings
-        if around is not None:
-            apart = distances_along(around, np.zeros(0), found, self.times[k : k + 1], around.clearance)
-            if (apart < around.clearance).any():
-                return None
-        return np.asarray(found[0])
+        return np.asarray(found[0]) if good[0] and self._clear(found, k)[0] else None
 
     # ---- the best of all -------------------------------------------------------------------------------------------
 
@@ -266,7 +274,8 @@ class Search:
             None and inf where no motion goes through all instants; a bound that is lower than it might be where more
             charts would be needed than memory is for.
         """
-        dearest = float(self.cost.of(np.minimum(self.limits, FARTHEST), np.diff(self.times)[:, None]).max(initial=0.0))
+        seconds = np.diff(self.times)[:, None]
+        dearest = float(self.cost.of(np.minimum(self.limits, FARTHEST), seconds).max(initial=0.0))
         while True:
             path, bound = self._best(most)
             if most >= dearest:
@@ -280,7 +289,7 @@ class Search:
     @property
     def _share(self) -> float:
         """Of what a motion's steps cost, which the bound has to reach."""
-        return 1 - GAPS[max(0, *(instant.sets.size for instant in self.instants))]
+        return 1 - self.settings.gaps[max(0, *(instant.sets.size for instant in self.instants))]
 
     def _best(self, most: float) -> tuple[Array | None, float]:
         """As `best`, of motions all of whose steps cost at most so much."""
@@ -317,7 +326,7 @@ class Search:
             kept = [charts.of(own) for charts, own in zip(layers, cheap, strict=True)]
             if not all(len(charts) for charts in kept):
                 return best, share * least
-            if not self._may_be_halved(kept):
+            if not self._may_be_halved(kept, self.settings.charts):
                 return best, max(low, 0.0)
             finer = [self._finer(kept[k], k, passed[k].of(own)) for k, own in enumerate(cheap)]
             layers, rest = [charts for charts, _ in finer], [values for _, values in finer]
@@ -340,7 +349,7 @@ class Search:
             if coarse:
                 graph = self.graph(layers, graph.most)
                 path = self._led(graph, graph.to_come())
-            if path is not None or not self._may_be_halved(layers, FIRST):
+            if path is not None or not self._may_be_halved(layers, self.settings.first):
                 return layers, path
             coarse = False
             layers = [self.allowed(self.halved(charts, k), k) for k, charts in enumerate(layers)]
@@ -350,27 +359,27 @@ class Search:
         chart = int(graph.least(to_come[0], 0).argmin())
         return self._tight(self._path(graph, 0, chart, to_come, to_come), graph.layers)
 
-    def _may_be_halved(self, layers: list[Charts], most: int = MOST) -> bool:
+    def _may_be_halved(self, layers: list[Charts], most: int) -> bool:
         """Whether charts of half the radius are no more than so many, and not too small."""
         finer = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
-        return finer <= most and max(float(charts.radii.max()) for charts in layers) >= FINEST
+        return finer <= most and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
     def _through_centers(self, graph: Graph) -> Array | None:
         """The cheapest way from centre to centre of charts, too far steps being dear; None if there is none."""
         layers = graph.layers
-        cost, back = np.where(self._clear(layers[-1], len(layers) - 1), 0.0, np.inf), list[Array]()
+        cost, back = np.where(self._clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
         for k in range(len(layers) - 2, -1, -1):
             here, there = layers[k], layers[k + 1]
             least, onward = np.full(len(here), np.inf), np.zeros(len(here))
             for i, j in graph.steps(k, k + 1):
                 way = self.space.difference(there.centers[j], here.centers[i])
                 total = cost[j] + self.cost.of(way, self.times[k + 1] - self.times[k])
-                total += DEAR * np.maximum(np.abs(way) - self.limits[k], 0.0).sum(axis=1)
+                total += PENALTY * np.maximum(np.abs(way) - self.limits[k], 0.0).sum(axis=1)
                 order = np.lexsort((total, i))
                 i, j, total = i[order], j[order], total[order]
                 first = np.flatnonzero(np.diff(i, prepend=-1))
                 least[i[first]], onward[i[first]] = total[first], j[first]
-            cost = np.where(self._clear(here, k), least, np.inf)
+            cost = np.where(self._clear(here.centers, k), least, np.inf)
             back.append(onward)
         if not np.isfinite(cost).any():
             return None
@@ -381,13 +390,13 @@ class Search:
             path.append(path[-1] + self.space.difference(layers[k + 1].centers[chart], path[-1]))
         return np.array(path)
 
-    def _clear(self, charts: Charts, k: int) -> NDArray[np.bool_]:
-        """Whether the centres of charts keep limits and clearance. Shape (N,)."""
-        good, around = self.space.within(charts.centers), self.surroundings
+    def _clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
+        """Whether postures (N, n) of an instant keep limits and clearance. Shape (N,)."""
+        good, around = self.space.within(joints), self.surroundings
         if around is not None:
             at = np.flatnonzero(good)
             times = np.full(len(at), self.times[k])
-            apart = distances_along(around, np.zeros(0), charts.centers[at], times, around.clearance)
+            apart = distances_along(around, np.zeros(0), joints[at], times, around.clearance)
             good[at] = (apart >= around.clearance).all(axis=1)
         return good
 
@@ -401,7 +410,7 @@ class Search:
             width = max(float(charts.radii.max()) for charts in layers)
             made = drawn_tight(path, self.instants, *steps, bounds, self.surroundings, (width / 2, width / 64))
             path = made if all(self._on(k, joints) is not None for k, joints in enumerate(made)) else path
-        return path if (np.abs(np.diff(path, axis=0)) <= self.limits + WHOLE).all() else None
+        return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
     def halved(self, charts: Charts, k: int) -> Charts:
         """Charts of an instant of half the radius in their place."""
@@ -418,6 +427,4 @@ class Search:
         parts = self._parts(charts, k)
         good = self._allowed(parts.charts, k)
         values, low, high = values.of(parts.owners[good]), parts.low[good], parts.high[good]
-        least = values.least + least_in_box(values.slope, values.curve, low, high)[0]
-        new = parts.charts.of(good)
-        return new, Values(least, np.zeros_like(new.low), np.zeros((*new.low.shape, new.low.shape[1])))
+        return parts.charts.of(good), Values.constant(values.lowest(low, high)[0], low.shape[1])

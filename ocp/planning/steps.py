@@ -9,30 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
 from models.arrays import Array
 from ocp.planning.charts import Charts
 
-__all__ = [
-    "Homogeneous",
-    "Largest",
-    "Length",
-    "Sheets",
-    "Squares",
-    "StepCost",
-    "Steps",
-    "Values",
-    "least_in_box",
-    "lowest_curvature",
-]
+__all__ = ["Homogeneous", "Largest", "Length", "Sheets", "Squares", "StepCost", "Steps", "Values", "least_in_box"]
 
 MEETINGS = 8
-"""Times that the least of the largest is looked for where lines meet."""
-NEAREST = 2
-"""Times that the nearest places of two charts are looked for, in one and in the other."""
+"""Times that the least of what is homogeneous is looked for where lines meet: one of as many as joints, each time."""
 CONCAVE = 0.5
 """Curvature of values, of the step's own, that is taken as it is; what is more concave is bounded by its ends."""
 
@@ -51,6 +38,16 @@ class Values(NamedTuple):
     def of(self, chosen: Any) -> Values:
         """Some of them."""
         return Values(*(part[chosen] for part in self))
+
+    @classmethod
+    def constant(cls, least: Array, free: int) -> Values:
+        """The same everywhere on charts of so many free directions."""
+        return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
+
+    def lowest(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """The least in boxes (N, r), and where."""
+        least, place = least_in_box(self.slope, self.curve, low, high)
+        return self.least + least, place
 
     def at(self, places: Array) -> Array:
         """Values (N,) at places (N, r)."""
@@ -72,26 +69,6 @@ class Sheets(NamedTuple):
     def of(self, chosen: Any) -> Sheets:
         """Some of them."""
         return Sheets(self.charts.of(chosen), self.bends[chosen], self.rest[chosen])
-
-
-class Steps(Protocol):
-    """Bounds of P steps, and the cost after them, by the place t in the box that they go from.
-
-    Each place p gives one: value + slope . (t - p) + (t - p) . curve . (t - p) / 2.
-    """
-
-    @property
-    def curve(self) -> Array:
-        """Shape (P, r, r)."""
-
-    def of(self, chosen: Any) -> Steps:
-        """Some of them."""
-
-    def at(self, places: Array) -> tuple[Array, Array]:
-        """Values (P,) and slopes (P, r) at places (P, r)."""
-
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Places (P, r) at which the values are lower, less slope . t + t . curve . t / 2, if some are known."""
 
 
 class StepCost(Protocol):
@@ -211,14 +188,9 @@ def _nearest(
     flat: Array, turn: Array, here: Array, there: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
     """Places in boxes (2, r, P) from and to which the ways along the charts cost little: flat - turn . one + other."""
-    one = (here[0] + here[1]) / 2
-    square = curve + np.eye(len(flat))[:, :, None] / seconds
-    square_back = _product(turn, turn)
-    for _ in range(NEAREST):
-        start = (flat - _times(turn, one)) / seconds
-        other = _least(start + slope, square, *there)[1]
-        one = _least(-_back(turn, flat + other), square_back, *here)[1]
-    return one, other
+    square, start = curve + np.eye(len(flat))[:, :, None] / seconds, (here[0] + here[1]) / 2
+    other = _least((flat - _times(turn, start)) / seconds + slope, square, *there)[1]
+    return _least(-_back(turn, flat + other), _product(turn, turn), *here)[1], other
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +198,7 @@ class SquareSteps:
     """least + slope . t + t . level . t / 2, and the least of v . v / (2 dt) + after . t' + t' . curved . t' / 2.
 
     There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`. All arrays have the
-    steps last.
+    steps last. Each place p gives a bound of all: value + slope . (t - p) + (t - p) . curve . (t - p) / 2.
     """
 
     seconds: float
@@ -259,6 +231,7 @@ class SquareSteps:
         return start, *_least(start / self.seconds + self.after, self._square, *self.into)
 
     def at(self, places: Array) -> tuple[Array, Array]:
+        """Values (P,) and slopes (P, r) at places (P, r)."""
         places = _last(places)
         start, onward, there = self._onward(places)
         held = _times(self.level, places)
@@ -267,6 +240,7 @@ class SquareSteps:
         return value + _dot(places, held / 2 + self.slope), _first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+        """Places (P, r) at which the values are lower, less slope . t + t . curve . t / 2, if some are known."""
         pulled = -_back(self.turn, self.flat + self._onward(_last(places))[2]) / self.seconds
         square = _product(self.turn, self.turn) / self.seconds + self.level - _last(curve)
         return _first(_least(pulled + self.slope - _last(slope), square, *self.out)[1])
@@ -295,9 +269,45 @@ class Homogeneous:
         """How far a step of at most this cost goes in the metric of the charts."""
         raise NotImplementedError
 
+    def pull(self, way: Array) -> Array:
+        """Gradients by ways (P, n)."""
+        raise NotImplementedError
+
     def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
         """The cheapest steps on charts: bounds (P,), their multipliers (P, n), the gradient by the way, and places."""
-        raise NotImplementedError
+        count = len(delta)
+        if not into.tangents.shape[2]:
+            return self.of(delta, 1.0) + after.least, self.pull(delta), np.zeros((count, 0))
+        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
+        box = into.low[:, 0], into.high[:, 0]
+
+        def pulled(at: Array) -> list[Array]:
+            """The place, the gradient there, its value at no place, and how the whole rises."""
+            pull = self.pull(delta + along * at[:, None])
+            return [at, pull, (pull * delta).sum(axis=1), (pull * along).sum(axis=1) + slope]
+
+        def meeting() -> Array:
+            """Where lines from both ends meet; an end that does not fall towards the other is the least."""
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meet = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
+            return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], meet))
+
+        # a piece of the convex function is left out at a time
+        first, last = (pulled(at.copy()) for at in box)
+        for _ in range(MEETINGS):
+            there = pulled(meeting())
+            falls = (there[3] < 0) & (first[3] < 0) & (last[3] > 0)
+            rises = (there[3] >= 0) & (first[3] < 0) & (last[3] > 0)
+            for end, moved in ((first, falls), (last, rises)):
+                for part, new in zip(end, there, strict=True):
+                    part[moved] = new[moved]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossed = np.nan_to_num(last[3] / (last[3] - first[3]))
+        share = np.where(first[3] >= 0, 1.0, np.where(last[3] <= 0, 0.0, crossed))
+        pull, place = share[:, None] * first[1] + (1 - share[:, None]) * last[1], meeting()
+        rest = (pull * along).sum(axis=1) + slope
+        least = np.minimum(rest * box[0], rest * box[1])
+        return (pull * delta).sum(axis=1) + least + after.least, pull, place[:, None]
 
     def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
         cost, _, place = self.least(delta, into, after)
@@ -316,32 +326,8 @@ class Length(Homogeneous):
     def farthest(self, cost: float, seconds: float) -> float:
         return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
 
-    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
-        count = len(delta)
-        if not into.tangents.shape[2]:
-            return self.of(delta, 1.0) + after.least, self.weights * np.sign(delta), np.zeros((count, 0))
-        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            places = np.nan_to_num(np.clip(-delta / along, into.low, into.high))
-        places = np.column_stack([into.low, into.high, places])  # an end of the box before what is cut there
-        costs = np.stack([self.of(delta + along * at[:, None], 1.0) + slope * at for at in places.T], axis=1)
-        best = costs.argmin(axis=1)
-        rows = np.arange(count)
-        at = places[rows, best]
-        # the multiplier: signs, and for the joint that does not move there what makes the place the least
-        signs = np.sign(delta + along * at[:, None])
-        turning = best > 1
-        joint = np.maximum(best - 2, 0)
-        signs[rows[turning], joint[turning]] = 0.0
-        rest = slope + (self.weights * signs * along).sum(axis=1)
-        own = self.weights[joint] * along[rows, joint]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            balance = np.clip(np.nan_to_num(-rest / own), -1.0, 1.0)
-        signs[rows[turning], joint[turning]] = balance[turning]
-        rest = slope + (self.weights * signs * along).sum(axis=1)
-        pull = self.weights * signs
-        least = np.minimum(rest * into.low[:, 0], rest * into.high[:, 0])
-        return (pull * delta).sum(axis=1) + least + after.least, pull, at[:, None]
+    def pull(self, way: Array) -> Array:
+        return np.asarray(self.weights * np.sign(way))
 
 
 class Largest(Homogeneous):
@@ -353,32 +339,7 @@ class Largest(Homogeneous):
     def farthest(self, cost: float, seconds: float) -> float:
         return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
 
-    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
-        if not into.tangents.shape[2]:
-            return self.of(delta, 1.0) + after.least, self._pull(delta), np.zeros((len(delta), 0))
-        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
-        low, high = into.low[:, 0].copy(), into.high[:, 0].copy()
-        # where what rises from there meets what falls: a piece of the convex function is left out each time
-        for _ in range(MEETINGS):
-            ends = [self._pull(delta + along * at[:, None]) for at in (low, high)]
-            rises = [(pull * along).sum(axis=1) + slope for pull in ends]
-            crosses = (rises[0] < 0) & (rises[1] > 0)
-            values = [(pull * delta).sum(axis=1) for pull in ends]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                meet = np.where(crosses, (values[0] - values[1]) / (rises[1] - rises[0]), low)
-            at = np.clip(np.nan_to_num(meet), low, high)
-            there = (self._pull(delta + along * at[:, None]) * along).sum(axis=1) + slope
-            low, high = np.where(crosses & (there < 0), at, low), np.where(crosses & (there > 0), at, high)
-        place = np.where(rises[0] >= 0, into.low[:, 0], np.where(rises[1] <= 0, into.high[:, 0], at))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.where(crosses, np.clip(rises[1] / (rises[1] - rises[0]), 0.0, 1.0), rises[0] >= 0)
-        pull = share[:, None] * ends[0] + (1 - share[:, None]) * ends[1]
-        rest = (pull * along).sum(axis=1) + slope
-        least = np.minimum(rest * into.low[:, 0], rest * into.high[:, 0])
-        return (pull * delta).sum(axis=1) + least + after.least, pull, place[:, None]
-
-    def _pull(self, way: Array) -> Array:
-        """Gradients by the ways (P, n)."""
+    def pull(self, way: Array) -> Array:
         pull, rows = np.zeros(way.shape), np.arange(len(way))
         joint = (self.weights * np.abs(way)).argmax(axis=1)
         pull[rows, joint] = (self.weights * np.sign(way))[rows, joint]
@@ -414,6 +375,10 @@ class HomogeneousSteps:
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
         return places
+
+
+Steps: TypeAlias = SquareSteps | HomogeneousSteps
+"""Bounds of P steps, and the cost after them, by the place in the box that they go from."""
 
 
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.local.following import Followed
-from ocp.local.inverse_kinematics import Unreachable, postures_of
-from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
+from ocp.local.inverse_kinematics import Unreachable
+from ocp.planning.charts import Instant, SelfMotions
 from ocp.planning.dead_end import DeadEnd, dead_end
+from ocp.planning.held import Held
+from ocp.planning.joint_space import JointSpace
 from ocp.planning.postures import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.planning.reconfigurations import farthest, fewest_pieces
 from ocp.planning.search import FREE, Search
@@ -23,22 +26,29 @@ from ocp.tasks.equations import TaskEquations
 
 __all__ = ["TaskSearch"]
 
-STARTS = 16
-"""Random starts of inverse kinematics at each instant."""
-LOST = (0.0033, 0.0033, 0.045)
-"""Share of the cost that straight steps between the instants may lose, by the directions that are free. With two each
-instant is dear: with a third as much lost, and as much more for the search, a plan took half as long again.
-"""
-INSTANTS = 4
-"""Steps over the motion, at least."""
-TIGHT, AT_LIMIT = 0.9, 1e-3
-"""Share of its greatest speed, and rad or m from the limit of its position, where a joint has hardly any room."""
-CLOSEST = 1e-3
-"""Share of the horizon: instants do not come closer."""
-CUT = 4
-"""Parts of a step between two instants where pieces of a motion end that might have to be fewer."""
-TOLD = 64
-"""Times of the motions that are told, beside the breaks of the tasks."""
+
+@dataclass(frozen=True)
+class InstantSettings:
+    """At which times the postures of tasks are searched.
+
+    Attributes:
+        lost: Share of the cost that straight steps between the instants may lose, by the directions that are free. With
+            two each instant is dear: with a third as much lost a plan took half as long again.
+        steps: Over the motion, at least.
+        closest: Share of the horizon: instants do not come closer.
+        tight: Share of its greatest speed at which a joint has hardly any room, so that instants are put beside.
+        at_limit: Likewise from the limit of its position, rad or m.
+        parts: Of a step between two instants where pieces of a motion end that might have to be fewer.
+        told: Times of the motions that are told, beside the breaks of the tasks.
+    """
+
+    lost: tuple[float, float, float] = (0.0033, 0.0033, 0.045)
+    steps: int = 4
+    closest: float = 1e-3
+    tight: float = 0.9
+    at_limit: float = 1e-3
+    parts: int = 4
+    told: int = 64
 
 
 class TaskSearch:
@@ -52,13 +62,14 @@ class TaskSearch:
         Unreachable: An instant at which no posture does the tasks.
     """
 
-    def __init__(self, asked: Asked, followed: list[Followed]) -> None:
+    def __init__(self, asked: Asked, followed: list[Followed], settings: InstantSettings = InstantSettings()) -> None:
         """
         Args:
             asked: What is asked.
             followed: Local motions through its stretches, of which the cheapest says where instants are needed.
+            settings: How many are taken.
         """
-        self.asked = asked
+        self.asked, self._settings = asked, settings
         machine, bounds = asked.machine, asked.bounds
         if machine.base_size:
             words = "search='global' is for machines on a fixed base; search='postures' for those that move"
@@ -85,8 +96,8 @@ class TaskSearch:
                     f"at most {FREE} can be searched; fix more, or search='postures'"
                 )
                 raise ProblemError(words, name="search", value=size, limit=FREE, time=stretch.begin)
-            steps = int(np.ceil(INSTANTS * stretch.duration / asked.horizon))
-            own = instants_of(part.t, part.joints[best], asked.weights, LOST[max(size, 0)], steps)
+            steps = int(np.ceil(settings.steps * stretch.duration / asked.horizon))
+            own = instants_of(part.t, part.joints[best], asked.weights, settings.lost[max(size, 0)], steps)
             times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
         if not times:
             words = f"the tasks have no part of {asked.horizon:g} s: the horizon is that much longer"
@@ -149,7 +160,7 @@ class TaskSearch:
             if not through or len(ends) > least:
                 wide = [end for end in ends if end < last and self._wide[end]]
                 if wide:
-                    inside = (np.arange(1, CUT) / CUT)[:, None]
+                    inside = (np.arange(1, self._settings.parts) / self._settings.parts)[:, None]
                     closer = self.times[wide] + inside * np.diff(self.times)[wide]
                     self._place(self._closer(closer.ravel()))
                     continue
@@ -162,7 +173,7 @@ class TaskSearch:
     @property
     def _wide(self) -> NDArray[np.bool_]:
         """Between which instants others can be put."""
-        return np.asarray(np.diff(self.times) > CLOSEST * self.asked.horizon)
+        return np.asarray(np.diff(self.times) > self._settings.closest * self.asked.horizon)
 
     def _closer(self, times: Array) -> list[Array]:
         """The instants of each stretch with others between them."""
@@ -173,8 +184,10 @@ class TaskSearch:
         if self._best is None:
             return False
         bounds, steps = self.asked.bounds, np.abs(np.diff(self._best, axis=0))
-        at_limit = np.minimum(self._best - bounds.lower, bounds.upper - self._best).min(axis=1) < AT_LIMIT
-        tight = (steps >= TIGHT * self._search.limits).any(axis=1) | at_limit[1:] | at_limit[:-1]
+        at_limit = (
+            np.minimum(self._best - bounds.lower, bounds.upper - self._best).min(axis=1) < self._settings.at_limit
+        )
+        tight = (steps >= self._settings.tight * self._search.limits).any(axis=1) | at_limit[1:] | at_limit[:-1]
         tight &= self._wide
         if not tight.any():
             return False
@@ -183,17 +196,11 @@ class TaskSearch:
 
     def _seeds(self, k: int) -> Array:
         """Postures at an instant, by closed forms and by inverse kinematics from random starts."""
-        asked, time = self.asked, float(self.times[k])
         sets, number = self._instants[k]
-        listed = sets.listed(number)
         try:
-            told: dict[str, Any] = {"seed": asked.seed + k, "limits": asked.limits.joints, "starts": STARTS}
-            found = postures_of(sets.equations, sets.targets[number], **told)
-            return np.vstack([listed, [one.joints for one in found]])
+            return sets.seeds(number, self.asked.limits.joints, self.asked.seed + k)
         except Unreachable as error:
-            if len(listed):
-                return listed
-            raise placed(asked, error, time) from error
+            raise placed(self.asked, error, float(self.times[k])) from error
 
     def followed(self, every: bool = False) -> list[Followed]:
         """The cheapest motion of each class through all stretches, as what a plan begins from.
@@ -204,12 +211,13 @@ class TaskSearch:
         ways = self._search.motions(self._known, every)
         if self._best is not None:
             ways.insert(0, self._best)
-        paths = [self._turned(path) for path in ways]
-        count, n = len(paths), asked.machine.joint_size
+        if asked.start is None:  # by whole turns, so that joints keep their limits
+            ways = [self.space.turned(path, asked.bounds.lower, asked.bounds.upper) for path in ways]
+        count, n = len(ways), asked.machine.joint_size
         for stretch in asked.stretches:
-            share = max(int(np.ceil(TOLD * stretch.duration / asked.horizon)), INSTANTS)
+            share = max(int(np.ceil(self._settings.told * stretch.duration / asked.horizon)), self._settings.steps)
             times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
-            rows = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in paths])
+            rows = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in ways])
             rows = rows.reshape(count, n, len(times)).transpose(0, 2, 1)
             if stretch.equations is not None:
                 on = self._sets(stretch.equations, times)
@@ -221,17 +229,6 @@ class TaskSearch:
             rates = np.concatenate([rates, rates[:, -1:]], axis=1)
             found.append(Followed(times, base, rows, rates, np.asarray(cost), none, none))
         return found
-
-    def _turned(self, path: Array) -> Array:
-        """A path moved by whole turns of joints so that it keeps their limits, where it can."""
-        bounds, path = self.asked.bounds, path.copy()
-        if self.asked.start is None:
-            for j in np.flatnonzero(
-                self.space.periodic & np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
-            ).tolist():
-                middle = (bounds.lower[j] + bounds.upper[j] - path[:, j].min() - path[:, j].max()) / 2
-                path[:, j] += TURN * np.round(middle / TURN)
-        return path
 
 
 def instants_of(t: Array, joints: Array, weights: Array, share: float, least: int) -> Array:

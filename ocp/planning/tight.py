@@ -9,6 +9,7 @@ its cost has.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -18,19 +19,29 @@ from models.arrays import Array
 from ocp.local.touching import distances_along
 from ocp.planning.charts import Instant
 from ocp.planning.steps import StepCost
+from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["DEAR", "drawn_tight"]
+__all__ = ["PENALTY", "TightSettings", "drawn_tight"]
 
-BESIDE = (0, 5, 2)
-"""Postures on either side, by the directions that are free."""
-DEAR = 1e6
-"""Cost of a rad or m by which a limit is passed."""
-INSIDE = 1e-6
-"""m: bodies are held apart by so much more than is asked."""
-MOVES = 10
-"""At most, before the postures come nearer to each other."""
-STILL = 1e-4
-"""Share of its cost by which a way at the edge has to get cheaper, or the postures come nearer."""
+PENALTY = 1e6
+"""Cost of a rad or m by which a limit is passed: beyond that of any way."""
+
+
+@dataclass(frozen=True)
+class TightSettings:
+    """How a way is drawn tight.
+
+    Attributes:
+        beside: Postures on either side, by the directions that are free.
+        inside: By so much more than is asked bodies are held apart, m.
+        moves: At most, before the postures come nearer to each other.
+        still: Share of its cost by which a way at the edge has to get cheaper, or the postures come nearer.
+    """
+
+    beside: tuple[int, int, int] = (0, 5, 2)
+    inside: float = CLEARANCE_TOLERANCE_M
+    moves: int = 10
+    still: float = 1e-4
 
 
 def drawn_tight(
@@ -42,6 +53,7 @@ def drawn_tight(
     bounds: tuple[Array, Array],
     around: Surroundings | None,
     widths: tuple[float, float],
+    settings: TightSettings = TightSettings(),
 ) -> Array:
     """A way beside another one that is cheaper, or keeps limits better. Shape (K, n).
 
@@ -60,7 +72,8 @@ def drawn_tight(
     if sizes not in ({1}, {2}):
         return path
     size = sizes.pop()
-    own, count = BESIDE[size], (2 * BESIDE[size] + 1) ** size
+    own = settings.beside[size]
+    count = (2 * own + 1) ** size
     shifts = np.array(list(product(np.arange(-own, own + 1.0), repeat=size)))
     rows = [(sets, np.flatnonzero([instant.sets is sets for instant in instants])) for sets in whole]
     number = np.array([instant.number for instant in instants])
@@ -73,32 +86,34 @@ def drawn_tight(
             on, fine = sets.corrected(np.repeat(number[those], count), flat.reshape(-1, flat.shape[2]))
             good[those] = fine.reshape(len(those), -1)
             beside[those] = np.where(good[those][:, :, None], on.reshape(flat.shape), flat)
-        wrong = np.where(good, _passed(beside, times, bounds, around), 1.0)
-        value, back = DEAR * wrong[0], []
+        wrong = np.where(good, _passed(beside, times, bounds, around, settings.inside), 1.0)
+        value, back = PENALTY * wrong[0], []
         for k in range(1, len(joints)):
             way = beside[k][None] - beside[k - 1][:, None]
             over = np.maximum(np.abs(way) - far[k - 1], 0.0).sum(axis=2)
-            steps = value[:, None] + cost.of(way, times[k] - times[k - 1]) + DEAR * over
+            steps = value[:, None] + cost.of(way, times[k] - times[k - 1]) + PENALTY * over
             back.append(steps.argmin(axis=0))
-            value = steps.min(axis=0) + DEAR * wrong[k]
+            value = steps.min(axis=0) + PENALTY * wrong[k]
         seats = [int(value.argmin())]
         for before in reversed(back):
             seats.append(int(before[seats[-1]]))
         joints = beside[np.arange(len(joints)), seats[::-1]]
         at_edge, now = np.abs(shifts[seats]).max() == own, float(value.min())
         moves += 1
-        if not (at_edge and now < least * (1 - STILL) and moves < MOVES):
+        if not (at_edge and now < least * (1 - settings.still) and moves < settings.moves):
             width, moves = width / 2, 0
         least = min(least, now)
     return joints
 
 
-def _passed(beside: Array, times: Array, bounds: tuple[Array, Array], around: Surroundings | None) -> Array:
+def _passed(
+    beside: Array, times: Array, bounds: tuple[Array, Array], around: Surroundings | None, inside: float
+) -> Array:
     """By how much postures (K, s, n) about a way pass limits and clearance at times (K,), rad and m. Shape (K, s)."""
     over = np.maximum(np.maximum(beside - bounds[1], bounds[0] - beside), 0.0).sum(axis=2)
     if around is None:
         return np.asarray(over)
-    least, middle, none = around.clearance + INSIDE, beside[:, beside.shape[1] // 2], np.zeros(0)
+    least, middle, none = around.clearance + inside, beside[:, beside.shape[1] // 2], np.zeros(0)
     span = np.abs(beside - middle[:, None]).max(axis=1) @ around.levers.joints.T
     apart = distances_along(around, none, middle, times, least + float(span.max(initial=0.0)))
     close = np.flatnonzero((apart - span < least).any(axis=1))  # beside the others nothing comes near

@@ -13,38 +13,54 @@ whose values are affine.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.planning.charts import Charts, JointSpace
-from ocp.planning.steps import Sheets, StepCost, Steps, Values, least_in_box, lowest_curvature
+from ocp.planning.charts import Charts
+from ocp.planning.joint_space import FARTHEST, JointSpace
+from ocp.planning.steps import Sheets, StepCost, Steps, Values
 
-__all__ = ["FARTHEST", "Graph"]
+__all__ = ["Graph", "GraphSettings"]
 
 Indices = NDArray[np.intp]
-LOOKED = 8
-"""Charts that are tried to go on to from a posture."""
-FARTHEST = 1e6
-"""rad or m: no step goes farther."""
-PAIRS = 200_000
-"""Places near enough for a step between two instants that are looked at together, about; a few of ten are steps."""
-SAMPLE = 64
-"""Charts by which it is estimated how many there are."""
-NEARER, LOWER = 2, 3
-"""Times that the least of a step in a box is looked at nearer, and places on the way to it each time."""
+
+
+@dataclass(frozen=True)
+class GraphSettings:
+    """How closely steps are looked at.
+
+    Attributes:
+        onward: Charts that are tried to go on to from a posture.
+        pairs: Places near enough for a step between two instants that are looked at together, about, by memory.
+        sample: Charts by which it is estimated how many there are.
+        nearer, lower: Times that the least of a step in a box is looked at nearer, and places on the way to it each
+            time: with fewer the least is told too low, and charts are halved that could be left out.
+    """
+
+    onward: int = 8
+    pairs: int = 200_000
+    sample: int = 64
+    nearer: int = 2
+    lower: int = 3
 
 
 class Graph:
     """The charts of all instants, and the steps between them that a motion may take."""
 
     def __init__(
-        self, space: JointSpace, layers: list[Charts], seconds: Array, cost: StepCost, limits: Array, most: Array
+        self,
+        space: JointSpace,
+        layers: list[Charts],
+        seconds: Array,
+        cost: StepCost,
+        limits: Array,
+        most: Array,
+        settings: GraphSettings = GraphSettings(),
     ) -> None:
         """
         Args:
@@ -54,9 +70,10 @@ class Graph:
             cost: Of a step.
             limits: How far the joints may go from each instant to the next. Shape (K - 1, n).
             most: What the step from each instant to the next may cost. Shape (K - 1,).
+            settings: How closely steps are looked at.
         """
         self.space, self.layers, self.seconds, self.cost, self.limits = space, layers, seconds, cost, limits
-        self.most = most
+        self.most, self.settings = most, settings
 
     @cached_property
     def sheets(self) -> list[Sheets]:
@@ -96,9 +113,9 @@ class Graph:
         way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
         way = min(way, FARTHEST)
         tree = self.space.tree(there.centers)
-        some = self.space.tree(here.centers[:: max(len(here) // SAMPLE, 1)])
+        some = self.space.tree(here.centers[:: max(len(here) // self.settings.sample, 1)])
         number = some.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST)) / some.n
-        share = max(16, int(PAIRS / max(number, 1.0)))
+        share = max(16, int(self.settings.pairs / max(number, 1.0)))
         for first in range(0, len(here), share):
             part = np.arange(first, min(first + share, len(here)))
             own = self.space.tree(here.centers[part])
@@ -130,17 +147,18 @@ class Graph:
             return
         into = there.of(chosen)
         costs, places = self.cost.cheapest(delta[chosen], into, after.of(chosen), seconds)
-        for i in np.argsort(costs, kind="stable")[:LOOKED].tolist():
+        for i in np.argsort(costs, kind="stable")[: self.settings.onward].tolist():
             yield replace(into.of([i]), centers=joints + delta[chosen[[i]]]), places[i]
 
     def _swept(self, order: range, direction: int, rest: list[Values] | None, most: float) -> list[Values]:
         layers = self.layers
         found: list[Any] = [None] * len(layers)
         first = order[0]
-        found[first] = none = _none(layers[first])
+        count, free = layers[first].low.shape
+        found[first] = Values.constant(np.zeros(count), free)
         if rest is not None:
             dear = self.least(rest[first], first) >= most
-            found[first] = none._replace(least=np.where(dear, np.inf, 0.0))
+            found[first] = Values.constant(np.where(dear, np.inf, 0.0), free)
         for k in order[1:]:
             found[k] = self._before(k, k - direction, found[k - direction], None if rest is None else rest[k], most)
         return found
@@ -152,7 +170,7 @@ class Graph:
         """
         here, there = self.layers[k], self.layers[other]
         seconds = float(self.seconds[min(k, other)])
-        found = _none(here)._replace(least=np.full(len(here), np.inf))
+        found = Values.constant(np.full(len(here), np.inf), here.low.shape[1])
         known = np.zeros(len(here)) if rest is None else self.least(rest, k)
         # steps that are nowhere the cheapest from their chart are left out: seen from far, then by their tangents
         here_spans, there_spans = here.spans, there.spans
@@ -178,7 +196,7 @@ class Graph:
             if not i.size:
                 continue
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _below_all(*_lowest(steps, here.of(i), starts), most - known[i[starts]])
+            parts = _below_all(steps, here.of(i), starts, most - known[i[starts]], self.settings)
             parts = self._raised(parts, here.of(i[starts]), floor[i[starts]])
             for whole, part in zip(found, parts, strict=True):
                 whole[i[starts]] = part
@@ -187,7 +205,7 @@ class Graph:
     @staticmethod
     def _raised(values: Values, charts: Charts, floor: Array) -> Values:
         """Values, or constants that are bounds, too, where these are higher in the middle and at the least together."""
-        least = values.least + least_in_box(values.slope, values.curve, charts.low, charts.high)[0]
+        least = values.lowest(charts.low, charts.high)[0]
         flat = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return Values(
             np.where(flat, floor, values.least),
@@ -197,8 +215,7 @@ class Graph:
 
     def least(self, values: Values, k: int) -> Array:
         """The least of values anywhere on the charts of an instant. Shape (N,)."""
-        charts = self.layers[k]
-        return np.asarray(values.least + least_in_box(values.slope, values.curve, charts.low, charts.high)[0])
+        return values.lowest(self.layers[k].low, self.layers[k].high)[0]
 
     def through(self, passed: list[Values], to_come: list[Values], k: int) -> Array:
         """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
@@ -206,18 +223,11 @@ class Graph:
         return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
 
 
-def _none(charts: Charts) -> Values:
-    """No cost at all."""
-    count, r = len(charts), charts.tangents.shape[2]
-    return Values(np.zeros(count), np.zeros((count, r)), np.zeros((count, r, r)))
-
-
 def _whole(steps: Steps, own: Charts, rest: Values) -> Array:
     """What steps from charts cost at least, with what is known of the rest. Shape (P,)."""
     middle, curve = (own.low + own.high) / 2, steps.curve
-    tangents = _tangents(middle, steps.at(middle), curve, np.zeros_like(curve))
-    both = Tangents(tangents.value + rest.least, tangents.slope + rest.slope)
-    return both.least(own, curve + rest.curve)
+    both = _tangents(middle, steps.at(middle), curve, -rest.curve, -rest.slope)
+    return rest.least + both.lowest(own.low, own.high)[0]
 
 
 def _least_of_groups(values: Array, group: Indices) -> Array:
@@ -226,33 +236,7 @@ def _least_of_groups(values: Array, group: Indices) -> Array:
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
 
-def _lowest(steps: Steps, own: Charts, starts: Indices) -> tuple[Steps, Charts, Indices]:
-    """Of steps as of `_below_all` those that are not above another one from the same chart in its whole box.
-
-    A tangent less what bends it down is concave, and a step's bound, but for what bends it down, lies below what is
-    interpolated from corner to corner: where the one is above the other at all corners it is so everywhere.
-    """
-    r = own.tangents.shape[2]
-    count = np.diff(np.append(starts, len(own)))
-    if not r or len(own) == len(starts):
-        return steps, own, starts
-    group = np.repeat(np.arange(len(starts)), count)
-    middle, half = (own.low + own.high) / 2, (own.high - own.low) / 2
-    value, slope = steps.at(middle)
-    best = np.lexsort((value, group))[starts]
-    down = np.minimum(lowest_curvature(steps.curve), 0.0) / 2 * (half**2).sum(axis=1)
-    known = steps.of(best)
-    above = np.ones(len(own), dtype=bool)
-    for signs in product((-1.0, 1.0), repeat=r):
-        corner = half * np.array(signs)
-        there = known.at(middle[best] + corner[best])[0] - down[best]
-        above &= value + (slope * corner).sum(axis=1) + down >= there[group]
-    above[best] = False
-    kept = np.flatnonzero(~above)
-    return steps.of(kept), own.of(kept), np.flatnonzero(np.diff(group[kept], prepend=-1))
-
-
-def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Values:
+def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array, settings: GraphSettings) -> Values:
     """A bound for each chart that steps go from, whose steps are together and begin at `starts`.
 
     Above `most`, of shape (M,), it is of no use.
@@ -269,74 +253,45 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array) -> Value
     heights = np.minimum(heights, most)
     curve += _sunk(heights - _pressed_all(curve, places, starts), half[starts], curve)
     common = curve[group]
-    tangents = [_tangents(place, one, curves, common) for place, one in zip(places, touching, strict=True)]
     values = np.stack([value - _pressed(common, place) for (value, _), place in zip(touching, places, strict=True)])
-    lowest = heights - _pressed_all(curve, places, starts)
-    slope = _rise([*lowest], half[starts])
+    slope = _rise([*(heights - _pressed_all(curve, places, starts))], half[starts])
     # how far above the linear functions the steps lie: by tangents at places where they are low
     lean, rows = slope[group], np.arange(len(own))
     seen = values - np.stack([(place * lean).sum(axis=1) for place in places])
     room, at = np.minimum.reduceat(seen.min(axis=0), starts)[group], seen.argmin(axis=0)
-    best = Tangents(*(np.stack(parts)[at, rows] for parts in zip(*tangents, strict=True))).leaning(lean)
-    bends = curves - common
-    least = best.least(own, bends)
-    for _ in range(NEARER):  # those that may be the least of their chart
+    lowest, value, rise = (np.stack(parts)[at, rows] for parts in (places, *zip(*touching, strict=True)))
+    best = _tangents(lowest, (value, rise), curves, common, lean)
+    least = best.lowest(own.low, own.high)[0]
+    for _ in range(settings.nearer):  # those that may be the least of their chart
         kept = np.flatnonzero(least[rows] < room[rows])
         rows, best = rows[kept], best.of(kept)
-        part, box, bend, leaning = steps.of(rows), own.of(rows), bends[rows], lean[rows]
-        place = best.lowest(box, bend)
-        for _ in range(LOWER):
-            place = part.lower(place, leaning, common[rows])
-        other = _tangents(place, part.at(place), curves[rows], common[rows]).leaning(leaning)
-        best, least[rows] = best.mixed(least[rows], other, box, bend)
+        part, box, level = steps.of(rows), own.of(rows), common[rows]
+        place = best.lowest(box.low, box.high)[1]
+        for _ in range(settings.lower):
+            place = part.lower(place, lean[rows], level)
+        other = _tangents(place, part.at(place), curves[rows], level, lean[rows])
+        best, least[rows] = _mixed(best, least[rows], other, box)
     least = np.minimum.reduceat(least, starts)
     return Values(least, slope, curve)
 
 
-class Tangents(NamedTuple):
-    """Functions value + slope . t + t . bend . t / 2 below others, those that touch these at places or means of such.
+def _mixed(best: Values, most: Array, other: Values, charts: Charts) -> tuple[Values, Array]:
+    """The mean with others, as curved, whose least is the largest, of those level along an axis; and that least.
 
-    What they bend, shape (P, r, r), is told apart: it is one for all that touch one function.
-
-    Attributes:
-        value: Shape (P,). slope: Shape (P, r).
+    The least of the first is the `most` that is known. Shape (P,).
     """
-
-    value: Array
-    slope: Array
-
-    def of(self, chosen: Any) -> Tangents:
-        """Some of them."""
-        return Tangents(self.value[chosen], self.slope[chosen])
-
-    def leaning(self, lean: Array) -> Tangents:
-        """Less lean . t, of shape (P, r)."""
-        return Tangents(self.value, self.slope - lean)
-
-    def least(self, charts: Charts, bend: Array) -> Array:
-        """The least in boxes. Shape (P,)."""
-        return np.asarray(self.value + least_in_box(self.slope, bend, charts.low, charts.high)[0])
-
-    def lowest(self, charts: Charts, bend: Array) -> Array:
-        """Where that is. Shape (P, r)."""
-        return least_in_box(self.slope, bend, charts.low, charts.high)[1]
-
-    def mixed(self, most: Array, other: Tangents, charts: Charts, bend: Array) -> tuple[Tangents, Array]:
-        """The mean with others whose least is the largest, of those level along an axis; and that least.
-
-        Their own least is the `most` that is known. Shape (P,).
-        """
-        best = self
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.clip(np.nan_to_num(-self.slope / (other.slope - self.slope)), 0.0, 1.0)
-        for share in (*shares.T, np.ones(len(most))):
-            value = self.value + share * (other.value - self.value)
-            mean = Tangents(value, self.slope + share[:, None] * (other.slope - self.slope))
-            least = mean.least(charts, bend)
-            better = least > most
-            best = Tangents(np.where(better, mean.value, best.value), np.where(better[:, None], mean.slope, best.slope))
-            most = np.maximum(most, least)
-        return best, most
+    first = best
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.clip(np.nan_to_num(-first.slope / (other.slope - first.slope)), 0.0, 1.0)
+    for share in (*shares.T, np.ones(len(most))):
+        least = first.least + share * (other.least - first.least)
+        mean = first._replace(least=least, slope=first.slope + share[:, None] * (other.slope - first.slope))
+        low = mean.lowest(charts.low, charts.high)[0]
+        better = low > most
+        slope = np.where(better[:, None], mean.slope, best.slope)
+        best = best._replace(least=np.where(better, mean.least, best.least), slope=slope)
+        most = np.maximum(most, low)
+    return best, most
 
 
 def _pressed(curve: Array, place: Array) -> Array:
@@ -348,12 +303,11 @@ def _pressed_all(curve: Array, places: list[Array], starts: Indices) -> Array:
     return np.stack([_pressed(curve, place[starts]) for place in places])
 
 
-def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array) -> Tangents:
-    """Of functions less t . common . t / 2, of such values and slopes at places, which bend by curve at least."""
+def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array, lean: Array) -> Values:
+    """Below functions less lean . t + t . common . t / 2, of such values and slopes at places, which bend by curve."""
     value, slope = values
-    return Tangents(
-        value - (place * slope).sum(axis=1) + _pressed(curve, place), slope - np.einsum("pab,pb->pa", curve, place)
-    )
+    at_origin = value - (place * slope).sum(axis=1) + _pressed(curve, place)
+    return Values(at_origin, slope - np.einsum("pab,pb->pa", curve, place) - lean, curve - common)
 
 
 def _sunk(values: Array, half: Array, curve: Array) -> Array:

@@ -10,9 +10,8 @@ pieces may be asked for (see `ocp.planning.reconfigurations`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,16 +23,19 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.clearance import clearance_of
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
-from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest, postures_of
+from ocp.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest
 from ocp.local.touching import Touch, distances_along, touches
-from ocp.planning.charts import TURN, Held, Instant, JointSpace, SelfMotions
-from ocp.planning.dead_end import KINDS, dead_end
+from ocp.planning.charts import Instant, SelfMotions
+from ocp.planning.dead_end import GiveKind, dead_end
+from ocp.planning.held import Held
+from ocp.planning.joint_space import TOLERANCE, JointSpace
 from ocp.planning.planner import clear_of
-from ocp.planning.reconfigurations import fewest_pieces
-from ocp.planning.search import FREE, Search, checked_bound
-from ocp.planning.sections import RADII, Sections, values_of
+from ocp.planning.reconfigurations import Piece, fewest_pieces
+from ocp.planning.search import FREE, Search, SearchSettings, checked_bound
+from ocp.planning.sections import Sections, SectionSettings, values_of
 from ocp.planning.steps import Homogeneous, Largest, Length
 from ocp.planning.tight import drawn_tight
+from ocp.planning.waypoint_plan import WaypointPlan
 from ocp.tasks.checks import checked_numbers
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
@@ -44,85 +46,51 @@ __all__ = ["Reconfigurations", "WayCost", "WaypointPlan", "plan_waypoints"]
 WayCost: TypeAlias = Literal["length", "largest", "time"]
 Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
-EVERY = 5
-"""Of so many waypoints one is searched whole; more where none of the ways found goes through all."""
 WAYPOINT = "waypoint {:g}"
 POSTURES = "postures"
 """What an error is about where there are more than memory is for."""
 NONE_FOUND = "no way through the waypoints keeps all limits"
-STARTS = 16
-"""Random starts of inverse kinematics at each of these."""
-SPARSE = (10, 5)
-"""Likewise where two directions are free; the second where no way found by the first goes through all."""
-FEW = 6
-"""Steps from one waypoint that is searched to the next, where short ways are looked for."""
-INSTANTS = 20
-"""Waypoints that are searched then, about, where there are so many, and more where there are many."""
-SPACED = 4 * RADII[1]
-"""rad or m: how far each joint may go from one of these to the next, at least."""
-DRAWN = 2
-"""Ways that are drawn tight then, the cheapest first."""
-WIDTH, TIGHT = 0.06, 1e-6
-"""rad or m, between postures beside a way that is drawn tight, at first and at last."""
-MISSED = 1e-6
-"""m and rad: poses are met up to this."""
-WHOLE = 1e-9
-"""rad or m: limits are kept up to this."""
 
 
-Searched = TypeVar("Searched", bound=Search)
-
-
-@dataclass(frozen=True, eq=False)
-class WaypointPlan:
-    """A way through waypoints.
+@dataclass(frozen=True)
+class WaypointSettings:
+    """Which waypoints are searched, and how ways through all are drawn beside those that are found.
 
     Attributes:
-        machine: What moves.
-        joints: At the waypoints. Shape (N, n), rad or m.
-        cost: Of the way, without what lies in reconfigurations.
-        bound: Of the cost of any way through the waypoints, in no more pieces; 0 where none is known.
-        ways: Costs of all ways that were found, and why they are not the plan.
-        between: How near bodies come on straight lines of the joints from waypoint to waypoint, proven; its times are
-            numbers of waypoints. None where nothing was to be looked at. Reconfigurations are left out.
-        reconfigurations: Numbers of the waypoints from which the arm comes to the next one in another posture, by a way
-            that is not planned.
+        stride: With at most one free direction one of so many waypoints is searched, then one of half as many, where
+            none of the ways found goes through all.
+        few: Steps between the waypoints that are searched first with two free directions, where short ways are seen.
+        steps: Steps between those that are searched next, about, where there are so many ...
+        strides: ... but one of so many at least, and one of so many where no way goes through all.
+        drawn: Ways of a search that are drawn tight, the cheapest first.
+        search, sections: Of the searches with at most one free direction, and with two.
+        widths: Between postures beside a way that is drawn tight, at first and at last, rad or m.
+        missed: By which poses may be, m and rad: what the last width leaves.
     """
 
-    machine: FixedBase
-    joints: Array
+    stride: int = 5
+    few: int = 6
+    steps: int = 20
+    strides: tuple[int, int] = (10, 5)
+    drawn: int = 2
+    widths: tuple[float, float] = (0.06, 1e-6)
+    missed: float = 1e-6
+    search: SearchSettings = field(default_factory=SearchSettings)
+    sections: SectionSettings = field(default_factory=SectionSettings)
+
+
+class _Way(NamedTuple):
+    """Joints (N, n) through all waypoints beside what a search found, what is wrong with them, and where.
+
+    Attributes:
+        after: The waypoints after which the arm reconfigures.
+    """
+
     cost: float
-    bound: float
-    ways: tuple[tuple[float, str], ...] = ()
-    between: Clearance | None = None
-    reconfigurations: tuple[int, ...] = ()
-
-    @property
-    def steps(self) -> Array:
-        """Largest way of each joint from one waypoint to the next, but for reconfigurations. Shape (n,), rad or m."""
-        ways = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
-        return np.asarray(ways.max(axis=0, initial=0.0))
-
-    def __repr__(self) -> str:
-        return (
-            f"<WaypointPlan through {len(self.joints)} waypoints: cost {self.cost:.6g}, at least {self.bound:.6g} any>"
-        )
-
-    def __str__(self) -> str:
-        lines = [
-            f"way through {len(self.joints)} waypoints of {', '.join(self.machine.robot.joint_names)}: "
-            f"cost {self.cost:.6g}, at least {self.bound:.6g} any"
-        ]
-        if self.reconfigurations:
-            places = ", ".join(map(str, self.reconfigurations))
-            count = f"{len(self.reconfigurations)} time{'s' if len(self.reconfigurations) > 1 else ''}"
-            lines.append(f"  the arm reconfigures {count}, after waypoint {places}")
-        if self.between is not None and self.between.worst is not None:
-            near = self.between.worst
-            how = "too near" if near.missed else "proven clear, the nearest"
-            apart = f"{near.distance:.4g} m apart, {near.asked:g} m asked, at waypoint {near.time:.4g}"
-            lines.append(f"  straight between waypoints {how}: {' and '.join(near.bodies)}, {apart}")
-        return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.ways])
+    why: str
+    wrong: NDArray[np.intp]
+    joints: Array
+    after: tuple[int, ...] = ()
 
 
 @interruptible
@@ -209,7 +177,9 @@ class _Ways:
         limits: Limits,
         around: Surroundings | None,
         seed: int,
+        settings: WaypointSettings = WaypointSettings(),
     ) -> None:
+        self.settings = settings
         self.machine, self.places, self.turns, self.step, self.around = machine, places, turns, step, around
         self.seed, self.kept, self.cost = seed, limits.joints, cost
         bounds = limits.bounds(machine)
@@ -228,95 +198,72 @@ class _Ways:
             words = f"{machine.robot.name}: {int((~free.idle).sum())} joints for the {free.size} rows of a pose"
             words += f"; hold joints until at most {FREE} are left over"
             raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
+        # with two free directions it is held that is nearest to the base: it moves all others
+        robot = machine.robot
+        names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
+        self._held = robot.joint_names.index(names[0]) if self.sets.size > 1 else None
 
-    def plan(self, in_pieces: bool) -> WaypointPlan:
-        if in_pieces and self.sets.size > 1:
+    def plan(self, counted: bool) -> WaypointPlan:
+        """The cheapest way that goes on through all waypoints; in the fewest pieces where that is asked for.
+
+        Some waypoints are searched, what is found is drawn tight through all, and more are searched where that goes
+        wrong: those where it does, and closer ones.
+        """
+        if counted and self.sets.size > 1:
             words = f"reconfigurations are counted with one free direction at most, not with {self.sets.size}"
             raise ProblemError(words, name="reconfigurations", value=self.sets.size, limit=1)
-        if self.sets.size > 1:
-            return self._made(self._by_sections(), 0.0)
-        every, bound, ways = EVERY, 0.0, list[tuple[float, str, Array]]()
-        search, chosen = self._begun(self._search, every)
+        strides, looks = self._strides()
+        search = self._begun(strides.pop(0))
+        assert search is not None
+        ways, bound, cut = list[_Way](), 0.0, False
         while True:
-            best, least = search.best(np.inf)
-            if not np.isfinite(least):
-                if in_pieces:
-                    return self._in_pieces(search, chosen)
-                raise self._ended(search, chosen)
-            bound = max(bound, least)
-            if best is not None:
-                ways.append(self._drawn(chosen, best))
-            if any(not why for _, why, _ in ways) or len(chosen) == len(self.places):
+            chains, least = self._chains(search, cut)
+            if np.isfinite(least):
+                bound = least if cut else max(bound, least)
+                drawn = [self._drawn(search, chain) for chain in chains[: self.settings.drawn]]
+                ways = drawn if cut else ways + drawn
+                looks -= 1
+                if any(not way.why for way in ways) and (looks <= 0 or not strides):
+                    return self._made(ways, bound)
+                closer = self._closer(search, ways[-1]) if chains else None
+                while closer is None and strides and not cut:
+                    closer = self._begun(strides.pop(0), search)
+                if closer is not None:
+                    search = closer
+                    continue
+            if cut or not counted:
                 break
-            # what is cheapest through some waypoints does not go through all: those where it is wrong are searched, too
-            more = chosen if best is None else np.union1d(chosen, self._wrong(ways[-1][2])[1])
-            if len(more) == len(chosen):
-                every = max(every // 2, 1)
-                more = np.union1d(chosen, self._every(every))
-            try:
-                search, chosen = self._search(more), more
-            except ProblemError as error:
-                if error.name != POSTURES:
-                    raise
-                break
-        if in_pieces and all(why for _, why, _ in ways):
-            return self._in_pieces(search, chosen)
-        if not ways:
-            raise dead_end(search, WAYPOINT, proven=False) or SolveError(NONE_FOUND, name="waypoints")
+            cut = True
+        if not np.isfinite(least):
+            raise self._ended(search)
+        if not chains and all(way.why for way in ways):
+            ways += self._rescued(search)
         return self._made(ways, bound)
 
-    def _made(self, ways: list[tuple[float, str, Array]], bound: float) -> WaypointPlan:
+    def _chains(self, search: Search, cut: bool) -> tuple[list[list[Piece]], float]:
+        """Motions through the waypoints that are searched, each in its pieces, and what none costs less than."""
+        if cut:
+            found = fewest_pieces(search)
+            return ([], np.inf) if found is None else ([found[0]], found[1])
+        paths, bound = search.ways()
+        return [[Piece(0, len(path) - 1, path, search.steps(path), bound)] for path in paths], bound
+
+    def _made(self, ways: list[_Way], bound: float) -> WaypointPlan:
         """The plan of the cheapest way that keeps all limits.
 
         Raises:
             SolveError: None does.
         """
-        ways.sort(key=lambda one: (bool(one[1]), one[0]))
-        length, why, joints = ways[0]
-        if why:
-            reasons = "; ".join(dict.fromkeys(why for _, why, _ in ways))
-            raise SolveError(f"{NONE_FOUND}: {reasons}", name="waypoints")
-        listed = tuple((cost, why or ("" if k == 0 else "dearer")) for k, (cost, why, _) in enumerate(ways))
-        least = checked_bound(bound, length) or 0.0
-        return WaypointPlan(self.machine, joints, length, least, listed, self._between(joints))
+        ways = sorted(ways, key=lambda way: (bool(way.why), way.cost))
+        if not ways or ways[0].why:
+            reasons = "; ".join(dict.fromkeys(way.why for way in ways))
+            raise SolveError(f"{NONE_FOUND}{reasons and ': '}{reasons}", name="waypoints")
+        best = ways[0]
+        listed = tuple((way.cost, way.why or ("" if way is best else "dearer")) for way in ways)
+        least, between = checked_bound(bound, best.cost) or 0.0, self._between(best.joints, best.after)
+        return WaypointPlan(self.machine, best.joints, best.cost, least, listed, between, best.after)
 
-    def _begun(self, make: Callable[[NDArray[np.intp]], Searched], every: int) -> tuple[Searched, NDArray[np.intp]]:
-        """A search of one of so many waypoints, of fewer where that were more postures than memory is for."""
-        while True:
-            chosen = self._every(every)
-            try:
-                return make(chosen), chosen
-            except ProblemError as error:
-                if error.name != POSTURES or len(chosen) == 2:
-                    raise
-            every *= 2
-
-    def _in_pieces(self, search: Search, chosen: NDArray[np.intp]) -> WaypointPlan:
-        """The cheapest way with the fewest reconfigurations, seen from waypoints that are searched already."""
-        while True:
-            found = fewest_pieces(search)
-            if found is None:
-                raise self._ended(search, chosen)
-            pieces, bound = found
-            breaks = [(int(chosen[piece.last]), int(chosen[piece.last + 1])) for piece in pieces[:-1]]
-            # a reconfiguration lies between two waypoints, and what is drawn between others has to be right
-            more = np.union1d(chosen, np.concatenate([chosen, *(np.arange(*pair) for pair in breaks)]))
-            if len(more) == len(chosen):
-                parts = [self._drawn(chosen[piece.first : piece.last + 1], piece.joints)[2] for piece in pieces]
-                joints, after = np.concatenate(parts), tuple(one for one, _ in breaks)
-                why, wrong = self._wrong(joints, after)
-                more = np.union1d(chosen, wrong)
-                if not why:
-                    length = self._length(joints, after)
-                    ways, between = ((length, ""),), self._between(joints, after)
-                    least = checked_bound(bound, length) or 0.0
-                    return WaypointPlan(self.machine, joints, length, least, ways, between, after)
-                if len(more) == len(chosen):
-                    raise SolveError(f"no way in {len(pieces)} pieces keeps all limits: {why}", name="waypoints")
-            chosen = more
-            search = self._search(chosen)
-
-    def _between(self, joints: Array, breaks: tuple[int, ...] = ()) -> Clearance | None:
+    def _between(self, joints: Array, breaks: tuple[int, ...]) -> Clearance | None:
         """What is proven of straight lines from waypoint to waypoint, one of each a second, but for breaks."""
         if self.around is None:
             return None
@@ -332,90 +279,117 @@ class _Ways:
 
         return clearance_of(self.around, along, numbers / last, last, rates, np.zeros_like(rates), False)
 
-    def _every(self, every: int) -> NDArray[np.intp]:
-        """One of so many waypoints, the first and the last as well."""
-        count = len(self.places)
-        return np.unique(np.linspace(0, count - 1, -(-(count - 1) // every) + 1).round().astype(int))
+    # ---- which waypoints are searched ----------------------------------------------------------------------------
 
-    def _by_sections(self) -> list[tuple[float, str, Array]]:
-        """Ways beside the cheapest found by sections, in which the joint nearest to the base, that moves all others, is
-        held.
-
-        Raises:
-            SolveError: None leads through the waypoints that were searched.
-        """
-        robot, found = self.machine.robot, list[tuple[float, str, Array]]()
-        names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
-        held = robot.joint_names.index(names[0])
-        low, high = self.lower[held], self.upper[held]
-        slides = robot.moving_joints[held].kind == "prismatic"
-
-        def sections(chosen: NDArray[np.intp], radius: float = RADII[1]) -> Sections:
-            space, instants, times, cost, far = self._searched(chosen)
-            values = values_of(slides, low, high, float(far[:, held].min()))
-            told = self._told(chosen)
-            return Sections(space, instants, times, cost, far, joint=held, values=values, radius=radius, **told)
-
-        # ways with short steps are seen in finer charts, at few waypoints
-        search, chosen = self._begun(lambda some: sections(some, RADII[0]), -(-len(self.places) // FEW))
-        found += [self._drawn(chosen, path) for path in search.ways()[:1]]
+    def _strides(self) -> tuple[list[int], int]:
+        """One of how many waypoints is searched, one after the other, and how many of these searches always."""
+        settings, count = self.settings, len(self.places)
+        if self._held is None:
+            halves = int(np.log2(settings.stride)) + 1
+            return [settings.stride // 2**k for k in range(halves)], 1
         # steps from one curve to the next are no shorter than between charts
-        least = int(np.ceil(min(SPACED / np.delete(self.step, held).min(), len(self.places))))
-        for every in SPARSE:
-            search, chosen = self._begun(sections, max(min(every, len(self.places) // INSTANTS), least, 1))
-            paths, end = search.ways(), None
-            if not paths and any(not why for _, why, _ in found):
-                break
-            if not paths and (empty := [k for k, charts in enumerate(search.covered) if not len(charts)]):
-                at, name = float(chosen[empty[0]]), robot.joint_names[held]
-                words = f"{NONE_FOUND}: none was found at waypoint {at:g} with {name!r} where it was held"
-                end = SolveError(words, name=name, time=at)
-            elif not paths:
-                end = dead_end(search, WAYPOINT, proven=False)
-                gives = () if end is None else end.gives
-                paths = [one.joints for one in gives if one.kind in KINDS and one.amount <= MISSED]
-            found += [self._drawn(chosen, path) for path in paths[:DRAWN]]
-            if any(not why for _, why, _ in found):
-                break
-            if not paths:
-                raise end or SolveError(NONE_FOUND, name="waypoints")
-        return found
+        least = min(4 * settings.sections.radii[1] / np.delete(self.step, self._held).min(), count)
+        some = (max(min(each, count // settings.steps), int(np.ceil(least)), 1) for each in settings.strides)
+        return [-(-count // settings.few), *some], 2
 
-    def _search(self, chosen: NDArray[np.intp]) -> Search:
-        """Of the postures at some waypoints."""
-        return Search(*self._searched(chosen), **self._told(chosen))
+    def _begun(self, stride: int, known: Search | None = None) -> Search | None:
+        """A search of one of so many waypoints, of fewer where that were more postures than memory is for.
 
-    def _searched(self, chosen: NDArray[np.intp]) -> tuple[Any, ...]:
-        """What a search of some waypoints takes."""
-        sets = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen])
+        None where these are no more than those of a search that is known.
+        """
+        last, before = len(self.places) - 1, 1 if known is None else len(known.times)
+        while True:
+            chosen = np.unique(np.linspace(0, last, -(-last // stride) + 1).round().astype(int))
+            if known is not None and self._held is None:
+                chosen = np.union1d(chosen, known.times.astype(int))
+            if len(chosen) <= before:
+                return None
+            try:
+                return self._search(chosen, known is not None)
+            except ProblemError as error:
+                if error.name != POSTURES or len(chosen) == 2:
+                    raise
+            stride *= 2
+
+    def _closer(self, search: Search, way: _Way | None) -> Search | None:
+        """A search of the waypoints where a way is wrong as well; None where that are no more, or too many."""
+        chosen = search.times.astype(int)
+        if way is None or self._held is not None or np.isin(way.wrong, chosen).all():
+            return None
+        try:
+            return self._search(np.union1d(chosen, way.wrong))
+        except ProblemError as error:
+            if error.name != POSTURES:
+                raise
+            return None
+
+    def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> Search:
+        """Of all postures at some waypoints; with two free directions of those on some curves."""
+        sets, far = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen]), np.diff(chosen)[:, None]
+        told: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "surroundings": self.around}
         instants = [Instant(sets, k) for k in range(len(chosen))]
-        return self.space, instants, chosen.astype(float), self.cost, np.diff(chosen)[:, None] * self.step
+        held = self._held
+        given = self.space, instants, chosen.astype(float), self.cost, far * self.step
+        if held is None:
+            return Search(*given, **told, settings=self.settings.search)
+        slides = self.machine.robot.moving_joints[held].kind == "prismatic"
+        own, limit = self.settings.sections, float((far * self.step)[:, held].min())
+        curves: dict[str, Any] = {"radius": own.radii[coarse], "charts": own.charts}
+        curves["values"] = values_of(slides, self.lower[held], self.upper[held], limit, own)
+        return Sections(*given, **told, **curves, joint=held)
 
-    def _told(self, chosen: NDArray[np.intp]) -> dict[str, Any]:
-        return {"seeds": lambda k: self._seeds(int(chosen[k])), "surroundings": self.around}
-
-    def _ended(self, search: Search, chosen: NDArray[np.intp]) -> SolveError:
+    def _ended(self, search: Search) -> SolveError:
         """Where no way goes on, at first seen from the waypoints that were searched, then from each of those there."""
-        end = dead_end(search, WAYPOINT)
+        end, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if end is None:
             return SolveError("no way goes through the waypoints", name="waypoints")
         assert end.time is not None
         closer = np.union1d(chosen, np.arange(int(end.time), int(end.until) + 1))
         return (None if len(closer) == len(chosen) else dead_end(self._search(closer), WAYPOINT)) or end
 
-    def _drawn(self, chosen: NDArray[np.intp], path: Array) -> tuple[float, str, Array]:
-        """A way through all waypoints beside one through some of them, from the first of these to the last.
+    def _rescued(self, search: Search) -> list[_Way]:
+        """What comes through though no way was found: a motion that gives way, by nothing that counts.
 
-        Returns:
-            Its length, what is wrong with it where it goes through all there are, and its joints.
+        Raises:
+            SolveError: None does.
         """
-        times = np.arange(chosen[0], chosen[-1] + 1.0)
-        numbers = [Instant(self.sets, k) for k in range(int(chosen[0]), int(chosen[-1]) + 1)]
-        far, bounds = np.repeat(self.step[None], len(numbers) - 1, axis=0), (self.lower, self.upper)
-        start = self._through(chosen, path)
-        joints = drawn_tight(start, numbers, self.cost, times, far, bounds, self.around, (WIDTH, TIGHT))
-        whole = len(joints) == len(self.places)
-        return self._length(joints), self._wrong(joints)[0] if whole else "", joints
+        empty = [float(time) for time, charts in zip(search.times, search.covered, strict=True) if not len(charts)]
+        if empty and self._held is not None:
+            name = self.machine.robot.joint_names[self._held]
+            words = f"{NONE_FOUND}: none was found at waypoint {empty[0]:g} with {name!r} where it was held"
+            raise SolveError(words, name=name, time=empty[0])
+        end = dead_end(search, WAYPOINT, proven=False)
+        if end is None:
+            return []
+        of_pose = [give for give in end.gives if give.kind is not GiveKind.CLEARANCE]
+        paths = [give.joints for give in of_pose if give.amount <= self.settings.missed]
+        if not paths:
+            raise end
+        return [self._drawn(search, [Piece(0, len(path) - 1, path, search.steps(path), 0.0)]) for path in paths]
+
+    # ---- ways through all waypoints ------------------------------------------------------------------------------
+
+    def _drawn(self, search: Search, chain: list[Piece]) -> _Way:
+        """A way through all waypoints beside pieces through some of them.
+
+        It is wrong where it reconfigures between two that are no neighbours, whatever comes of the rest.
+        """
+        chosen = search.times.astype(int)
+        breaks = [(int(chosen[piece.last]), int(chosen[piece.last + 1])) for piece in chain[:-1]]
+        joints, after = self._through(chosen, chain), tuple(one for one, _ in breaks)
+        if wide := [np.arange(*pair) for pair in breaks if pair[1] > pair[0] + 1]:
+            return _Way(np.inf, "it reconfigures between waypoints", np.concatenate(wide), joints, after)
+        parts = []
+        for piece in chain:
+            rows = slice(int(chosen[piece.first]), int(chosen[piece.last]) + 1)
+            instants = [Instant(self.sets, k) for k in range(len(self.places))[rows]]
+            far, bounds = np.repeat(self.step[None], len(instants) - 1, axis=0), (self.lower, self.upper)
+            times = np.arange(len(self.places), dtype=float)[rows]
+            told = self.cost, times, far, bounds, self.around, self.settings.widths
+            parts.append(drawn_tight(joints[rows], instants, *told))
+        joints = np.concatenate(parts)
+        steps = np.delete(self.cost.of(np.diff(joints, axis=0), 1.0), list(after))
+        return _Way(float(steps.sum()), *self._wrong(joints, after), joints, after)
 
     def _task(self, number: int) -> TipTask:
         return TipTask(position=self.places[number], orientation=self.turns[number])
@@ -427,40 +401,33 @@ class _Ways:
         return self._known[number]
 
     def _sought(self, number: int) -> Array:
-        listed = self.sets.listed(number)
         try:
-            told: dict[str, Any] = {"seed": self.seed + number, "limits": self.kept, "starts": STARTS}
-            found = postures_of(self.sets.equations, self.sets.targets[number], **told)
+            return self.sets.seeds(number, self.kept, self.seed + number)
         except Unreachable as error:
-            if len(listed):
-                return listed
             words = f"waypoint {number} at {self.places[number].round(6).tolist()} m: {error}"
             raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
-        return np.vstack([listed, [one.joints for one in found]])
 
-    def _through(self, chosen: NDArray[np.intp], path: Array) -> Array:
-        """Joints at all waypoints, (N, n), from the first of some to the last, turned within the limits."""
-        numbers = np.arange(chosen[0], chosen[-1] + 1)
+    def _through(self, chosen: NDArray[np.intp], chain: list[Piece]) -> Array:
+        """Joints at all waypoints, (N, n), beside pieces through some of them, each turned within the limits."""
+        numbers = np.arange(len(self.places))
+        path = np.concatenate([piece.joints for piece in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
         on, good = self.sets.corrected(numbers, joints)
         joints[good] = on[good]
-        for j in np.flatnonzero(self.space.periodic & np.isfinite(self.lower) & np.isfinite(self.upper)).tolist():
-            middle = (self.lower[j] + self.upper[j] - joints[:, j].min() - joints[:, j].max()) / 2
-            joints[:, j] += TURN * np.round(middle / TURN)
+        for piece in chain:
+            rows = slice(int(chosen[piece.first]), int(chosen[piece.last]) + 1)
+            joints[rows] = self.space.turned(joints[rows], self.lower, self.upper)
         return joints
 
-    def _length(self, joints: Array, breaks: tuple[int, ...] = ()) -> float:
-        return float(np.delete(self.cost.of(np.diff(joints, axis=0), 1.0), list(breaks)).sum())
-
-    def _wrong(self, joints: Array, breaks: tuple[int, ...] = ()) -> tuple[str, NDArray[np.intp]]:
+    def _wrong(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
         """What limit a way does not keep, "" if none, and the waypoints where it keeps one not, or is off."""
         names, numbers = self.machine.robot.joint_names, np.arange(len(joints))
         error = np.abs(self.sets.linearised(numbers, joints)[0]).max(axis=1)
         over = np.maximum(joints - self.upper, self.lower - joints)
         steps = np.abs(np.diff(joints, axis=0)) - self.step
         steps[list(breaks)] = -self.step
-        far = (steps > WHOLE).any(axis=1)
-        wrong = (error > MISSED) | (over > WHOLE).any(axis=1)
+        far = (steps > TOLERANCE).any(axis=1)
+        wrong = (error > self.settings.missed) | (over > TOLERANCE).any(axis=1)
         wrong[:-1] |= far
         wrong[1:] |= far
         near: NDArray[np.bool_] = np.zeros(len(joints), dtype=bool)
@@ -470,9 +437,9 @@ class _Ways:
                 (distances_along(self.around, np.zeros(0), joints, times, clearance) < clearance).any(axis=1)
             )
         words = ""
-        if error.max() > MISSED:
+        if error.max() > self.settings.missed:
             words = f"waypoint {int(error.argmax())} is missed by {error.max():.2g} m or rad"
-        elif over.max() > WHOLE:
+        elif over.max() > TOLERANCE:
             k, j = np.unravel_index(int(over.argmax()), over.shape)
             words = f"joint {names[j]!r} passes its limit by {over.max():.2g} at waypoint {k}"
         elif far.any():

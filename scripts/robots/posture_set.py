@@ -22,7 +22,8 @@ from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned
 from ocp.app.frames import frames_along
-from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import Charts, Instant, SelfMotions
+from ocp.planning.joint_space import JointSpace
 from ocp.planning.search import Search
 from ocp.planning.steps import Squares
 from ocp.tasks.equations import bind

@@ -26,7 +26,8 @@ from models.paths import rest_to_rest
 from ocp import Audit, Limits, Plan, PlanInPieces, Reconfiguration, TipTask, inverse_kinematics, plan_in_pieces
 from ocp.app.frames import frames_along
 from ocp.app.rendering import tube
-from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import Charts, Instant, SelfMotions
+from ocp.planning.joint_space import JointSpace
 from ocp.planning.search import Search
 from ocp.planning.steps import Squares
 from ocp.planning.value import Graph

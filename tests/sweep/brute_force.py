@@ -17,7 +17,8 @@ import numpy as np
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.local.inverse_kinematics import Unreachable
-from ocp.planning.charts import TURN, Instant, JointSpace, SelfMotions
+from ocp.planning.charts import Instant, SelfMotions
+from ocp.planning.joint_space import TURN, JointSpace
 from ocp.planning.search import Search
 from ocp.planning.steps import Length, Squares, StepCost
 from ocp.tasks.equations import bind

@@ -12,7 +12,8 @@ import pytest
 from models import FixedBase, Joint, Link, Robot
 from models.arrays import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
-from ocp.planning.charts import Charts, JointSpace, SelfMotions
+from ocp.planning.charts import Charts, SelfMotions
+from ocp.planning.joint_space import JointSpace
 from ocp.tasks.equations import bind
 from tests.ocp.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 

@@ -16,7 +16,8 @@ from models.arrays import Array
 from models.robot.rebuild import locked
 from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
 from ocp.local.closed_forms import closed_forms
-from ocp.planning.charts import Instant, JointSpace, SelfMotions
+from ocp.planning.charts import Instant, SelfMotions
+from ocp.planning.joint_space import JointSpace
 from ocp.planning.reconfigurations import farthest, fewest_pieces
 from ocp.planning.search import Search
 from ocp.planning.steps import Length

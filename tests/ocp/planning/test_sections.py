@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import casadi as ca
@@ -15,8 +15,10 @@ from models import Box, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import locked
 from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
-from ocp.planning import search, sections, waypoints
-from ocp.planning.sections import APART, VALUES, values_of
+from ocp.planning import waypoints
+from ocp.planning.search import SearchSettings
+from ocp.planning.sections import SectionSettings, values_of
+from ocp.planning.waypoints import WaypointSettings
 from tests.redundancy_benchmark import problem_of
 
 STEP = 0.1
@@ -27,11 +29,11 @@ STEP = 0.1
 def test_values_are_no_farther_apart_than_a_step_and_reach_the_limits(
     slides: bool, low: float, far: float, step: float
 ) -> None:
-    values, most = values_of(slides, low, low + far, step), min(APART[slides], step)
+    values, most = values_of(slides, low, low + far, step), min(SectionSettings().apart[not slides], step)
     ends = np.clip((low, low + far), -np.pi, np.pi)
     gap = float(np.diff(values).max(initial=0.0))
-    assert gap <= most * (1 + 1e-9) or len(values) >= VALUES - 1
-    assert len(values) <= VALUES
+    assert gap <= most * (1 + 1e-9) or len(values) >= SectionSettings().values - 1
+    assert len(values) <= SectionSettings().values
     assert values[0] == ends[0]
     if slides or np.ptp(ends) < 2 * np.pi - 1e-6:
         assert values[-1] == pytest.approx(ends[1])
@@ -59,6 +61,12 @@ def task(count: int) -> tuple[Array, Array]:
 def planned(count: int, **told: Any) -> WaypointPlan:
     machine = problem_of("fetch__square").machine
     return plan_waypoints(machine, *task(count), clearance=None, step=STEP * 39 / (count - 1), **told)
+
+
+def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Memory for so many charts."""
+    own = WaypointSettings(search=SearchSettings(charts=count), sections=SectionSettings(charts=count))
+    monkeypatch.setattr(waypoints, "_Ways", partial(waypoints._Ways, settings=own))
 
 
 def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_held() -> None:
@@ -104,11 +112,11 @@ def test_more_waypoints_of_one_path_change_little(count: int) -> None:
 def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(sections, "MOST", 4000)
+    limit_charts(monkeypatch, 4000)
     machine = problem_of("fetch__square").machine
     found = plan_waypoints(machine, *task(40), clearance=None, step=STEP)
     assert found.cost == pytest.approx(planned(40).cost, rel=0.1)
-    monkeypatch.setattr(sections, "MOST", 10)
+    limit_charts(monkeypatch, 10)
     with pytest.raises(ProblemError) as refused:
         plan_waypoints(machine, *task(40), clearance=None, step=STEP)
     assert refused.value.name == "postures"
@@ -167,7 +175,7 @@ def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: p
     machine = problem_of("fetch_arm__s").machine
     told: dict[str, Any] = {"clearance": None, "step": STEP}
     found = plan_waypoints(machine, *task(40), **told)
-    monkeypatch.setattr(search, "MOST", 1000)  # there are some 300 at each of 9 waypoints
+    limit_charts(monkeypatch, 1000)  # there are some 300 at each of 9 waypoints
     again = plan_waypoints(machine, *task(40), **told)
     assert again.cost == pytest.approx(found.cost, rel=0.02)
     assert again.bound <= again.cost

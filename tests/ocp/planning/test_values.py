@@ -13,10 +13,11 @@ import pytest
 from models import FixedBase
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.planning.charts import Charts, Instant, JointSpace, SelfMotions, _rim
+from ocp.planning.charts import Charts, Instant, SelfMotions, _rim
+from ocp.planning.joint_space import JointSpace
 from ocp.planning.search import Search
 from ocp.planning.steps import Largest, Length, Sheets, Squares, StepCost, Values, least_in_box
-from ocp.planning.value import _below_all, _lowest, _rise, _whole
+from ocp.planning.value import GraphSettings, _below_all, _rise, _whole
 from ocp.tasks.equations import bind
 from tests.ocp.planning.test_charts import planar
 
@@ -287,30 +288,6 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
 
 
 @pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
-def test_steps_that_are_left_out_are_nowhere_the_cheapest(kind: Any, free: int) -> None:
-    rng = np.random.default_rng(7)
-    groups, each, n, seconds, half = 12, 40, 4, 0.7, 0.2
-    count = groups * each
-    weights = rng.uniform(0.5, 2.0, n)
-    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
-    out = flat_charts(rng, groups, scale, free, half).of(np.repeat(np.arange(groups), each))
-    into = flat_charts(rng, count, scale, free, half)
-    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
-    after = Values(rng.normal(size=count) / 5, rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
-    delta = 0.3 * rng.normal(size=(count, n))
-    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
-    kept, own, starts = _lowest(steps, out, np.arange(0, count, each))
-    assert len(own) < count / 2
-    assert len(starts) == groups
-    for share in rng.uniform(size=(50, groups, free)):
-        place = out.low + (out.high - out.low) * np.repeat(share, each, axis=0)
-        least = steps.at(place)[0].reshape(groups, each).min(axis=1)
-        lengths = np.diff(np.append(starts, len(own)))
-        left = own.low + (own.high - own.low) * np.repeat(share, lengths, axis=0)
-        assert np.minimum.reduceat(kept.at(left)[0], starts) == pytest.approx(least, abs=1e-12)
-
-
-@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
 def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_the_rest(kind: Any, free: int) -> None:
     rng = np.random.default_rng(11)
     groups, each, n, seconds, half = 40, 5, 4, 0.7, 0.2
@@ -324,7 +301,7 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
     delta = np.repeat(0.3 * rng.normal(size=(groups, n)), each, axis=0) + 0.05 * rng.normal(size=(count, n))
     steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
     starts = np.arange(0, count, each)
-    found, boxes, gaps = _below_all(steps, out, starts, np.full(groups, np.inf)), out.of(starts), []
+    found, boxes, gaps = _below_all(steps, out, starts, np.full(groups, np.inf), GraphSettings()), out.of(starts), []
     rest = Values(rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1)))
     whole, corners = _whole(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
     for share in [*np.repeat(corners[:, None], groups, axis=1), *rng.uniform(size=(50, groups, free))]:
@@ -345,7 +322,6 @@ def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: py
     graph = search.whole_graph()
     some = [graph.to_come(), graph.passed()]
     monkeypatch.setattr("ocp.planning.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
-    monkeypatch.setattr("ocp.planning.value._lowest", lambda *steps: steps)
     whole = [graph.to_come(), graph.passed()]
     for k in range(INSTANTS):
         for few, every in zip(some, whole, strict=True):
