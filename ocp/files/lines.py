@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,14 @@ from typing import Any
 from models.input_files import UnfitFile, read_regular
 from ocp.errors import ProblemError
 
-__all__ = ["LARGEST_FILE", "MOST_LINES", "FileName", "read_lines", "wrong_line"]
+__all__ = ["LARGEST_FILE", "MOST_LINES", "FileName", "cells_of", "is_number", "read_lines", "wrong_line"]
 
 FileName = str | PathLike[str]
 LARGEST_FILE = 32 * 2**20
 """Bytes."""
 MOST_LINES, LONGEST_LINE = 500_000, 10_000
 """A path takes 1 or 2 kB a line."""
+BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 LONGEST_SHOWN = 120  # characters of a line in a message
 
 
@@ -60,3 +62,20 @@ def wrong_line(file: Any, number: int, text: str, why: str, limit: Any = None) -
     shown = text.strip()
     shown = shown if len(shown) <= LONGEST_SHOWN else shown[:LONGEST_SHOWN] + " ..."
     return ProblemError(f"{file}, line {number}, {shown!r}: {why}", name=f"line {number}", value=shown, limit=limit)
+
+
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line of a table, without quotes; where semicolons divide them a comma is decimal."""
+    if delimiter == " ":
+        return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
+    cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
+    return [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is read by `float`."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
-from ocp.files.lines import FileName, read_lines, wrong_line
+from ocp.files.lines import FileName, cells_of, is_number, read_lines, wrong_line
 from ocp.files.mcap import read_joint_messages
 from ocp.files.trees import parts_of, read_tree
 from ocp.tables import table_joints
@@ -56,7 +56,6 @@ UNITS = {
     "n": 1.0,
 }
 HEAD = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
-BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}
 
 
@@ -144,15 +143,15 @@ def _read_table(
             texts.append(line.strip(" "))
     if not texts:
         raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
-    delimiter = next((sign for sign in ";,\t" if sign in texts[0]), None)
-    first = _cells(texts[0], delimiter)
+    delimiter = next((sign for sign in ";,\t" if sign in texts[0]), " ")
+    first = cells_of(texts[0], delimiter)
     if columns is None:
-        if all(_is_number(cell) for cell in first):
+        if all(is_number(cell or "nan") for cell in first):
             why = "no head names the columns; name them: --columns time,NAME,... (columns=), in their order"
             raise wrong_line(file, numbers[0], texts[0], why)
         head, rows, numbers = first, texts[1:], numbers[1:]
     else:
-        told = not all(_is_number(cell) for cell in first)
+        told = not all(is_number(cell or "nan") for cell in first)
         head, rows, numbers = list(columns), texts[told:], numbers[told:]
     while head and not head[-1].strip():  # a delimiter at the end of every line
         head = head[:-1]
@@ -177,24 +176,9 @@ def _read_table(
     return RawTrajectory(names, t, values["positions"], v, a, efforts, lines, False, tuple(notes), str(file))
 
 
-def _cells(line: str, delimiter: str | None) -> list[str]:
-    if delimiter is None:
-        return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
-    cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
-    return [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell or "nan")
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str | None, width: int) -> Array:
+def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
     """The table; nan where a cell is empty. Shape (M, width)."""
-    split = [_cells(row, delimiter) for row in rows]
+    split = [cells_of(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
             while len(cells) > width and not cells[-1]:
@@ -208,7 +192,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
         pass
     for row, number, cells in zip(rows, numbers, split, strict=True):
         for k, cell in enumerate(cells):
-            if not _is_number(cell):
+            if not is_number(cell or "nan"):
                 raise wrong_line(file, number, row, f"{cell!r} is no number; correct it")
             cells[k] = cell or "nan"
     return np.array(split, dtype=float)

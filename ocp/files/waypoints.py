@@ -31,7 +31,7 @@ from models.paths.orientation import product, rotation_vector
 from models.paths.reversals import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
-from ocp.files.lines import FileName, read_lines, wrong_line
+from ocp.files.lines import FileName, cells_of, is_number, read_lines, wrong_line
 from ocp.files.program import TOLERANCE, checked_reversal, smoothed
 
 __all__ = ["Waypoints", "read_waypoints"]
@@ -55,7 +55,6 @@ LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "µm": 1e-6, "in": 0.02
 ANGLES = {"rad": 1.0, "deg": np.pi / 180, "°": np.pi / 180}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEAD = re.compile(r"^([\w.]+?)\s*(?:[\[(/ _]\s*(m|mm|cm|um|µm|in|inch|rad|deg|°|s|ms|us|ns)\s*[\])]?)?$")
-BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 SKIPPED = ("", "-", "index")
 LOOSEST = 1e-2
 """Difference of a quaternion's norm from 1 that is put down to the digits written."""
@@ -237,20 +236,13 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
             continue
         if delimiter is None:
             delimiter = next((sign for sign in ";,\t" if sign in line), " ")
-        rows.append((number, text, _cells(line.strip(" "), delimiter)))
+        rows.append((number, text, cells_of(line.strip(" "), delimiter)))
     if not rows or delimiter is None:
         raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
-    named = _cells(remark[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
+    named = cells_of(remark[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
     if len(named) == len(rows[0][2]) and set(POSITION) <= {_name(cell) for cell in named}:
         rows.insert(0, (*remark, named))
     return rows
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    if delimiter == " ":
-        return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
-    cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
-    return [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
 
 
 def _name(cell: str) -> str:
@@ -260,20 +252,12 @@ def _name(cell: str) -> str:
     return OTHER_NAMES.get(name, name)
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _head(
     file: FileName, rows: list[tuple[int, str, list[str]]], columns: Sequence[str] | None
 ) -> tuple[list[str], int]:
     """Names of the columns as they stand, and the first row that is none of them."""
     cells = rows[0][2]
-    told = any(cell and not _is_number(cell) for cell in cells)
+    told = any(cell and not is_number(cell) for cell in cells)
     if columns is not None:
         known = [] if isinstance(columns, str) else list(checked_each("columns", columns, str))
         if len(known) != len(cells):
