@@ -29,28 +29,45 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Refinement, Solution, stack
+from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["refine", "refined", "split"]
 
 LIMITS = [name for name, given in signature(judge).parameters.items() if given.kind is Parameter.KEYWORD_ONLY]
 KINDS = ("integration", "equalities", "limits", "cost", "other")
-TARGET_SHARE = 0.5  # of its limit, which an interval is split for
-MOST_PIECES = 4  # that an interval is split into at once
-LEAST_WIDTH = 1e-9  # of an interval, as a share of the horizon
-TOLERANCE, MOST_INTERVALS = 1e-6, 400
-MOST_ROUNDS = 12
-PATIENCE = 2  # rounds that may pass without any row coming nearer to its limit
-NEARER = 0.8  # of what it was: a row that fell so much is falling
+
+
+@dataclasses.dataclass(frozen=True)
+class RefinementSettings:
+    """How meshes are refined.
+
+    Attributes:
+        target: Share of its limit to which a row is brought by splitting: half, as the order of an error is not known.
+        pieces: That an interval is split into at once, at most.
+        least_width: Of an interval, as a share of the horizon: what is narrower is rounding.
+        rounds: At most. patience: Rounds that may pass without any row coming nearer to its limit.
+        nearer: Share of what it was to which a row must fall to count as falling.
+    """
+
+    target: float = 0.5
+    pieces: int = 4
+    least_width: float = ROUNDING_SHARE
+    rounds: int = 12
+    patience: int = 2
+    nearer: float = 0.8
+
+
+SETTINGS = RefinementSettings()
 
 
 def refine(
     problem: Problem,
     method: DirectMethod,
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float = SOLVER_SHARE,
     limits: ByName = None,
     breaks: Sequence[float] = (),
-    max_intervals: int = MOST_INTERVALS,
+    max_intervals: int = 400,
     parameters: ByName = None,
     solver: str = "ipopt",
     options: ByName = None,
@@ -125,7 +142,7 @@ def refined(
     for: see :func:`ocp.methods.solve`.
     """
     given = {"options": options, "check": check}
-    return _refined(problem, method, (solution, audit), TOLERANCE, given, {}, MOST_INTERVALS)
+    return _refined(problem, method, (solution, audit), SOLVER_SHARE, given, {}, 400)
 
 
 def _refined(
@@ -151,11 +168,12 @@ def _refined(
         intervals.append(method.intervals)
         for kind, values in errors.items():
             values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
-        nearer = [row for row in beyond if row.value < NEARER * best.get(row.name, np.inf)]
+        nearer = [row for row in beyond if row.value < SETTINGS.nearer * best.get(row.name, np.inf)]
         best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
         idle = 0 if nearer else idle + 1
         finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
-        if not beyond or idle == PATIENCE or len(finer) == method.intervals + 1 or len(intervals) == MOST_ROUNDS:
+        spent = idle == SETTINGS.patience or len(intervals) == SETTINGS.rounds
+        if not beyond or spent or len(finer) == method.intervals + 1:
             break
         method = method.with_mesh(finer)
         found = _next(problem, method, {**given, "guess": solution}, settings)
@@ -164,24 +182,32 @@ def _refined(
             break
         solution, audit = found
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
-    if beyond:
-        worst = max(beyond, key=lambda row: row.value)
-        hint = "raise max_intervals"
-        if late:
-            hint = "the time limit is reached: raise time_limit"
-        elif idle == PATIENCE:
-            hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
-        words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
-        warnings.warn(RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0), stacklevel=2)
-    elif touching := [each for each in audit.failures if each.name in form.apart]:
-        words = f"{stopped}; finer intervals keep no bodies apart, add constraints that do: {touching[0].note}"
-        warnings.warn(RefinementWarning(words, name=touching[0].name, value=touching[0].value, limit=1.0), stacklevel=2)
-    elif not audit.passed:
-        words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
-        warnings.warn(RefinementWarning(words, name="undecided", value=audit.undecided), stacklevel=2)
+    idles = idle == SETTINGS.patience and not late
+    if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
+        warnings.warn(warning, stacklevel=2)
     told = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
     return dataclasses.replace(solution, refinement=refinement), audit
+
+
+def _shortfall(
+    stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
+) -> RefinementWarning | None:
+    """What refinement leaves, in the order in which it matters; None where the last plan passes its audit."""
+    if beyond:
+        worst = max(beyond, key=lambda row: row.value)
+        hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
+        if idles:
+            hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
+        words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
+        return RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0)
+    if touching := [each for each in audit.failures if each.name in form.apart]:
+        words = f"{stopped}; finer intervals keep no bodies apart, add constraints that do: {touching[0].note}"
+        return RefinementWarning(words, name=touching[0].name, value=touching[0].value, limit=1.0)
+    if not audit.passed:
+        words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
+        return RefinementWarning(words, name="undecided", value=audit.undecided)
+    return None
 
 
 def _first(
@@ -316,15 +342,15 @@ def _pieces(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.
     for row in beyond:
         if row.errors is not None:
             with np.errstate(over="ignore"):
-                wanted = np.ceil((row.errors / TARGET_SHARE) ** (1.0 / row.order))
-            pieces = np.maximum(pieces, np.clip(wanted, 1, MOST_PIECES).astype(int))
+                wanted = np.ceil((row.errors / SETTINGS.target) ** (1.0 / row.order))
+            pieces = np.maximum(pieces, np.clip(wanted, 1, SETTINGS.pieces).astype(int))
             bad = np.maximum(bad, row.errors)
     if np.all(pieces == 1):  # no interval answers for what is beyond its limit
         for row in rows:
             bad = bad if row.errors is None else np.maximum(bad, row.errors)
         far = max((row.value for row in beyond), default=0.0) > 2.0
         pieces[far | (bad >= np.median(bad))] = 2
-    pieces[np.diff(mesh) < 2 * LEAST_WIDTH] = 1
+    pieces[np.diff(mesh) < 2 * SETTINGS.least_width] = 1
     return pieces, bad
 
 

@@ -7,6 +7,7 @@ the plan itself: what it pushes in the interval altogether is what the arcs befo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -19,24 +20,37 @@ from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Solution
+from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE
 
 __all__ = ["NEAR", "at_switches", "switches"]
 
-AT_LIMIT = 1e-3
-"""Share of the range between two limits, nearer to which a value is at one."""
-JUMP = 0.05
-"""Share of that range by which a value jumps at least, where it switches."""
-LONGEST = 4
-"""Intervals that a jump may be smeared over."""
-TOO_NEAR = 0.15
-"""Share of the interval that a switch falls into, nearer to which other nodes give way."""
-ONE = 1e-7
-"""Of the horizon: switches nearer to each other are one."""
-MOST_ROUNDS = 3
-WORTH = 1e-5
-"""Share of the cost by which a plan gets cheaper, where moving its nodes was worth it."""
-OTHER = 1e-3
-"""Share of the cost by which a plan gets dearer, where it became another one."""
+
+@dataclass(frozen=True)
+class SwitchingSettings:
+    """How switches are found.
+
+    Attributes:
+        at_limit: Share of the range between two limits, nearer to which a value is at one: as near as audits look.
+        jump: Share of that range by which a value jumps at least, where it switches.
+        longest: Intervals that a jump may be smeared over.
+        too_near: Share of the interval that a switch falls into, nearer to which other nodes give way.
+        same: Share of the horizon, nearer to which switches are one.
+        rounds: At most.
+        worth: Share of the cost by which a plan gets cheaper, where moving its nodes was worth it.
+        other: Share of the cost by which a plan gets dearer, where it became another one.
+    """
+
+    at_limit: float = LIMIT_SHARE
+    jump: float = 0.05
+    longest: int = 4
+    too_near: float = 0.15
+    same: float = 1e-7
+    rounds: int = 3
+    worth: float = RESOLVED_SHARE
+    other: float = LIMIT_SHARE
+
+
+SETTINGS = SwitchingSettings()
 NEAR = {"mu_init": 1e-4}
 """Of IPOPT, from a plan that is nearly right: it stays the same plan."""
 
@@ -55,7 +69,8 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
     owner, place = np.repeat(np.arange(n), len(nodes)), np.tile(nodes, n)
     values, low, high = _pushed(form, solution, at, owner, place)
     span = np.where(np.isfinite(high - low), high - low, np.ptp(values, axis=0))
-    state = np.where(values >= high - AT_LIMIT * span, 1, np.where(values <= low + AT_LIMIT * span, -1, 0))
+    near = SETTINGS.at_limit * span
+    state = np.where(values >= high - near, 1, np.where(values <= low + near, -1, 0))
     values, state = (part.reshape(n, len(nodes), -1) for part in (values, state))
     same = (state == state[:, :1]).all(axis=1)
     slope = np.einsum("ij,kjr->kir", differentiation_matrix(nodes), values) / width[:, None, None]
@@ -65,7 +80,7 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
     for row in range(values.shape[2]):
         whole = np.flatnonzero(same[:, row])
         for i, j in pairwise(whole.tolist()):
-            if state[i, 0, row] == state[j, 0, row] or j - i > LONGEST:
+            if state[i, 0, row] == state[j, 0, row] or j - i > SETTINGS.longest:
                 continue
             a, b = breaks[i + 1], breaks[j]
             before, after = last @ values[i, :, row], first @ values[j, :, row]
@@ -73,7 +88,7 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
             with np.errstate(divide="ignore", invalid="ignore"):  # where the arcs meet, if they do
                 there = (before - rise * a - after + fall * b) / (fall - rise)
             if not breaks[i] <= there <= breaks[j + 1]:
-                if not abs(after - before) > JUMP * span[row]:
+                if not abs(after - before) > SETTINGS.jump * span[row]:
                     continue
                 # else where as much is pushed as by one up to there, by the other from there
                 there = np.clip(a + (area[i + 1 : j, row].sum() - after * (b - a)) / (before - after), a, b)
@@ -111,31 +126,31 @@ def at_switches(
         The last plan that is no dearer; ``plan`` itself where nothing switches, or where another solve fails.
     """
     known = np.zeros(0)
-    for turn in range(MOST_ROUNDS):
+    for turn in range(SETTINGS.rounds):
         found = _apart(switches(problem, plan))
-        if len(found) == len(known) and np.abs(found - known).max(initial=0.0) < ONE:
+        if len(found) == len(known) and np.abs(found - known).max(initial=0.0) < SETTINGS.same:
             break
         mesh = method.with_mesh(_mesh(method.fractions, found))
         given: dict[str, Any] = {"parameters": parameters, "options": {**NEAR, **(options or {})}}
         again = solve(problem, mesh, guess=plan, check=False, **given)
         won = (plan.cost - again.cost) / max(abs(plan.cost), abs(again.cost), np.finfo(float).tiny)
-        if not again.success or won < -OTHER:
+        if not again.success or won < -SETTINGS.other:
             break
         settles, known, plan = len(found) == len(known), found, again
-        if turn and won < WORTH and not settles:
+        if turn and won < SETTINGS.worth and not settles:
             break
     return plan
 
 
 def _apart(found: np.ndarray) -> np.ndarray:
     """Switches inside the horizon, of those that are one the first."""
-    inside = found[(found > ONE) & (found < 1 - ONE)]
-    return np.asarray(inside[np.diff(inside, prepend=-1.0) > ONE])
+    inside = found[(found > SETTINGS.same) & (found < 1 - SETTINGS.same)]
+    return np.asarray(inside[np.diff(inside, prepend=-1.0) > SETTINGS.same])
 
 
 def _mesh(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
     """A mesh with nodes at the switches, those of the given one beside them left out."""
     inner, width = mesh[1:-1], np.diff(mesh)
     piece = np.clip(np.searchsorted(mesh, at, side="right") - 1, 0, len(width) - 1)
-    near = (np.abs(inner[:, None] - at) < TOO_NEAR * width[piece]).any(axis=1)
+    near = (np.abs(inner[:, None] - at) < SETTINGS.too_near * width[piece]).any(axis=1)
     return np.unique(np.concatenate([mesh[[0, -1]], inner[~near], at]))

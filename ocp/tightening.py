@@ -6,7 +6,7 @@ bound is drawn in, interval by interval, by what the plan exceeded it there, unt
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,29 @@ from ocp.direct.prepared import DirectMethod, check_meshed
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution
+from ocp.tolerances import SOLVER_SHARE
 
 __all__ = ["exceeded", "tighten"]
 
-PLACES_A_DEGREE = 10  # places looked at for each degree of the plan's polynomials in an interval
-MOST_ROUNDS = 20
-FOLLOWED = 0.8  # share of a bound's move that the plan is taken to follow, until it is seen
-LEAST_SHARE = 0.1  # of a bound's move: a plan that follows it less is not moved by it
+
+@dataclass(frozen=True)
+class TighteningSettings:
+    """How bounds are drawn in.
+
+    Attributes:
+        places: Looked at for each degree of the plan's polynomials in an interval.
+        rounds: At most.
+        followed: Share of a bound's move that the plan is taken to follow, until it is seen.
+        least_followed: A plan that follows a bound's move by a smaller share is not moved by it.
+    """
+
+    places: int = 10
+    rounds: int = 20
+    followed: float = 0.8
+    least_followed: float = 0.1
+
+
+SETTINGS = TighteningSettings()
 
 
 @interruptible
@@ -31,7 +47,7 @@ def tighten(
     problem: Any,
     method: DirectMethod,
     *,
-    tolerance: float = 1e-6,
+    tolerance: float = SOLVER_SHARE,
     parameters: ByName = None,
     solver: str = "ipopt",
     options: ByName = None,
@@ -87,10 +103,10 @@ def _tightened(
         most = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
     places = _places(form, fragment, shared=method.control == "linear")
     drawn = np.zeros((2, len(fragment.mesh) - 1, len(index)))
-    move, before, followed = np.zeros_like(drawn), np.zeros_like(drawn), np.full_like(drawn, FOLLOWED)
+    move, before, followed = np.zeros_like(drawn), np.zeros_like(drawn), np.full_like(drawn, SETTINGS.followed)
     best: tuple[Solution, str, dict[str, Any]] | None = None  # a plan, and what it exceeds most
     relaxed = np.inf  # cost of the plan that keeps the bounds at the points alone
-    for _ in range(MOST_ROUNDS):
+    for _ in range(SETTINGS.rounds):
         moves = {}
         for kind, (entry, left, right) in places.items():
             both = np.maximum(drawn[:, left, entry], drawn[:, right, entry])
@@ -120,7 +136,7 @@ def _tightened(
             best = solution, remains, details
         # as in the secant method, each bound by itself; one that its neighbours moved says nothing
         share = (before - beyond) / np.where(move > 0, move, np.inf)
-        followed = np.where((beyond > 0) & (share > LEAST_SHARE), np.minimum(share, 1.0), followed)
+        followed = np.where((beyond > 0) & (share > SETTINGS.least_followed), np.minimum(share, 1.0), followed)
         before, guess = beyond, solution
         # a bound that no point of an interval stands at is first drawn in as far as they are away from it
         rows = prepared.program.numbers.values(solution.variables, p)[1]
@@ -128,7 +144,7 @@ def _tightened(
         stands = np.clip(np.where(np.isfinite(room), room, 0.0), drawn, most)
         move = np.minimum(np.where(beyond > tolerance / 2, beyond / followed, 0.0), most - stands)
         drawn = np.where(move > 0, stands + move, drawn)
-    told = f"problem {form.name!r}: after {MOST_ROUNDS} rounds {remains}; take more intervals"
+    told = f"problem {form.name!r}: after {SETTINGS.rounds} rounds {remains}; take more intervals"
     raise SolveError(told, solution, limit=tolerance, **details)
 
 
@@ -202,7 +218,7 @@ def _excess(
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     pieces = (len(solution.state_interpolant.breaks) - 1) // n
-    count = PLACES_A_DEGREE * (len(solution.state_interpolant.nodes) - 1) * pieces
+    count = SETTINGS.places * (len(solution.state_interpolant.nodes) - 1) * pieces
     place = np.linspace(0.0, 1.0, count + 1)
     owner = np.repeat(np.arange(n), len(place))
     s = breaks[owner] + np.diff(breaks)[owner] * np.tile(place, n)

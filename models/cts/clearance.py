@@ -26,11 +26,28 @@ from models.shapes.distance import soft_minimum
 from models.shapes.shapes import Box, Capsule
 from models.spatial import FULL_TURN, Expression
 
-PATTERN_STEPS, PATTERN_SHRINK = 44, 0.62
-BASINS = 4  # minima of the grid that are refined
-SHORTFALL_PRICE = 1e3  # 1/m; of a clearance that falls short, in what the search compares
-CLEARANCE_INSET = 1e-10  # m; how far inside the least clearance the search aims
-AT_LIMIT = 1e-6  # m; nearer to the least clearance than this counts as held by it
+
+@dataclass(frozen=True)
+class ClearanceSearch:
+    """How a roll that keeps clear is looked for.
+
+    Attributes:
+        basins: Minima of the grid that are refined.
+        steps, shrink: Of the pattern search, and ratio of its steps: 0.62^44 = 7e-10 of a grid's step.
+        shortfall_price: Of a clearance that falls short, in what the search compares, 1/m.
+        inset: How far inside the least clearance the search aims, m.
+        at_limit: Nearer to the least clearance than this counts as held by it, m.
+    """
+
+    basins: int = 4
+    steps: int = 44
+    shrink: float = 0.62
+    shortfall_price: float = 1e3
+    inset: float = 1e-10
+    at_limit: float = 1e-6
+
+
+SEARCH = ClearanceSearch()
 
 
 @dataclass(frozen=True)
@@ -179,8 +196,8 @@ def clear_inverse(
     fine = ca.logic_and(held, gap >= clearance)
     given = [target, previous, angle]
     value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))
-    short: Any = ca.fmax(clearance + CLEARANCE_INSET - gap, 0) if np.isfinite(clearance) else 0.0
-    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + SHORTFALL_PRICE * short, ca.inf)]))
+    short: Any = ca.fmax(clearance + SEARCH.inset - gap, 0) if np.isfinite(clearance) else 0.0
+    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + SEARCH.shortfall_price * short, ca.inf)]))
     place = ca.Function("place", given, ca.cse([joints, gap]))
 
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
@@ -190,15 +207,15 @@ def clear_inverse(
     grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
     starts = ca.Function("starts", *_starts(samples))(merit.map(samples)(x, before, grid))
     states = ca.horzcat(starts, ca.vertcat(free, merit(x, before, free), FULL_TURN / samples))
-    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, BASINS + 1))
+    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, SEARCH.basins + 1))
     angles = ca.horzcat(free, refined[0, :])
-    values = value.map(BASINS + 2)(x, before, angles)
-    best, least, from_closed = ca.Function("choice", *_choice(BASINS + 2))(angles, values)
+    values = value.map(SEARCH.basins + 2)(x, before, angles)
+    best, least, from_closed = ca.Function("choice", *_choice(SEARCH.basins + 2))(angles, values)
     q, distance = place(x, before, best)
     status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
     spoilt = ca.if_else(status == 0, 0, np.nan)
     active = ca.if_else(from_closed, closed_active, 0)
-    active = ca.if_else(distance - clearance < AT_LIMIT, ACTIVE.index("clearance"), active)
+    active = ca.if_else(distance - clearance < SEARCH.at_limit, ACTIVE.index("clearance"), active)
     outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
     labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
     return ca.Function("clear_inverse", [x, before], outputs, *labels)
@@ -213,7 +230,7 @@ def _starts(samples: int) -> tuple[list[Any], list[Any]]:
         low = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
         left.append(ca.if_else(low, merits[k], ca.inf))
     columns = []
-    for _ in range(BASINS):
+    for _ in range(SEARCH.basins):
         at, least = ca.SX(0), ca.SX(ca.inf)
         for angle, merit in zip(angles, left, strict=True):
             at, least = ca.if_else(merit < least, angle, at), ca.fmin(merit, least)
@@ -242,6 +259,6 @@ def _pattern(merit: Any) -> Any:
         found = merit(given[:5], given[5], at)
         better = found < least
         angle, least = ca.if_else(better, at, angle), ca.if_else(better, found, least)
-    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * PATTERN_SHRINK)])
-    all_steps = once.mapaccum(PATTERN_STEPS)(state, ca.repmat(given, 1, PATTERN_STEPS))[:, -1]
-    return ca.Function("pattern", [state, given], [all_steps]).map(BASINS + 1)
+    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * SEARCH.shrink)])
+    all_steps = once.mapaccum(SEARCH.steps)(state, ca.repmat(given, 1, SEARCH.steps))[:, -1]
+    return ca.Function("pattern", [state, given], [all_steps]).map(SEARCH.basins + 1)

@@ -15,8 +15,6 @@ import numpy as np
 from models.shapes.shapes import Box, Capsule
 from models.spatial import Expression, expression
 
-SEARCH_STEPS = 40
-GOLDEN = (5**0.5 - 1) / 2
 KINK = 1e-12  # m; rounds off the kink of a distance at zero
 
 
@@ -59,13 +57,13 @@ def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
     def at(s: Expression) -> Expression:
         return box_distance(a + s * (b - a), box)
 
-    low, high = 0.0, 1.0
-    left, right = 1 - GOLDEN, GOLDEN
+    golden, (low, high) = (5**0.5 - 1) / 2, (0.0, 1.0)
+    left, right = 1 - golden, golden
     f_left, f_right = at(left), at(right)
-    for _ in range(SEARCH_STEPS):
+    for _ in range(40):  # 0.618^40 = 4e-9
         lower = f_left < f_right
         low, high = ca.if_else(lower, low, left), ca.if_else(lower, right, high)
-        fresh = ca.if_else(lower, high - GOLDEN * (high - low), low + GOLDEN * (high - low))
+        fresh = ca.if_else(lower, high - golden * (high - low), low + golden * (high - low))
         value = at(fresh)
         left, right, f_left, f_right = (
             ca.if_else(lower, fresh, right),

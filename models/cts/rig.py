@@ -30,8 +30,6 @@ from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
 INCH = 0.0254
 LENGTHS = ("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goose_neck")
-HALF_PI = np.pi / 2
-LEAST_SQUARE = 1e-32  # under square roots: keeps derivatives finite where an arm is stretched
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,11 +177,11 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
     """
     q = expression(q)
     rows = (
-        (0.0, q[0], 0.0, -HALF_PI),
+        (0.0, q[0], 0.0, -np.pi / 2),
         (q[1], 0.0, rig.yaw_link_1, 0.0),
-        (q[2], 0.0, rig.yaw_link_2, -HALF_PI),
+        (q[2], 0.0, rig.yaw_link_2, -np.pi / 2),
         (q[3], rig.yaw_offset, rig.pitch_link, 0.0),
-        (q[4], 0.0, 0.0, HALF_PI),
+        (q[4], 0.0, 0.0, np.pi / 2),
         (q[5], rig.sting, rig.goose_neck, 0.0),
     )
     frames = [Frame(ca.DM([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), ca.DM.zeros(3))]
@@ -192,7 +190,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
         shift = ca.vertcat(a * ca.cos(theta), a * ca.sin(theta), d)
         last = frames[-1]
         frames.append(Frame(ca.mtimes(last.rotation, turn), last.point(shift)))
-    tool = ca.mtimes(frames[-1].rotation, rotation((0, 1, 0), -HALF_PI))
+    tool = ca.mtimes(frames[-1].rotation, rotation((0, 1, 0), -np.pi / 2))
     return [*frames, Frame(tool, frames[-1].position)]
 
 
@@ -221,8 +219,8 @@ def forward(rig: Rig, q: Expression) -> Expression:
         q[0] - rig.yaw_link_1 * ca.sin(q[1]) - s23 * along - c23 * aside,
         rig.yaw_link_1 * ca.cos(q[1]) + c23 * along - s23 * aside,
         rig.sting * c45 - rig.pitch_link * ca.sin(q[3]) - rig.goose_neck * s45 * c6,
-        q[1] + q[2] + HALF_PI,
-        q[3] + q[4] - HALF_PI,
+        q[1] + q[2] + np.pi / 2,
+        q[3] + q[4] - np.pi / 2,
         q[5],
     )
 
@@ -268,10 +266,10 @@ def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branc
     corner = corner_at(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
-    cos4 = branch.pitch * ca.sqrt(ca.fmax((1 - sin4) * (1 + sin4), LEAST_SQUARE))
+    cos4 = branch.pitch * ca.sqrt(ca.fmax((1 - sin4) * (1 + sin4), 1e-32))
     along = rig.yaw_link_2 + rig.pitch_link * cos4
     cos2 = (corner[1] - along * s_yaw - rig.yaw_offset * c_yaw) / rig.yaw_link_1
-    sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), LEAST_SQUARE))
+    sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), 1e-32))
     q1 = corner[0] - along * c_yaw + rig.yaw_offset * s_yaw + rig.yaw_link_1 * sin2
     return RigPosture(corner, sin4, cos4, sin2, cos2, q1)
 
@@ -303,7 +301,7 @@ def joints_of(rig: Rig, target: Expression, roll: Expression, posture: RigPostur
     """Joint positions of a posture, each in the turn nearest to the middle of its limits. Shape (6, 1)."""
     q2 = ca.atan2(posture.sin2, posture.cos2)
     q4 = ca.atan2(posture.sin4, posture.cos4)
-    angles = [q2, target[3] - q2 - HALF_PI, q4, target[4] - q4 + HALF_PI]
+    angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]
     for k, angle in enumerate(angles):
         if np.isfinite(rig.limit(k + 2, False)):
             angles[k] = in_nearest_turn(angle, rig.middle_and_half(k + 2)[0])

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.cts.rig import HALF_PI, Branch, Rig, RigPosture, Tunnel, corner_circle, posture_at
+from models.cts.rig import Branch, Rig, RigPosture, Tunnel, corner_circle, posture_at
 from models.cts.trigonometric import (
     Harmonics,
     Point,
@@ -232,7 +232,7 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
     """Values of sin q4 at which an arc may end."""
     found: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
-        if _allows(rig, 4, sign * HALF_PI):
+        if _allows(rig, 4, sign * np.pi / 2):
             found.append((sign * (1 - REACH_INSET), 1))
     for upper in (False, True):
         if rig.limited(4):

@@ -18,9 +18,6 @@ from models.cts.roll import ANGLE_INSET, index_harmonics
 from models.cts.trigonometric import Harmonics, roots
 from models.spatial import FULL_TURN, Expression
 
-CONVEX_STEPS, PIECE_STEPS = 12, 20
-"""Newton steps where all of I2 is convex, and on each of its convex pieces."""
-
 
 def checked_gain(rate_weight: float) -> float:
     """w4 / (2 pi); ModelError for a weight that is negative or not finite."""
@@ -55,10 +52,10 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
     start, end = roll_window(rig, previous)
     start, end = start + 2 * ANGLE_INSET, end - 2 * ANGLE_INSET
     first = ca.fmin(ca.fmax(previous, start), end)
-    whole = descend(f, gain, previous, start, end, first, CONVEX_STEPS)
+    whole = descend(f, gain, previous, start, end, first, 12)  # Newton steps to rounding, from near
     convex = ca.Function("convex", [target, previous], [ca.repmat(whole, 5, 1)])
     cuts = [start, *_sorted(_splits(f, gain, start, end)), end]
-    pieces = [descend(f, gain, previous, a, b, (a + b) / 2, PIECE_STEPS) for a, b in pairwise(cuts)]
+    pieces = [descend(f, gain, previous, a, b, (a + b) / 2, 20) for a, b in pairwise(cuts)]
     cut = ca.Function("pieces", [target, previous], [ca.vertcat(*pieces)])
     is_convex = ca.Function("is_convex", [target], [2 * gain >= f.slope_bound()])
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")

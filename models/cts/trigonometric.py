@@ -8,6 +8,7 @@ iteration on all their roots.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -20,11 +21,37 @@ Point = tuple[Expression, Expression]
 Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 """A function of a point of the circle that gives a value and its derivative by the angle."""
 
-SMALLEST_SECOND = 1e-6
-"""Least second harmonic, relative, that the pencil of conics is given; the polish takes the difference out again."""
 SMALLEST_DIVISOR = 1e-300
-SMALLEST_SQUARED = 1e-100  # a second harmonic whose square is still a number
-CUBIC_STEPS, POLISH_STEPS, POLISH_REACH, LEAST_STEPS = 2, 3, 0.05, 4
+"""What divisors are raised by: it changes no number but zero."""
+
+
+@dataclass(frozen=True)
+class RootSettings:
+    """How roots are found in a bounded number of operations.
+
+    Attributes:
+        least_second: Second harmonic, relative, that the pencil of conics is given at least; the polish takes the
+            difference out again.
+        least_square: Second harmonic whose square is still a number.
+        cubic_steps, polish_steps, least_steps: Newton or Halley steps to the root of the pencil, to a root, and to the
+            least point: what rounding leaves no more to do after.
+        polish_reach: Of a step of the polish, rad.
+        stages: Steps to all roots at once: after each stage but the last only those that still move by more than `near`
+            go on.
+        near: Relative.
+    """
+
+    least_second: float = 1e-6
+    least_square: float = 1e-100
+    cubic_steps: int = 2
+    polish_steps: int = 3
+    least_steps: int = 4
+    polish_reach: float = 0.05
+    stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)
+    near: float = 1e-5
+
+
+ROOTS = RootSettings()
 
 
 class Harmonics(NamedTuple):
@@ -65,7 +92,7 @@ def scaled(f: Harmonics, factor: Expression) -> Harmonics:
     return Harmonics(*(factor * a for a in f))
 
 
-def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS) -> list[Point]:
+def roots(f: Harmonics, sharper: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
     """Four points of the circle, among which are all roots of f; where f has fewer, the others mean nothing.
 
     The unit circle is cut by the conic f = 0: turned so that the second harmonic is r (x^2 - y^2), the pencil
@@ -81,8 +108,8 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = POLISH_STEPS)
     size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + SMALLEST_DIVISOR
     f = Harmonics(f.a0 / size, f.a1 / size, f.b1 / size, f.a2 / size, f.b2 / size)
     a0 = ca.fmin(ca.fmax(f.a0, -3.0), 3.0)  # beyond there is no root, only lost digits
-    plain = f.a2 * f.a2 + f.b2 * f.b2 < SMALLEST_SECOND**2
-    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(plain, 2 * SMALLEST_SECOND, 0.0))
+    plain = f.a2 * f.a2 + f.b2 * f.b2 < ROOTS.least_second**2
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(plain, 2 * ROOTS.least_second, 0.0))
 
     t = _pencil(a0, p, q, r)
     wide, narrow = ca.sqrt(r * (1 + t)), ca.sqrt(r * (1 - t))
@@ -134,7 +161,7 @@ def least_point(f: Harmonics) -> Point:
     start from the larger of two lower bounds of the angle, or, by the cusp P = 4 r, Q = 0 where three roots meet,
     from the cube root that leads there: four of them and one of Newton are good to rounding for all P, Q, r >= 0.
     """
-    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(f.a2 >= 0, SMALLEST_SQUARED, -SMALLEST_SQUARED))
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(f.a2 >= 0, ROOTS.least_square, -ROOTS.least_square))
     big_p, big_q = ca.fabs(p), ca.fabs(q)
     scale = 1 / (big_p + big_q + 4 * r)
     big_p, big_q, big_r = big_p * scale, big_q * scale, 4 * r * scale
@@ -145,11 +172,11 @@ def least_point(f: Harmonics) -> Point:
     near = ca.fabs(big_r - big_p) * s_cusp < big_q
     c = ca.if_else(near, ca.fmin(c, ca.sqrt((1 - s_cusp) * (1 + s_cusp))), c)
     s = ca.sqrt(ca.fmax((1 - c) * (1 + c), 0.0))
-    for k in range(LEAST_STEPS):
+    for k in range(ROOTS.least_steps):
         pc, ps, qc, qs, rc, rs = big_p * c, big_p * s, big_q * c, big_q * s, big_r * c, big_r * s
         value = ps - qc - rs * c
         slope = ca.fmax(pc + qs - (rc * c - rs * s), 1e-30)
-        if k < LEAST_STEPS - 1:
+        if k < ROOTS.least_steps - 1:
             step = -value * slope / (slope * slope - 0.5 * value * (qc - ps + 4 * rs * c))
             step = ca.fmin(ca.fmax(step, -1.0), 1.0)
             c, s = ca.fmax(c - step * s, 0.0), ca.fmax(s + step * c, 0.0)
@@ -157,13 +184,13 @@ def least_point(f: Harmonics) -> Point:
             step = -value / slope
             c, s = c - step * s, s + step * c
         size = c * c + s * s
-        norm = 1.5 - 0.5 * size if k == LEAST_STEPS - 2 else 1 / ca.sqrt(size)  # that step is small already
+        norm = 1.5 - 0.5 * size if k == ROOTS.least_steps - 2 else 1 / ca.sqrt(size)  # that step is small already
         c, s = c * norm, s * norm
     x, y = -_sign(p) * c, -_sign(q) * s
     return x * turn_c - y * turn_s, x * turn_s + y * turn_c
 
 
-def polish(point: Point, function: Slope, steps: int = POLISH_STEPS, reach: float = POLISH_REACH) -> Point:
+def polish(point: Point, function: Slope, steps: int = ROOTS.polish_steps, reach: float = ROOTS.polish_reach) -> Point:
     """Newton steps of at most `reach` rad on the circle; `function` gives value and derivative by the angle."""
     c, s = point
     for _ in range(steps):
@@ -198,7 +225,7 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
     # of three real roots an odd number lies in [-1, 1]: the least does, or else the greatest
     t = ca.if_else(excess >= 0, lone, ca.if_else(least >= -1 - 1e-9, least, greatest))
     t = ca.fmin(ca.fmax(t, -1.0), 1.0)
-    for _ in range(CUBIC_STEPS):
+    for _ in range(ROOTS.cubic_steps):
         value = ((t + b2) * t + b1) * t + b0
         slope = (3 * t + 2 * b2) * t + b1
         step = -value * slope / (slope * slope + SMALLEST_DIVISOR)
@@ -208,8 +235,6 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
 
 Series = list[tuple[Expression, Expression]]
 """Coefficients (a_k, b_k) of cos k and sin k of an angle, k = 0, 1, ...; b_0 is 0."""
-ABERTH_STAGES, ABERTH_NEAR = (6, 1, 1, 1, 1, 2, 4, 8, 16), 1e-5
-"""Steps to all roots at once: after each stage but the last only those that still move by more go on."""
 
 
 def product(f: Series, g: Series) -> Series:
@@ -237,7 +262,7 @@ def series_roots(degree: int) -> Any:
     """Function of the coefficients of a Series -> points of the circle, among which are its simple roots.
 
     Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. The roots z = exp(i angle) of the
-    polynomial z^degree f are found all at once (Aberth 1973) in at most sum(ABERTH_STAGES) steps, and those off the
+    polynomial z^degree f are found all at once (Aberth 1973) in at most sum(ROOTS.stages) steps, and those off the
     circle are drawn to it, where they mean nothing. Good to a few digits; polish them with the function at hand.
     """
     n = 2 * degree
@@ -276,7 +301,7 @@ def series_roots(degree: int) -> Any:
         moved.append(ca.vertcat(x - calm * step[0], y - calm * step[1]))
     longest = ca.SX(0)
     for i in range(n):
-        longest = ca.fmax(longest, ca.norm_1(moved[i] - z[:, i]) - ABERTH_NEAR * ca.norm_1(moved[i]))
+        longest = ca.fmax(longest, ca.norm_1(moved[i] - z[:, i]) - ROOTS.near * ca.norm_1(moved[i]))
     step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*moved), longest])
 
     symbol = ca.MX.sym("coefficients", 2, degree + 1)
@@ -287,7 +312,7 @@ def series_roots(degree: int) -> Any:
     at = list(zip(angles, radii, strict=True))
     found: Any = ca.DM([[r * ca.cos(a) for a, r in at], [r * ca.sin(a) for a, r in at]])
     moving = None
-    for count in ABERTH_STAGES:
+    for count in ROOTS.stages:
         stage = _steps(step_function, count)
         if moving is None:
             found, moving = stage(found, norm)

@@ -37,10 +37,6 @@ __all__ = ["Elbow", "Scara"]
 
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
-LIMIT_SLACK = 1e-9
-"""Joint limits are exceeded beyond this, rad or m: rounding is not."""
-REACH_SLACK = 1e-12
-"""Reaches beyond the boundary by no more than this, relative, are on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +150,7 @@ class Scara:
             joint: Index.
             least, most: The range, rad or m.
         """
-        low, high = float(self.lower[joint]) - LIMIT_SLACK, float(self.upper[joint]) + LIMIT_SLACK
+        low, high = float(self.lower[joint]) - 1e-9, float(self.upper[joint]) + 1e-9
         turn = 0.0
         if joint != QUILL and least < low:
             turn = FULL_TURN * float(np.ceil((low - least) / FULL_TURN))
@@ -198,7 +194,7 @@ class Scara:
 
     def check_reach(self, radius: float, what: str) -> None:
         """ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
-        if not self.inner * (1 - REACH_SLACK) <= radius <= self.outer * (1 + REACH_SLACK):
+        if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
                 f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
                 f"{self.inner:g} to {self.outer:g} m"

@@ -17,14 +17,6 @@ from models.spatial import FULL_TURN
 
 __all__ = ["JointsAlong", "ScaraPath", "scara_along"]
 
-DEFAULT_CLEARANCE = 1e-3
-"""m that the path keeps from both ends of the reach unless told otherwise."""
-LARGEST_TILT = 1e-9
-"""Of the tool, as a component of its quaternion."""
-TABLE_STEP = 0.3
-"""Largest change (rad) of an angle between two entries of the table that tells its turn."""
-HALVINGS = 40
-"""Of an interval of that table, at most."""
 ANGLES = [0, 1, 3]
 """The joints that turn."""
 
@@ -68,9 +60,7 @@ class ScaraPath:
         return JointsAlong(*values)
 
 
-def scara_along(
-    scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = DEFAULT_CLEARANCE
-) -> ScaraPath:
+def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = 1e-3) -> ScaraPath:
     """The arm along a path, its elbow bent one way.
 
     Args:
@@ -91,18 +81,18 @@ def scara_along(
     s = path.dense(8, 16)
     turn = path.turn(s)
     tilt = np.abs(turn.quaternion[:, 1:3]).max(axis=1)
-    if tilt.max() > LARGEST_TILT:
+    if tilt.max() > 1e-9:
         at = s[int(tilt.argmax())]
         message = f"scara: the path tilts its tool at {at:g} m, a SCARA turns it about the vertical only"
-        raise ModelError(message, name="path", value=float(tilt.max()), limit=LARGEST_TILT)
+        raise ModelError(message, name="path", value=float(tilt.max()), limit=1e-9)
 
     def raw(places: Array) -> Array:
         return np.array(rates.map(len(places))(*_poses(path, places))[0]).T
 
     q = raw(s)
-    for _ in range(HALVINGS):
+    for _ in range(40):
         change = np.diff(q[:, ANGLES], axis=0)
-        wide = np.flatnonzero((np.abs((change + np.pi) % FULL_TURN - np.pi) > TABLE_STEP).any(axis=1))
+        wide = np.flatnonzero((np.abs((change + np.pi) % FULL_TURN - np.pi) > 0.3).any(axis=1))
         if not wide.size:
             break
         middle = (s[wide] + s[wide + 1]) / 2

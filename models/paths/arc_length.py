@@ -19,11 +19,8 @@ __all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
 
 GAUSS_NODES, GAUSS_WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
 GAUSS_NODES, GAUSS_WEIGHTS = (GAUSS_NODES + 1) / 2, GAUSS_WEIGHTS / 2
-LENGTH_ACCURACY = 1e-13
-"""Largest disagreement of the rule on a cell and on its halves, relative to the length of the cell's curve."""
 STEEPEST = 3.0
 """Largest slope du/ds at a cell's ends over its mean: up to it the cubic between them is monotone."""
-MOST_HALVINGS = 40
 MOST_STEPS = 4
 
 
@@ -96,13 +93,13 @@ def cells(coefficients: Array) -> Cells:
     whole = _lengths(slopes, start, width)
     scale = whole.copy()
     done: list[tuple[NDArray[np.intp], Array, Array, Array]] = []
-    for _ in range(MOST_HALVINGS):
+    for _ in range(40):  # a cell of 1e-12 of the curve
         if not curve.size:
             break
         half = width / 2
         mine = slopes[:, :, curve]
         left, right = _lengths(mine, start, half), _lengths(mine, start + half, half)
-        fine = np.abs(whole - left - right) <= LENGTH_ACCURACY * scale[curve]
+        fine = np.abs(whole - left - right) <= 1e-13 * scale[curve]  # rounding of twenty terms
         slowest = np.minimum(_speed(mine, start), _speed(mine, start + width))
         fine &= left + right <= STEEPEST * width * slowest
         done.append((curve[fine], start[fine], width[fine], (left + right)[fine]))

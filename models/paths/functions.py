@@ -31,17 +31,12 @@ from models.paths.smooth_path import SmoothPath
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
-DEGREES = (3, 5)  # of the cubic, of the quintic
-MOST_CORRECTIONS, MOST_NODES = 100, 100  # of a mapping, whose expression grows with them
-QUADRATURE_NODES = (2, 3, 4, 8)
-"""Twice the time of the paper's 3 corrections; on a 90 deg corner of 5 mm, at 1 m/s and 2 ms, a drift of 2e-9 mm."""
-NEWTON_STEPS = 3
-"""From the cubic guess of where a blend has an arc length, to rounding."""
 # rows of the table of cells
+MOST_TERMS = 100
+"""Corrections, or nodes, of a mapping, whose expression grows with them."""
 SEGMENT = slice(0, 13)  # start; parts along, round and towards the axis of the screw, rate of turning
 CURVE = slice(13, 31)  # coefficients, three a power
 CELL = slice(31, 38)  # distance, length, whether on a blend; u at the start, width in u, speed at both ends
-ROWS = 38
 
 
 def path_function(path: SmoothPath) -> Any:
@@ -81,7 +76,7 @@ def _inside(distance: Any, length: float) -> Any:
 
 @lru_cache(maxsize=1)
 def _in_cell() -> Any:
-    row, s = ca.SX.sym("row", ROWS), ca.SX.sym("s")
+    row, s = ca.SX.sym("row", CELL.stop), ca.SX.sym("s")
     start, climb, ahead, inward, rate = row[0:3], row[3:6], row[6:9], row[9:12], row[12]
     coefficients = ca.reshape(row[CURVE], 3, 6)
     first_s, length, curved, first_u, width, speed0, speed1 = (row[i] for i in range(CELL.start, CELL.stop))
@@ -109,7 +104,7 @@ def _in_cell() -> Any:
     x = distance / length
     slope0, slope1 = length / (width * speed0), length / (width * speed1)
     at: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
-    for _ in range(NEWTON_STEPS):
+    for _ in range(3):  # from an interpolation, which errs little
         step = at - first_u
         mean = sum(
             float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
@@ -140,7 +135,7 @@ def _horner(columns: Any, u: Any) -> Any:
 def _table(path: SmoothPath) -> tuple[Array, Array]:
     on_segment = np.flatnonzero(path.piece_segment >= 0)
     count = len(on_segment) + len(path.cells.curve)
-    rows = np.zeros((count, ROWS))
+    rows = np.zeros((count, CELL.stop))
     parts = slice(0, len(on_segment))
     segment = path.piece_segment[on_segment]
     task = path.path
@@ -181,8 +176,8 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
-    number = checked_count(corrections, "mapping", "corrections", 0, MOST_CORRECTIONS)
-    return _predictor_corrector(checked_choice(degree, DEGREES, "blend", "degree"), number)
+    number = checked_count(corrections, "mapping", "corrections", 0, MOST_TERMS)
+    return _predictor_corrector(checked_choice(degree, (3, 5), "blend", "degree"), number)
 
 
 @lru_cache(maxsize=16)
@@ -196,19 +191,19 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
 
-def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = QUADRATURE_NODES) -> Any:
+def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
     """The default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
 
     Arguments and results as of predictor_corrector, but for `nodes`: of the quadrature over one control step, for each
     Newton step. The first ones need few, since they only lead near; the last one decides the drift.
     """
     numbers = tuple(
-        checked_count(n, "mapping", "nodes", 1, MOST_NODES) for n in checked_each(nodes, int, "mapping", "nodes")
+        checked_count(n, "mapping", "nodes", 1, MOST_TERMS) for n in checked_each(nodes, int, "mapping", "nodes")
     )
     if not numbers:
         message = "mapping: nodes are empty; give one number for each Newton step"
         raise ModelError(message, name="nodes", value=nodes)
-    return _gauss_newton(checked_choice(degree, DEGREES, "blend", "degree"), numbers)
+    return _gauss_newton(checked_choice(degree, (3, 5), "blend", "degree"), numbers)
 
 
 @lru_cache(maxsize=16)

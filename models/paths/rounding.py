@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 from warnings import warn
 
@@ -21,20 +22,35 @@ from models.spatial import FULL_TURN
 __all__ = ["Overlap", "smooth"]
 
 Overlap: TypeAlias = Literal["shrink", "refuse"]
-BLEND_SAMPLES, EXTREME_SAMPLES = (
-    33,
-    33,
-)  # of a blend whose deviation is looked for, and of the neighbourhood of the extreme
-KEPT_BACK = 1e-3
-"""Share of the tolerance kept back for what lies between the samples of a deviation."""
-MOST_TRIALS, MOST_SHRINKS = 60, 30
-CORNERS_AT_ONCE = 500  # so that memory does not grow with them
-HELIX_SAMPLES, HELIX_STEPS = 33, 4  # of a stretch, and a turn, that a nearest place is looked for on
-GENTLEST = 0.1
-"""Slope of the condition for a nearest place below which a Newton step is not trusted: near the axis of a helix."""
-LONGEST_SHOWN = 12  # vertices in a warning
-SHORTEST_PIECE = 1e-12
-"""Rests of a segment between two blends shorter than this, over the segment, are dropped."""
+
+
+@dataclass(frozen=True)
+class RoundingSettings:
+    """How corners are rounded.
+
+    Attributes:
+        samples: Of a blend whose deviation is looked for, of the neighbourhood of its extreme, and of a turn of a helix
+            on which a nearest place is looked for.
+        kept_back: Share of the tolerance kept back for what lies between the samples.
+        trials: Of remaining distances, and rounds in which neighbours that overlap shrink, at most.
+        newton_steps: To a nearest place on a helix.
+        gentlest: Slope of the condition for it below which a step is not trusted: near the axis of the helix.
+        block: Corners handled at once, which bounds the memory.
+        shortest: Rests of a segment between two blends that are shorter, over the segment, are dropped: rounding.
+        shown: Vertices named in a warning.
+    """
+
+    samples: int = 33
+    kept_back: float = 1e-3
+    trials: int = 60
+    newton_steps: int = 4
+    gentlest: float = 0.1
+    block: int = 500
+    shortest: float = 1e-12
+    shown: int = 12
+
+
+SETTINGS = RoundingSettings()
 
 
 class _Corners(NamedTuple):
@@ -113,14 +129,14 @@ def _within(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
     found = _without_overlap(path, _from_deviation(corners, tolerance, longest), overlap)
     # next to an arc the vertex need not be the farthest point, nor a smaller blend the nearer one
     bent = corners.bent
-    aim = tolerance * (1 - KEPT_BACK)
-    for _ in range(MOST_SHRINKS):
+    aim = tolerance * (1 - SETTINGS.kept_back)
+    for _ in range(SETTINGS.trials):
         some = corners.some(bent)
         over = np.maximum(_from_blend(some, found[bent]), _deviations(some, found[bent])[1]) / tolerance[bent]
         bent, over = bent[over > 1], over[over > 1]
         if not bent.size:
             break
-        aim[bent] *= (1 - KEPT_BACK) / over
+        aim[bent] *= (1 - SETTINGS.kept_back) / over
         found[bent] = _fitted(corners.some(bent), aim[bent], found[bent])
     return found
 
@@ -130,8 +146,8 @@ def _warn_of_smaller(path: Path, wanted: Array, found: Array) -> None:
     if smaller.size:
         worst = int((found / wanted).argmin())
         vertices = tuple((smaller + 1).tolist())
-        shown = ", ".join(str(vertex) for vertex in vertices[:LONGEST_SHOWN])
-        shown += f" and {len(vertices) - LONGEST_SHOWN} more" if len(vertices) > LONGEST_SHOWN else ""
+        shown = ", ".join(str(vertex) for vertex in vertices[: SETTINGS.shown])
+        shown += f" and {len(vertices) - SETTINGS.shown} more" if len(vertices) > SETTINGS.shown else ""
         message = (
             f"overlap='shrink': blends are smaller than asked at vertices {shown}; at vertex {worst + 1} "
             f"{found[worst]:g} of {wanted[worst]:g} m, between segments {path.lengths[worst]:g} and "
@@ -166,27 +182,27 @@ def _from_deviation(corners: _Corners, tolerance: Array, longest: Array) -> Arra
     if lines.size:
         some = corners.some(lines)
         corner, legs = _deviations(some, longest[lines])
-        largest = np.maximum(corner, legs * (1 + KEPT_BACK))
+        largest = np.maximum(corner, legs * (1 + SETTINGS.kept_back))
         with np.errstate(divide="ignore"):
             found[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
     if arcs.size:
-        found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - KEPT_BACK), longest[arcs])
+        found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - SETTINGS.kept_back), longest[arcs])
     return found
 
 
 def _fitted(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    """Remaining distances, at most `longest`, whose deviation is the tolerance to KEPT_BACK, or less at the longest."""
+    """Remaining distances, at most `longest`, whose deviation is the tolerance, or less at the longest."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
-    for number in range(MOST_TRIALS):
+    for number in range(SETTINGS.trials):
         found = np.maximum(*_deviations(corners.some(todo), trial[todo]))
         ratio = found / tolerance[todo]
         fits = ratio <= 1
         low[todo] = np.where(fits, trial[todo], low[todo])
         high[todo] = np.where(fits, high[todo], trial[todo])
-        going = (~fits | (ratio < 1 - KEPT_BACK)) & (trial[todo] < longest[todo]) | ~fits
+        going = (~fits | (ratio < 1 - SETTINGS.kept_back)) & (trial[todo] < longest[todo]) | ~fits
         # nearly proportional; halving where that leads out of the bracket, or does not settle
-        aim = trial[todo] * (1 - KEPT_BACK / 2) / np.maximum(ratio, 1e-12)
+        aim = trial[todo] * (1 - SETTINGS.kept_back / 2) / np.maximum(ratio, 1e-12)
         inside = (aim > low[todo]) & (aim < high[todo]) & (number % 4 != 3)
         trial[todo] = np.where(inside, aim, (low[todo] + high[todo]) / 2)
         todo = todo[going]
@@ -207,15 +223,15 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     evenly and again about the extreme: the first is never below the truth, the second by at most 0.1 %. Shape (V,), m.
     """
     path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
-    u = np.linspace(0, 1, BLEND_SAMPLES)
+    u = np.linspace(0, 1, SETTINGS.samples)
     points = polynomial(curves[:, None], u[None, :])
     tip = path.start[vertices + 1][:, None]
     corner = np.linalg.norm(points - tip, axis=-1)
     near = _from_segments(path, vertices, points, remaining)
 
     def about(extreme: NDArray[np.intp]) -> Array:
-        places = u[np.clip(extreme, 1, BLEND_SAMPLES - 2)][:, None] + np.linspace(-1, 1, EXTREME_SAMPLES) / (
-            BLEND_SAMPLES - 1
+        places = u[np.clip(extreme, 1, SETTINGS.samples - 2)][:, None] + np.linspace(-1, 1, SETTINGS.samples) / (
+            SETTINGS.samples - 1
         )
         return polynomial(curves[:, None], places)
 
@@ -228,9 +244,9 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 def _from_blend(corners: _Corners, remaining: Array) -> Array:
     """Largest distance of the two stretches that each blend replaces from the blend. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
-    u, v = np.linspace(0, 1, 4 * BLEND_SAMPLES), np.linspace(0, 1, BLEND_SAMPLES)
-    for first in range(0, len(remaining), CORNERS_AT_ONCE):
-        part = slice(first, first + CORNERS_AT_ONCE)
+    u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
+    for first in range(0, len(remaining), SETTINGS.block):
+        part = slice(first, first + SETTINGS.block)
         some, away = corners.some(part), remaining[part]
         index = some.vertices
         tip = path.start[index + 1][:, None]
@@ -289,21 +305,21 @@ def _distance(path: Path, index: NDArray[np.intp], points: Array, first: Array, 
 
 def _from_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
     # as _distance: the nearest of some places, and Newton steps from there to where the offset is square to the tangent
-    if len(index) > CORNERS_AT_ONCE:
-        parts = [slice(k, k + CORNERS_AT_ONCE) for k in range(0, len(index), CORNERS_AT_ONCE)]
+    if len(index) > SETTINGS.block:
+        parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_from_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
     frame = path.start[index][:, None], path.tangent[index][:, None], path.normal[index][:, None]
     bends = path.curvature[index][:, None], path.torsion[index][:, None]
     turns = float((np.hypot(*bends)[:, 0] * (last - first)).max()) / FULL_TURN
-    share = np.linspace(0, 1, int(HELIX_SAMPLES * (1 + turns)))
+    share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
     there = screw(*frame, *bends, places)[0] - frame[0]
     square = (there**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ there.transpose(0, 2, 1)
     s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
-    for _ in range(HELIX_STEPS):
+    for _ in range(SETTINGS.newton_steps):
         at, tangent, bend, _ = screw(*frame, *bends, s)
         slope = 1 + ((at - points) * bend).sum(axis=-1)
-        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, GENTLEST)
+        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.gentlest)
         s = np.clip(s, first[:, None], last[:, None])
     return np.asarray(np.linalg.norm(screw(*frame, *bends, s)[0] - points, axis=-1))
 
@@ -356,7 +372,7 @@ def smooth(
     lengths[::2], lengths[1::2] = rests, blend_lengths
     segment[::2], blend[1::2] = np.arange(count), np.arange(count - 1)
     kept = np.ones(2 * count - 1, dtype=bool)
-    kept[::2] = rests > SHORTEST_PIECE * path.lengths
+    kept[::2] = rests > SETTINGS.shortest * path.lengths
     bounds = np.concatenate([[0.0], np.cumsum(lengths[kept])])
     made = path, kind, distances, corners.shape, coefficients, bounds, segment[kept], blend[kept], curve_cells
     smoothed = SmoothPath(*made)

@@ -11,6 +11,7 @@ A tangent joint of line and arc is left at the arc's own curvature: 1 of its spe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,14 +21,35 @@ from models.paths.blends import LARGEST_SHAPE, polynomial, quintic
 
 __all__ = ["best_shape", "corner_shape"]
 
-NARROWEST, WIDEST = 0.5, 3.0
-"""Of the factor times remaining distance over the chord: between two lines the best lies from 0.885 to 2.44."""
-BELOW_CUSP = 0.95
-COARSE, GOLDEN_STEPS, SAMPLES = 9, 16, 49
-GOLDEN = (np.sqrt(5) - 1) / 2
-TABLE_ANGLES, TABLE_SAMPLES = 65, 201
-SMALLEST_ANGLE = 1e-3  # of the table, rad; below, the best factor over sine of half the angle is constant
-AT_ONCE = 500  # corners, so that memory does not grow with them
+
+@dataclass(frozen=True)
+class ShapeSearch:
+    """How the best shape factor is looked for.
+
+    Attributes:
+        narrowest, widest: Of the factor times remaining distance over the chord: between two lines the best lies from
+            0.885 to 2.44.
+        below_cusp: Share of the factor at which a blend has a cusp.
+        coarse: Factors compared first. steps: Of the golden section between the neighbours of the best.
+        samples: Of a blend whose peak is looked for.
+        table_angles, table_samples: Corners of the table, and samples of each.
+        least_angle: Of the table, rad; below, the best factor over sine of half the angle is constant.
+        block: Corners handled at once, which bounds the memory.
+    """
+
+    narrowest: float = 0.5
+    widest: float = 3.0
+    below_cusp: float = 0.95
+    coarse: int = 9
+    steps: int = 16
+    samples: int = 49
+    table_angles: int = 65
+    table_samples: int = 201
+    least_angle: float = 1e-3
+    block: int = 500
+
+
+SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
@@ -39,14 +61,14 @@ def corner_shape(angle: Array) -> Array:
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
     """Interior angles, rad, and the best factor over the chord at remaining distance 1."""
-    angles = np.linspace(SMALLEST_ANGLE, np.pi, TABLE_ANGLES)
-    zero = np.zeros((TABLE_ANGLES, 3))
-    before = np.column_stack([np.ones(TABLE_ANGLES), zero[:, :2]])
+    angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
+    zero = np.zeros((SEARCH.table_angles, 3))
+    before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
     after = np.column_stack([-np.cos(angles), np.sin(angles), zero[:, 0]])
     nearly = angles.copy()
     nearly[-1] = (angles[-1] + angles[-2]) / 2  # where all is straight any factor will do: the limit counts
     after[-1] = [-np.cos(nearly[-1]), np.sin(nearly[-1]), 0.0]
-    found = best_shape(-before, before, zero, after, after, zero, np.ones(TABLE_ANGLES), TABLE_SAMPLES)
+    found = best_shape(-before, before, zero, after, after, zero, np.ones(SEARCH.table_angles), SEARCH.table_samples)
     return angles, found / (2 * np.sin(nearly / 2))
 
 
@@ -58,7 +80,7 @@ def best_shape(
     end_tangent: Array,
     end_bend: Array,
     remaining: Array,
-    samples: int = SAMPLES,
+    samples: int = SEARCH.samples,
 ) -> Array:
     """Factors of least peak curvature of quintic blends between given ends.
 
@@ -73,7 +95,7 @@ def best_shape(
         Shape (V,).
     """
     ends = start, start_tangent, start_bend, end, end_tangent, end_bend
-    parts = [slice(first, first + AT_ONCE) for first in range(0, len(remaining), AT_ONCE)]
+    parts = [slice(first, first + SEARCH.block) for first in range(0, len(remaining), SEARCH.block)]
     found = [_searched(tuple(each[part] for each in ends), remaining[part], samples) for part in parts]
     return np.concatenate(found) if found else np.zeros(0)
 
@@ -94,18 +116,20 @@ def _searched(ends: tuple[Array, ...], remaining: Array, samples: int) -> Array:
         return np.asarray(np.nan_to_num(curvature, nan=np.inf).max(axis=1))
 
     chord = np.linalg.norm(end - start, axis=1) / remaining
-    low = np.log(np.clip(NARROWEST * chord, 1e-6, BELOW_CUSP * LARGEST_SHAPE["quintic"] / 2))
-    high = np.log(np.minimum(np.maximum(WIDEST * chord, 2 * np.exp(low)), BELOW_CUSP * LARGEST_SHAPE["quintic"]))
-    grid = low + np.linspace(0, 1, COARSE)[:, None] * (high - low)
+    golden = (np.sqrt(5) - 1) / 2
+    cusp = SEARCH.below_cusp * LARGEST_SHAPE["quintic"]
+    low = np.log(np.clip(SEARCH.narrowest * chord, 1e-6, cusp / 2))
+    high = np.log(np.minimum(np.maximum(SEARCH.widest * chord, 2 * np.exp(low)), cusp))
+    grid = low + np.linspace(0, 1, SEARCH.coarse)[:, None] * (high - low)
     lowest = np.argmin([peak(each) for each in grid], axis=0)
     row = np.arange(len(remaining))
-    low, high = grid[np.maximum(lowest - 1, 0), row], grid[np.minimum(lowest + 1, COARSE - 1), row]
-    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    low, high = grid[np.maximum(lowest - 1, 0), row], grid[np.minimum(lowest + 1, SEARCH.coarse - 1), row]
+    left, right = high - golden * (high - low), low + golden * (high - low)
     at_left, at_right = peak(left), peak(right)
-    for _ in range(GOLDEN_STEPS):
+    for _ in range(SEARCH.steps):
         lower = at_left <= at_right
         low, high = np.where(lower, low, left), np.where(lower, right, high)
-        new = np.where(lower, high - GOLDEN * (high - low), low + GOLDEN * (high - low))
+        new = np.where(lower, high - golden * (high - low), low + golden * (high - low))
         at_new = peak(new)
         left, right = np.where(lower, new, right), np.where(lower, left, new)
         at_left, at_right = np.where(lower, at_new, at_right), np.where(lower, at_left, at_new)

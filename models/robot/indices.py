@@ -14,7 +14,6 @@ from models.robot.robot import Robot
 from models.spatial import Expression, determinant, expression, on_scalars
 
 TWIST_SIZE = 6
-EXPANDED_ROWS = 7  # of a determinant without divisions
 
 
 def joint_limit_index(robot: Robot, q: Expression) -> Expression:
@@ -58,7 +57,7 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
 def manipulability_of(task: Expression) -> Expression:
     """sqrt(det(G G')) of the Jacobian G of any task, shape (m, n). Shape (1, 1)."""
     square = ca.mtimes(task, task.T)
-    if square.shape[0] <= EXPANDED_ROWS:
+    if square.shape[0] <= 7:  # a determinant without divisions
         volume = determinant(square)
     else:  # of two arms, say: an expansion would be long
         diagonal, _, _ = ca.ldl(ca.densify(square), False)

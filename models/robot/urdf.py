@@ -100,29 +100,33 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
         warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unread)}", ModelWarning, 3)
     links = _links(tree, inertia, folder)
-    floating = {name_of(each) for each in tree.findall("joint") if each.get("type") == "floating"}
-    pairs = [(name_of(each), _joint(each)) for each in tree.findall("joint")]
-    for name in floating:
-        virtual = next(joint for each, joint in pairs if each == name)
-        base = next((link for link in links if link.name == virtual.parent), None)
-        neighbours = [j for _, j in pairs if virtual.parent in (j.parent, j.child)]
-        if base is None or base.mass or len(neighbours) > 1 or base.inertia.any():
-            message = (
-                f"joint {name!r} is floating, which is supported only as the joint between a massless root link and "
-                "the whole robot; make it fixed, or read its two sides as two robots"
-            )
-            raise ModelError(message, name=name, value="floating")
-        if base.collisions:
-            message = (
-                f"link {base.name!r}, from which joint {name!r} lets the robot float, is left out with its "
-                "<collision> shapes: give them as obstacles"
-            )
-            warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=3)
-        links = tuple(link for link in links if link is not base)
-        pairs = [pair for pair in pairs if pair[0] != name]
+    joints = [(name_of(each), each.get("type"), _joint(each)) for each in tree.findall("joint")]
+    for name in [name for name, kind, _ in joints if kind == "floating"]:
+        links = _without_world(name, links, joints)
+        joints = [each for each in joints if each[0] != name]
     tip = _only(tree, "tip", "the robot")
     named = None if tip is None else text_of(tip, "link", "the robot")
-    return Description(tree.get("name") or "robot", links, tuple(joint for _, joint in pairs), named)
+    return Description(tree.get("name") or "robot", links, tuple(joint for *_, joint in joints), named)
+
+
+def _without_world(name: str, links: tuple[Link, ...], joints: list[tuple[str, str | None, Joint]]) -> tuple[Link, ...]:
+    """The links but for the massless root from which a floating joint lets the whole robot float."""
+    virtual = next(joint for each, _, joint in joints if each == name)
+    base = next((link for link in links if link.name == virtual.parent), None)
+    neighbours = [joint for *_, joint in joints if virtual.parent in (joint.parent, joint.child)]
+    if base is None or base.mass or len(neighbours) > 1 or base.inertia.any():
+        message = (
+            f"joint {name!r} is floating, which is supported only as the joint between a massless root link and "
+            "the whole robot; make it fixed, or read its two sides as two robots"
+        )
+        raise ModelError(message, name=name, value="floating")
+    if base.collisions:
+        message = (
+            f"link {base.name!r}, from which joint {name!r} lets the robot float, is left out with its "
+            "<collision> shapes: give them as obstacles"
+        )
+        warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
+    return tuple(link for link in links if link is not base)
 
 
 def written_urdf(
@@ -143,40 +147,48 @@ def written_urdf(
         links, joints = [*links, Link(end)], [*joints, Joint(f"{end}_fixed", "fixed", tip, end, translation, rotation)]
         tip = end
     for link in links:
-        element = ElementTree.SubElement(robot, "link", name=link.name)
-        if link.mass or link.inertia.any() or link.center_of_mass.any():
-            body = ElementTree.SubElement(element, "inertial")
-            _write_origin(body, link.center_of_mass, np.eye(3))
-            ElementTree.SubElement(body, "mass", value=_text(link.mass))
-            moments = map(_text, link.inertia[np.triu_indices(3)])
-            ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
-        for seen in link.visuals:
-            visual = _write_shape(element, "visual", seen)
-            if seen.color is not None:
-                material = ElementTree.SubElement(visual, "material", name="")
-                ElementTree.SubElement(material, "color", rgba=_text(seen.color))
-        for shape in link.collisions:
-            _write_shape(element, "collision", shape)
+        _write_link(robot, link)
     for joint in joints:
-        element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
-        _write_origin(element, joint.translation, joint.rotation)
-        ElementTree.SubElement(element, "parent", link=joint.parent)
-        ElementTree.SubElement(element, "child", link=joint.child)
-        if not joint.moves:
-            continue
-        ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
-        given = [what for what in ("effort", "velocity") if np.isfinite(getattr(joint, what))]
-        given += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
-        if given:
-            ElementTree.SubElement(element, "limit", {what: _text(getattr(joint, what)) for what in given})
-        if (tie := joint.mimic) is not None:
-            numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
-            ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
+        _write_joint(robot, joint)
     if tip is not None:
         ElementTree.SubElement(robot, "tip", link=tip)
     ElementTree.indent(robot)
     head = '<?xml version="1.0" encoding="utf-8"?>\n<!-- written by selfmotion -->\n'
     return head + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_link(robot: ElementTree.Element, link: Link) -> None:
+    element = ElementTree.SubElement(robot, "link", name=link.name)
+    if link.mass or link.inertia.any() or link.center_of_mass.any():
+        body = ElementTree.SubElement(element, "inertial")
+        _write_origin(body, link.center_of_mass, np.eye(3))
+        ElementTree.SubElement(body, "mass", value=_text(link.mass))
+        moments = map(_text, link.inertia[np.triu_indices(3)])
+        ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
+    for seen in link.visuals:
+        visual = _write_shape(element, "visual", seen)
+        if seen.color is not None:
+            material = ElementTree.SubElement(visual, "material", name="")
+            ElementTree.SubElement(material, "color", rgba=_text(seen.color))
+    for shape in link.collisions:
+        _write_shape(element, "collision", shape)
+
+
+def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
+    element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+    _write_origin(element, joint.translation, joint.rotation)
+    ElementTree.SubElement(element, "parent", link=joint.parent)
+    ElementTree.SubElement(element, "child", link=joint.child)
+    if not joint.moves:
+        return
+    ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
+    given = [what for what in ("effort", "velocity") if np.isfinite(getattr(joint, what))]
+    given += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
+    if given:
+        ElementTree.SubElement(element, "limit", {what: _text(getattr(joint, what)) for what in given})
+    if (tie := joint.mimic) is not None:
+        numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
+        ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
 
 
 def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:

@@ -19,8 +19,6 @@ from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["Certificate", "Comparison", "certificate"]
 
-SPREAD = 400  # places at which states and controls are compared
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -133,7 +131,7 @@ def certificate(
             raise ProblemError(f"plans {reference!r} and {name!r} were solved at different parameters", name=name)
     audits = {name: audit(problem, named[name]) for name in order}
     first = named[reference]
-    spread = (np.arange(SPREAD) + 0.5) / SPREAD
+    spread = (np.arange(400) + 0.5) / 400
     comparisons = []
     for name in order:
         solution = named[name]

@@ -9,6 +9,7 @@ integration, as where a push falls between two points, or corrections do not fal
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -19,21 +20,50 @@ from ocp.audit.sizes import FineGrid, plan_at
 from ocp.console import check_time
 from ocp.curves import lagrange
 
-__all__ = ["ROUNDING", "TOLERANCE", "Corrected", "corrected"]
+__all__ = ["SETTINGS", "Corrected", "corrected"]
 
-TOLERANCE = 1e-11  # of the error over one cell of the grid, relative to the size of each state
-ROUNDING = 1e-15  # of a state: its last digit
+
+@dataclass(frozen=True)
+class IntegrationSettings:
+    """How the motion under the controls of a plan is found. Shares are relative.
+
+    Attributes:
+        tolerance: Of the error over one cell of the grid, relative to the size of each state.
+        rounding: Of a state: its last digits.
+        corrections: Of a plan, at most. left: What they may leave, of the sizes: ten times the tolerance.
+        falling: Each correction is less than this share of the one before.
+        order: Of the error of a step in its width.
+        pieces: That a step is split into at once, at most: an unstable step tells no width. rounds: Of splitting.
+        steps: At once, at most: what is stiffer than that, or chatters, breaks down within seconds.
+        block: Steps in one call. blocks: Calls between two looks at the time.
+        inline: Instructions of the dynamics up to which a step is one flat function.
+        grown: Times what every interval adds: a plan that is so far off has been carried off by its dynamics.
+    """
+
+    tolerance: float = 1e-11
+    rounding: float = 4 * float(np.finfo(float).eps)
+    corrections: int = 5
+    left: float = 1e-10
+    falling: float = 0.1
+    order: int = 5
+    pieces: int = 4
+    rounds: int = 40
+    steps: int = 300_000
+    block: int = 512
+    blocks: int = 8
+    inline: int = 1000
+    grown: float = 10.0
+
+
+SETTINGS = IntegrationSettings()
 INNER = np.array([0.46, 0.53, 0.44, 0.55, 0.48])
 """Where each of five cells is looked at inside: unevenly, so that what swings in time with the grid is seen too. A
 polynomial integrates the five together; the number of cells in an interval is a multiple of five."""
 POINTS = np.append(np.ravel([np.arange(5), np.arange(5) + INNER], "F") / 5, 1.0)
 """The samples of five cells together, in 0..1."""
-LENGTH = len(POINTS) - 1
+LENGTH = len(POINTS[1:])
 RULE, ROUGH = (integrals(POINTS, POINTS[1:], degree).T for degree in (LENGTH, LENGTH - 2))
 """What integrates values there from 0 to each of the others, and nearly does: how well, their difference tells."""
-CLOSE = 1e-10  # of the sizes: what corrections may leave
-FALLING = 0.1  # each correction is less than this share of the one before
-ROUNDS = 5
 
 
 class Corrected(NamedTuple):
@@ -115,7 +145,7 @@ class _Newton:
         flow = flow.reshape(n, samples, -1) * (self.width * self.along.solution.horizon)
         panels = _panels(flow)
         doubt = np.abs(panels @ self.doubt).max(axis=1).reshape(n, -1, flow.shape[2]).max(axis=1)
-        room = len(INNER) * TOLERANCE * self.unit + ROUNDING * self.largest
+        room = len(INNER) * SETTINGS.tolerance * self.unit + SETTINGS.rounding * self.largest
         return self._risen(panels, flow.shape) if (doubt <= room).all() else None
 
     def _risen(self, panels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -137,16 +167,16 @@ class _Newton:
             chained: Which of both. rate: By what share corrections fall, as far as is known.
         """
         nx, x, integral, own, last = self.along.form.nx, self.x, self.first, self.own, np.inf
-        for _ in range(ROUNDS):
+        for _ in range(SETTINGS.corrections):
             if integral is None or own is None:
                 break
             change = own + self._carried_on(own[:, -1], x) if chained else own
             size = float(np.abs(change).reshape(-1, nx).max(axis=0) @ (1 / self.unit[:nx]))
-            if not size < FALLING * last:
+            if not size < SETTINGS.falling * last:
                 break
             rate = size / last if np.isfinite(last) else rate
             x = x + change
-            if rate * size <= CLOSE:
+            if rate * size <= SETTINGS.left:
                 return _Settled(x, float(integral[:, -1, nx].sum()) + self._more(change), rate)
             integral, last = self._integral(x), size
             own = None if integral is None else self._own_error(integral, x)

@@ -25,9 +25,6 @@ from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
 
 __all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "ends_of_intervals"]
 
-ROUNDS = 3
-"""Of finding the multipliers that hold the controls and those that hold the states, one with the other."""
-
 
 class Ends(NamedTuple):
     """The conditions at the ends of a plan.
@@ -101,7 +98,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, taken:
     )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
     holding, across = holders(along, costate, curved)
-    for _ in range(ROUNDS):
+    for _ in range(3):  # of the multipliers that hold the controls and those that hold the states, one with the other
         before = holding != 0
         back = Backwards(along, holding, across)
         for k in limited.tolist():

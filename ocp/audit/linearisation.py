@@ -21,10 +21,8 @@ from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHT
 
 __all__ = ["Limits", "Linearisation", "gauss", "integrals"]
 
-POINTS = (3, 5)
-"""Least and largest number of Gauss points of an interval."""
-MOST_NEEDED = 150
-"""Gauss points of a plan from which on the least of an interval are enough: few intervals are wide ones."""
+LEAST_POINTS, MOST_POINTS, ENOUGH_POINTS = 3, 5, 150
+"""Gauss points of an interval, and those of a plan from which on the least are enough: few intervals are wide ones."""
 MOST_DERIVATIVES = 3
 """Of a limit of the states, looked at for a control."""
 
@@ -116,7 +114,7 @@ class Linearisation:
         n = len(self.width)
         pieces = (len(solution.state_interpolant.breaks) - 1) / n
         degree = max(len(solution.control_interpolant.nodes), solution.state_interpolant.values.shape[1] - 1)
-        q = POINTS[1] if pieces > 1 else int(np.clip(max(degree, MOST_NEEDED / n), *POINTS))
+        q = MOST_POINTS if pieces > 1 else int(np.clip(max(degree, ENOUGH_POINTS / n), LEAST_POINTS, MOST_POINTS))
         self.shape = n, q
         self.places = np.array(ca.collocation_points(q, "legendre"))
         self.matrix, self.weight = gauss(self.places)

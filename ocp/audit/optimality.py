@@ -21,9 +21,6 @@ from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE
 
 __all__ = ["Optimality", "optimality"]
 
-SPREADS = 4
-"""Times that pushes at single nodes are spread: each finds them better by the width of an interval."""
-
 
 @dataclass(frozen=True)
 class Optimality:
@@ -79,7 +76,7 @@ def optimality(
     first = adjoint(along, curved, cost)
     if first.lumps.any():
         found, told = first, _told(along, first, curved)
-        for _ in range(SPREADS):
+        for _ in range(4):  # each finds pushes at single nodes better by the width of an interval
             found = adjoint(along, curved, cost, found.lumps)
             now = _told(along, found, curved)
             if now >= told:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ocp.audit.correction import ROUNDING, TOLERANCE, Corrected, corrected
+from ocp.audit.correction import SETTINGS, Corrected, corrected
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.sizes import FineGrid
 from ocp.console import check_time
@@ -21,15 +21,6 @@ from ocp.curves import dormand_prince_step, newton_coefficients
 from ocp.problem.formulation import Formulation, in_blocks
 
 __all__ = ["Reintegration", "integrated", "reintegrate"]
-
-ORDER = 5  # of the error of a step in its width
-MOST_PIECES = 4  # that a step is split into at once: an unstable step tells no width
-MOST_ROUNDS = 40  # of splitting
-MOST_STEPS = 300_000  # at once: what is stiffer than that, or chatters, breaks down within seconds
-BLOCK = 512  # steps in one call
-BLOCKS = 8  # calls between two looks at the time
-INLINE = 1000  # instructions of the dynamics up to which a step is one flat SX function
-GROWN = 10.0  # times what every interval adds: a plan that is so far off has been carried off by its dynamics
 
 
 @dataclass(frozen=True)
@@ -75,7 +66,7 @@ class Reintegration:
         first = int(np.argmax(beyond))
         k = int(self.interval[first])
         here = self.local_errors[self.interval == k].max()
-        return bool(self.added[k] + here <= limit / GROWN)
+        return bool(self.added[k] + here <= limit / SETTINGS.grown)
 
 
 def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
@@ -153,9 +144,9 @@ class Flow:
         curve, self._given = solution.control_interpolant, np.append(along.p, solution.horizon)
         differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
         self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
-        self._tolerance = TOLERANCE * np.append(sizes.state, sizes.cost)
+        self._tolerance = SETTINGS.tolerance * np.append(sizes.state, sizes.cost)
         name = "steps", curve.nodes.tobytes()
-        self._step = form.kept(name, lambda: step_function(form, curve.nodes).mapaccum("steps", BLOCK))
+        self._step = form.kept(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
@@ -173,12 +164,12 @@ class Flow:
         cell, place, width = Steps.even(len(chain), each) if steps is None else steps
         now = np.hstack([starts, np.zeros((len(starts), 1))])
         taken: list[Steps] = []
-        for _ in range(MOST_ROUNDS):
+        for _ in range(SETTINGS.rounds):
             own = chain[cell]
             first, last = np.diff(own, prepend=-1) > 0, np.diff(cell, append=len(chain)) > 0
             after, error = self._run(first, now[own], cell // each, place, width)
             before = np.where(first[:, None], now[own], np.roll(after, 1, axis=0))
-            allowed = self._tolerance + ROUNDING * np.maximum(np.abs(before), np.abs(after))
+            allowed = self._tolerance + SETTINGS.rounding * np.maximum(np.abs(before), np.abs(after))
             good = (error <= allowed).all(axis=1)  # what is not a number is not
             count = np.cumsum(~good)
             kept = count == (count - ~good)[first][np.cumsum(first) - 1]  # nothing before it in its chain is bad
@@ -187,11 +178,11 @@ class Flow:
             taken.append(Steps(cell[kept], place[kept], width[kept]))
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = (error / allowed).max(axis=1)
-            wanted = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / ORDER))
+            wanted = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / SETTINGS.order))
             known = np.isfinite(before).all(axis=1)  # what begins nowhere waits
-            pieces = np.where(good | ~known, 1, np.clip(wanted, 2, MOST_PIECES)).astype(int)[~kept]
+            pieces = np.where(good | ~known, 1, np.clip(wanted, 2, SETTINGS.pieces)).astype(int)[~kept]
             cell, place, width = cell[~kept], place[~kept], width[~kept]
-            if not pieces.size or pieces.sum() > MOST_STEPS:
+            if not pieces.size or pieces.sum() > SETTINGS.steps:
                 break
             cell, place, width = (np.repeat(part, pieces) for part in (cell, place, width))
             number = np.arange(len(cell)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -204,15 +195,15 @@ class Flow:
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and cost behind each step, each from those before it or, where it is a first one, from its start."""
         count, size = len(first), starts.shape[1]
-        whole = -(-count // BLOCK) * BLOCK
+        whole = -(-count // SETTINGS.block) * SETTINGS.block
         data = np.zeros((whole, self._step.size1_in(1)))  # what is left of the last block are steps of no width
         data[:, -len(self._given) :] = self._given
         data[:count, : -len(self._given)] = np.column_stack([first, starts, place, width, self._columns[interval]])
         now, after, errors = starts[0].copy(), np.empty((whole, size)), np.empty((whole, size))
-        for at in range(0, whole, BLOCKS * BLOCK):
+        for at in range(0, whole, SETTINGS.blocks * SETTINGS.block):
             check_time()
-            part = slice(at, at + BLOCKS * BLOCK)
-            in_blocks(self._step, BLOCK, data[part], [after[part], errors[part]], now)
+            part = slice(at, at + SETTINGS.blocks * SETTINGS.block)
+            in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], now)
         return after[:count], np.abs(errors[:count])
 
 
@@ -224,7 +215,7 @@ def step_function(form: Formulation, nodes: np.ndarray) -> Any:
     parameters and the horizon.
     """
     function = form.function("f", [form.f, form.running], ["f", "running"])
-    flat = function.is_a("SXFunction") and function.n_instructions() <= INLINE
+    flat = function.is_a("SXFunction") and function.n_instructions() <= SETTINGS.inline
     sym, size, nw = (ca.SX if flat else ca.MX).sym, form.nx + 1, form.nu * len(nodes)
     x, data = sym("x", size), sym("data", 1 + size + 2 + nw + 2 + form.np + 1)
     new, start, place, width = data[0], data[1 : 1 + size], data[1 + size], data[2 + size]

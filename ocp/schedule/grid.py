@@ -18,37 +18,10 @@ from ocp.errors import ProblemError
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_smooth
 from ocp.schedule.profile import Array, piece_of
 from ocp.schedule.rows import Rows, causes, rows_at
+from ocp.schedule.settings import SETTINGS
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Grid", "make_grid", "nodes_only", "reach"]
-
-UNEVEN, UNEVEN_SPEED = 0.2, 0.02
-"""Largest error of a demand between two nodes, over its limit, when it is taken as even; of the rows of speed, too."""
-AT_ONCE = 10_000
-"""Intervals halved at once."""
-HALVINGS = 8
-JUST_BEFORE = 1e-9
-"""What "just before" means, over the length of the path."""
-SHORTEST = 1e-7
-"""Pieces shorter than this share of the path count with the next."""
-CLOSE = 0.05
-"""Ratio of neighbouring intervals below which their node goes, unless pieces meet there."""
-ROUNDING = 1e-9
-PER_CELL, PER_PATH = 4, 64
-"""Intervals of the first grid in each cell of a blend, and on all segments together at least."""
-OF_BUILD_UP = 0.5
-"""Duration of an interval over the time in which the acceleration builds up..."""
-OF_RAMP = 1 / 20
-"""...or over the time in which the top speed is reached, if that is more."""
-OF_TURN = 0.25
-"""...but no more of that time than this: the speed must not change much in an interval."""
-LEAST_OF_BUILD_UP = 0.05
-"""...nor less than this share of the build-up: where jerks are low, no motion gets near the limits of acceleration."""
-PARTS = 32
-"""Most intervals that one which resolves the limits is cut into: where speeds are low, ramps are short beside it."""
-GROWTH = 1.2
-"""Ratio of neighbouring distances from rest."""
-FIRST = 0.3
-"""Duration of the first and last interval, of constant jerk, over that of the build-up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +61,7 @@ class Grid:
 
     def parts(self) -> list[tuple[int, int]]:
         """First and last nodes of parts of bounded length."""
-        ends = [*range(0, len(self.asked), AT_ONCE), len(self.asked)]
+        ends = [*range(0, len(self.asked), SETTINGS.block), len(self.asked)]
         return list(pairwise(ends))
 
 
@@ -122,18 +95,18 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     check_smooth(path, limits, joints)
     asked, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     # a piece that is next to nothing has no interval of its own
-    some = np.concatenate([[True], np.diff(bounds)[:-1] > SHORTEST * path.length, [True]])
-    some[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SHORTEST * path.length
+    some = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
+    some[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
     nodes = bounds[some]
-    first = _apart(np.concatenate([path.dense(PER_CELL, max(1, PER_PATH // len(bounds))), nodes]), nodes)
+    first = _apart(np.concatenate([path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds))), nodes]), nodes)
     parts = [
-        _halved(path, limits, joints, first[begin : begin + AT_ONCE + 1], (bounds, asked))
-        for begin in range(0, len(first) - 1, AT_ONCE)
+        _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, asked))
+        for begin in range(0, len(first) - 1, SETTINGS.block)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
     s = _apart(np.concatenate([_in_time(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
-    before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(nodes)[:-1] / 2)
+    before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
     of_interval = np.asarray(asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
     sharp = bool(np.isfinite(cells.sharp).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
@@ -152,11 +125,11 @@ def _halved(
     rows = rows_at(path, limits, joints, s)
     _check_rest(rows, s, causes(limits, joints))
     new = np.arange(len(s) - 1)
-    for _ in range(HALVINGS):
+    for _ in range(SETTINGS.halvings):
         middle = (s[new] + s[new + 1]) / 2
         between = rows_at(path, limits, joints, middle)
         wide = _uneven(rows.of(new), between, rows.of(new + 1), _top(rows, s, *asked)[new])
-        wide &= s[new + 1] - s[new] > SHORTEST * path.length
+        wide &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
         if not wide.any():
             break
         cut = new[wide]
@@ -173,7 +146,7 @@ def _halved(
 def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
     """The first nodes of a path, no interval halved: enough to say where the line binds."""
     bounds = np.asarray(path.bounds, dtype=float)
-    s = np.unique(np.concatenate([path.dense(PER_CELL, 1), bounds]))
+    s = np.unique(np.concatenate([path.dense(SETTINGS.cells, 1), bounds]))
     asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
     return Grid(path, limits, None, s, asked, np.zeros(0, dtype=np.intp), np.zeros(0))
 
@@ -194,7 +167,7 @@ def _apart(places: Array, nodes: Array) -> Array:
     for _ in range(3):
         gap = np.diff(s)
         beside = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
-        near = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < CLOSE * beside
+        near = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * beside
         near &= ~np.isin(s, nodes)
         near[1:] &= ~near[:-1]  # of two that are close one stays
         if not near.any():
@@ -214,9 +187,9 @@ def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.boo
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
-        ([rows.speed**2 for rows in sides], top**2, 2 * UNEVEN_SPEED),
-        ([rows.acceleration[:, :, 1] for rows in sides], top**2, UNEVEN),
-        ([rows.jerk[:, :, 2] for rows in sides], top**3, UNEVEN),
+        ([rows.speed**2 for rows in sides], top**2, 2 * SETTINGS.uneven_speed),
+        ([rows.acceleration[:, :, 1] for rows in sides], top**2, SETTINGS.uneven),
+        ([rows.jerk[:, :, 2] for rows in sides], top**3, SETTINGS.uneven),
     )
     wide = np.zeros(len(top), dtype=bool)
     for (first, between, last), scale, most in kinds:
@@ -271,25 +244,25 @@ def _in_time(cells: _Cells, length: float) -> Array:
     ramp = top / most
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(most / sharp, np.sqrt(top / sharp))
-    duration = np.minimum(np.maximum(OF_BUILD_UP * build_up, OF_RAMP * ramp), OF_TURN * ramp)
-    duration = np.maximum(duration, LEAST_OF_BUILD_UP * build_up)
+    duration = np.minimum(np.maximum(SETTINGS.build_up * build_up, SETTINGS.ramp * ramp), SETTINGS.turn * ramp)
+    duration = np.maximum(duration, SETTINGS.least_build_up * build_up)
     speed = np.sqrt(np.maximum(np.maximum(up[:-1], up[1:]), 0.0))
     longest = np.minimum(speed * duration, length)
     # what is a whole number but for rounding is one: the unit of length must not change the nodes
-    parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING)), 1, PARTS).astype(np.intp)
+    parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
     nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _count(parts), length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):
         away = nodes if end == 0 else length - nodes
         build = max(float(build_up[end]), 1e-3 * float(ramp[end]))
         room = float(s[1] if end == 0 else length - s[-2])
-        first = min(float(most[end]) / build * (FIRST * build) ** 3 / 6, room / 4)
+        first = min(float(most[end]) / build * (SETTINGS.first * build) ** 3 / 6, room / 4)
         # intervals in proportion to the distance from rest, until they are as long as the others
         steps = np.diff(np.sort(away))[:3].max(initial=0.0)
-        reached = min(max(steps * GROWTH / (GROWTH - 1), first), length / 2)
-        count = max(int(np.ceil(np.log(reached / first) / np.log(GROWTH))), 1)
-        near[end] = np.asarray(first * GROWTH ** np.arange(count + 1), dtype=float)
-        nodes = nodes[(away == 0) | (away >= near[end][-1] * (1 + (GROWTH - 1) / 2))]
+        reached = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
+        count = max(int(np.ceil(np.log(reached / first) / np.log(SETTINGS.growth))), 1)
+        near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
+        nodes = nodes[(away == 0) | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
     merged = np.unique(np.concatenate([nodes, near[0], length - near[1]]))
     return merged
 

@@ -13,11 +13,9 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.schedule.profile import Array
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["passes"]
-
-ROUNDING = 1e-12
-"""Relative width below which an interval of squared speeds counts as a point."""
 
 
 def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
@@ -49,7 +47,7 @@ def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: A
             up, down = bend > 0, bend < 0
             high_x = min(ceiling[k], ends[up].min(initial=np.inf), starts[down].min(initial=np.inf))
             low_x = max(floor[k], starts[up].max(initial=0.0), ends[down].max(initial=0.0))
-            if not low_x <= high_x * (1 + ROUNDING) + 1e-300:
+            if not low_x <= high_x * (1 + ROUNDING_SHARE) + 1e-300:
                 place = float(distance[k])
                 message = f"no motion keeps the limits of acceleration and torque at {place:g} m; raise them"
                 raise ProblemError(message, name="acceleration", value=low_x, limit=high_x, time=place)

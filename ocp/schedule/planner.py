@@ -15,21 +15,13 @@ from ocp.schedule.limits import JointPath, LineLimits, PathLike, check_line
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
 from ocp.schedule.ramps import Zones, plan, ramp_distance
 from ocp.schedule.rows import causes
+from ocp.schedule.settings import SETTINGS
 from ocp.schedule.stretch import fastest_over
 from ocp.schedule.window import Stretch
 from ocp.schedule.zones import ramps_below_the_curve
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Dip", "Schedule", "schedule"]
-
-BINDING = 0.98
-"""A limit binds where more than this share of it is used."""
-REACHED = 1e-4
-"""A speed that lies below the asked one by less than this share is no dip."""
-LONG = 400
-"""Pieces of a path from which on, where centripetal acceleration alone is limited, ramps are taken."""
-LEAVING = 1e-5
-"""Share of the asked speed that a motion may lie below it near the ends of a stretch, when that is long enough."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +130,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     more = limited is not None or limits.tool is not None or np.isfinite(limits.centripetal)
     if base is not None and not more:
         return Schedule(path, limits, base, (), joints)
-    if base is not None and limited is None and limits.tool is None and len(path.bounds) > LONG:
+    if base is not None and limited is None and limits.tool is None and len(path.bounds) > SETTINGS.long_path:
         profile = ramps_below_the_curve(path, limits)
         grid = nodes_only(path, limits)
     else:
@@ -251,7 +243,7 @@ def _long_enough(grid: Grid, motion: SpeedProfile, first: int, last: int) -> boo
         if node in (0, len(grid.asked)):
             continue
         near = np.abs(motion.distance - grid.distance[node]) < 0.02 * length
-        if (motion.speed[near] < grid.asked[inside] * (1 - LEAVING)).any():
+        if (motion.speed[near] < grid.asked[inside] * (1 - SETTINGS.leaving)).any():
             return False
     return True
 
@@ -275,7 +267,7 @@ def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Di
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     of_line = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.asked), dtype=np.intp), np.zeros(len(grid.asked))
-    binding = middle.speed < grid.asked * (1 - REACHED)
+    binding = middle.speed < grid.asked * (1 - SETTINGS.reached)
     for first, last in grid.parts():
         part, sides = slice(first, last), grid.ends(first, last)
         here = LineMotion(*(value[part] for value in middle))
@@ -283,7 +275,7 @@ def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Di
         line = demand[:, of_line].max(axis=1, initial=0.0)
         demand[:, of_line] = 0.0
         cause[part], most = demand.argmax(axis=1), demand.max(axis=1)
-        binding[part] &= (most > BINDING) & (most >= line - (1 - BINDING))
+        binding[part] &= (most > SETTINGS.binding) & (most >= line - (1 - SETTINGS.binding))
         steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
     permitted = np.minimum(steady, grid.asked)
     changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.asked) != 0)
@@ -292,7 +284,7 @@ def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Di
     if not runs.size:
         return ()
     # runs of one cause are one dip, unless the asked speed is reached between them: the count of such intervals grows
-    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.asked * (1 - REACHED))])
+    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.asked * (1 - SETTINGS.reached))])
     begin, end = runs[1:, 0], runs[:-1, 1]
     apart = (cause[begin] != cause[end - 1]) | (grid.asked[begin] != grid.asked[end - 1])
     groups = np.concatenate([[0], 1 + np.flatnonzero(apart | (reached[begin] != reached[end]))])

@@ -15,7 +15,6 @@ from ocp.errors import NOT_NUMBERS, ProblemError, floats
 __all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "joined", "piece_of", "through"]
 
 Array = NDArray[np.float64]
-NEWTON_STEPS = 60
 
 
 class LineMotion(NamedTuple):
@@ -175,7 +174,7 @@ class SpeedProfile:
         whole = advanced(v[todo], a[todo], j[todo], high)[0]
         t[todo] = high * np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0) ** np.where(a[todo] == 0, 0.5, 1)
         low = np.zeros_like(high)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(60):  # more than halving a bracket to the last digit takes
             if not todo.size:
                 break
             x = t[todo]

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from copy import copy
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -34,28 +35,44 @@ from scipy.sparse import csr_array
 
 from ocp.errors import SolveError
 from ocp.schedule.profile import Array
+from ocp.tolerances import SOLVER_SHARE
 
-__all__ = ["Program", "Spline", "SplineRows", "least_time"]
+__all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "least_time"]
 
-STEPS = 200
-ACCEPTED, MORE_STEPS = 1e-3, 10
-"""Complementarity over the time that is accepted where rounding leads no further in so many steps."""
-DIVERGED = 1e12
-"""Complementarity over the time that tells that no motion keeps the rows."""
-TO_BOUNDARY = 0.995
-"""Share of the way to the nearest bound that a step takes at most."""
-LOST = 0.7
-"""Share of a coefficient that a step takes at most: a motion that all but stands still somewhere may be a trap."""
-ALIKE = 10
-"""Intervals of a block, from whose middle to the next one's the lengths of steps change."""
-FIRM = 0.0, 1e-14, 1e-12, 1e-10
-"""Added to the diagonal of the equations of a step, relative, until rounding does not make them indefinite."""
-ASTRAY, NO_MATTER = 2.0, 1e-2
-"""Ratio by which the worst miss may grow in a step, and what it may grow to, relative to the bound, in any case."""
-INFEASIBLE, MORE_SO = 1e-6, 100.0
-"""What a row may miss its bound by, relative, when a solution is accepted; or so many times the accuracy's square."""
-UNEVEN = 1e-3
-"""Sum of the slopes that prices leave, by the logarithm of the coefficients, over the time, when it is accepted."""
+
+@dataclass(frozen=True)
+class ProgramSettings:
+    """How the interior point goes. Shares are relative; complementarity is over the time.
+
+    Attributes:
+        steps: At most. more_steps: After one that is accepted, where rounding leads no further.
+        accepted: Complementarity at which a solution is accepted, and what prices may leave of the slopes by the
+            logarithm of the coefficients, over the time.
+        missed: What a row may miss its bound by in a solution that is accepted, or `missed_by_accuracy` times the
+            square of the accuracy that is asked.
+        diverged: Complementarity above which no motion keeps the rows.
+        to_boundary: Share of the way to the nearest bound that a step takes at most.
+        lost: Share of a coefficient that a step takes at most: a motion that all but stands still may be a trap.
+        block: Intervals of a block, from whose middle to the next one's the lengths of steps change.
+        firm: Added to the diagonal of the equations of a step, until rounding does not make them indefinite.
+        astray: Ratio by which the worst miss may grow in a step. no_matter: What it may be in any case.
+    """
+
+    steps: int = 200
+    more_steps: int = 10
+    accepted: float = 1e-3
+    missed: float = SOLVER_SHARE
+    missed_by_accuracy: float = 100.0
+    diverged: float = 1e12
+    to_boundary: float = 0.995
+    lost: float = 0.7
+    block: int = 10
+    firm: tuple[float, ...] = (0.0, 1e-14, 1e-12, 1e-10)
+    astray: float = 2.0
+    no_matter: float = 1e-2
+
+
+INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
@@ -224,7 +241,7 @@ class _Steps:
     """
 
     def __init__(self, band: Array) -> None:
-        for firm in FIRM:
+        for firm in INTERIOR.firm:
             firmer = band.copy(order="F")
             firmer[0] *= 1 + firm
             self.factors, failed = dpbtrf(firmer, lower=1, overwrite_ab=1)
@@ -266,12 +283,12 @@ class _Rows:
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))
         shape = self.count, len(interval)
         self.by_interval = csr_array((np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape)
-        block = self.interval // ALIKE
+        block = self.interval // INTERIOR.block
         starts = np.diff(block, prepend=-1) != 0
         starts[self.count : self.count + 1] = True
         self.runs = np.flatnonzero(starts)
         self.blocks = block[self.runs]
-        self.middles = ALIKE * np.arange(self.blocks.max() + 1) + (ALIKE - 1) / 2
+        self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def look(self, b: Array) -> tuple[Array, Array]:
         """What rows miss their bounds by, and the size of these. Takes the tangents of the rows of jerk at b."""
@@ -382,10 +399,10 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     found: Array | None = None
     latest, worst, together = 0, np.inf, False
     before: tuple[tuple[Array, float, Array], ...] = ()
-    for number in range(STEPS):
+    for number in range(INTERIOR.steps):
         np.maximum(slack, -gap, out=slack)
         lacking = _lacking(gap, slack, size, count)
-        if before and not together and not lacking.max() < max(ASTRAY * worst, NO_MATTER):
+        if before and not together and not lacking.max() < max(INTERIOR.astray * worst, INTERIOR.no_matter):
             together = True
             b, slack, price = (value + step * change for value, step, change in before)
             gap, size = every.look(b)
@@ -393,19 +410,20 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             lacking = _lacking(gap, slack, size, count)
         time, slope, *curvature = _time(spline.share, cost_weights, b)
         mean, worst = float(slack @ price) / len(gap), float(lacking.max())
-        if not np.isfinite(mean + worst) or mean * len(gap) > DIVERGED * time:
+        if not np.isfinite(mean + worst) or mean * len(gap) > INTERIOR.diverged * time:
             if found is not None:
                 return found
             break
-        if worst < max(INFEASIBLE, MORE_SO * accuracy**2) and mean * len(gap) < max(ACCEPTED, accuracy) * time:
+        near_enough = mean * len(gap) < max(INTERIOR.accepted, accuracy) * time
+        if near_enough and worst < max(INTERIOR.missed, INTERIOR.missed_by_accuracy * accuracy**2):
             residual = slope + every.gathered(price)
             fixing.reduce(residual)
-            if float(np.abs(residual * b).sum()) < max(UNEVEN, accuracy) * time:
+            if float(np.abs(residual * b).sum()) < max(INTERIOR.accepted, accuracy) * time:
                 found = b
         if found is not None and (mean * len(gap) < accuracy * time or number > latest):
             return found
         if found is None:
-            latest = number + MORE_STEPS
+            latest = number + INTERIOR.more_steps
 
         per_slack, missed = 1 / slack, gap + slack
         pull = price * per_slack
@@ -432,8 +450,8 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         of_slack = -(missed + every.of(change))
         of_price = wanted - price - pull * of_slack
         taken = [
-            every.longest(of_slack * per_slack, TO_BOUNDARY, LOST),
-            every.longest(of_price / price, TO_BOUNDARY, TO_BOUNDARY),
+            every.longest(of_slack * per_slack, INTERIOR.to_boundary, INTERIOR.lost),
+            every.longest(of_price / price, INTERIOR.to_boundary, INTERIOR.to_boundary),
         ]
         shortest = [each.min() for each in taken]
         if together:
@@ -447,7 +465,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     row = int(lacking.argmax())
     place = float(spline.nodes[every.interval[row]])
     message = f"no motion keeps the limits near {place:g} m: they miss one another by {worst:.2g}"
-    raise SolveError(message, name="limits", value=worst, limit=INFEASIBLE, time=place)
+    raise SolveError(message, name="limits", value=worst, limit=INTERIOR.missed, time=place)
 
 
 def _lacking(gap: Array, slack: Array, size: Array, count: int) -> Array:

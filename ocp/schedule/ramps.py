@@ -16,6 +16,7 @@ from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from ocp.errors import ProblemError, checked_nonnegative, checked_positive
 from ocp.schedule.profile import Array, SpeedProfile, advanced
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Memory", "Phases", "Zones", "fastest", "peak_acceleration", "plan", "ramp_distance", "ramp_time", "reach"]
 
@@ -24,8 +25,6 @@ Phases = tuple[tuple[float, float], ...]
 Memory = MutableMapping[tuple[float, ...], Phases]
 """Motions already found, by their limits and ends."""
 
-END_ERROR = 1e-9
-"""Largest error of a motion's end, relative to its length and top speed."""
 REACH_MARGIN = 1e-6
 """Share of a zone's length kept back when its ends' speeds are chosen, so that a motion surely exists."""
 
@@ -137,13 +136,13 @@ def fastest(distance: float, first: float, last: float, top: float, acceleration
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
     """Whether a motion ends at its distance and last speed, and stays between the speeds on the way."""
     s, v, a = 0.0, first, 0.0
-    error = END_ERROR * top
+    error = ROUNDING_SHARE * top
     for t, j in phases:
         way, v, a = advanced(v, a, j, t)
         s += way
         if not min(first, last) - error <= v <= top + error:
             return False
-    return abs(s - distance) <= END_ERROR * distance and abs(v - last) <= error
+    return abs(s - distance) <= ROUNDING_SHARE * distance and abs(v - last) <= error
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:

@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 
 from ocp.schedule.limits import JointPath, LineLimits, PathLike, curvature_along, rates_along, tool_along, torques_along
 from ocp.schedule.profile import Array, LineMotion
+from ocp.schedule.settings import SETTINGS
 
 __all__ = ["Rows", "causes", "rows_at", "torque_rows"]
-
-AT_ONCE = 20_000
-"""Places handled at once."""
 
 
 class Rows(NamedTuple):
@@ -116,16 +114,16 @@ def rows_at(
     Raises:
         ProblemError: A curvature or joints that are not finite, as at a singular arm, or of a wrong shape.
     """
-    if len(distance) <= AT_ONCE:
+    if len(distance) <= SETTINGS.block:
         return _rows_at(path, limits, joints, distance, torques)
     # into memory that is there: the parts of a long path and the whole would be twice as much
     speed, acceleration, jerk = (len(kind) for kind in _kinds(limits, joints))
     shapes = ((speed,), (acceleration, 3), (jerk, 3))
     all_of_them = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
-    for first in range(0, len(distance), AT_ONCE):
-        part = _rows_at(path, limits, joints, distance[first : first + AT_ONCE], torques)
+    for first in range(0, len(distance), SETTINGS.block):
+        part = _rows_at(path, limits, joints, distance[first : first + SETTINGS.block], torques)
         for kind, own in zip(all_of_them, part, strict=True):
-            kind[first : first + AT_ONCE] = own
+            kind[first : first + SETTINGS.block] = own
     return all_of_them
 
 

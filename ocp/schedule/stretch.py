@@ -1,16 +1,15 @@
 """The fastest motion over a stretch of a path: its limits as rows, solved, looked at between the nodes, and tightened.
 
-A rough motion over every second node, under the rows at one place of every interval, tells which of them matter: few
-do. These are held at both ends of the interval, and at that of its places where they use most. The motion under them
-is looked at; a row that is passed is held there too, and where it was already, the bounds of the interval are lowered
-by as much. This is done until none is passed, at last in the few intervals alone that still are, and those about them.
-Long stretches are solved in windows: each comes to rest at its end, so that a motion beyond the next seam is known to
-exist.
+A rough motion, under the rows at one place of every interval, tells which of them matter: few do. These are held at
+both ends of the interval, and at that of its places where they use most. The motion under them is looked at; a row that
+is passed is held there too, and where it was already, the bounds of the interval are lowered by as much. This is done
+until none is passed, at last in the few intervals alone that still are, and those about them. Long stretches are solved
+in windows: each comes to rest at its end, so that a motion beyond the next seam is known to exist.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,37 +23,11 @@ from ocp.schedule.passes import passes
 from ocp.schedule.profile import Array, SpeedProfile, joined
 from ocp.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.schedule.rows import Rows
-from ocp.schedule.window import HELD, INSIDE, ROOM, Ends, Motion, Stretch, Window, demanded, profile_of
+from ocp.schedule.settings import SETTINGS
+from ocp.schedule.window import HELD, INSIDE, Ends, Motion, Stretch, Window, demanded, profile_of
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["fastest_over"]
-
-ROUNDS = 20
-"""Of tightening."""
-MANY = 200
-"""So many intervals, and two at a time are one in the first round, which is to find the rows that matter."""
-AROUND, FEW = 40, 1 / 6
-"""Intervals on either side of one that passes a limit, which are planned again with it; they alone if they are few."""
-MOST = 1.5
-"""Largest ratio by which a bound is lowered in a round."""
-ACCURACIES = 0.05, 1e-3, 1e-5, 1e-8
-"""Of the time of a window, relative, round by round: no more than rows still change by; the last is for all later."""
-CENTER, CENTER_AGAIN = 1.0, 0.1
-"""Where the interior point begins, the first time and from a solution."""
-LEAST_BESIDE = 0.01
-"""Squared speed inside an interval over that at its beginning at least, where the spline of a rough motion dives."""
-AGAIN = 0.9
-"""Squared speed to start again from, over that of the solution."""
-START = 0.5
-"""Squared speed to start from, over that of a fastest steady motion that accelerates as it may."""
-WINDOW, OVERLAP = 2000, 200
-"""Intervals of a window, and those at its end that the next one plans again."""
-SEAM = 1 - 1e-3
-"""Share of the bounds that a window uses behind its seam, so that the next has room."""
-NEVER = 0.98
-"""Rows that reach less than this share of their bound whatever the motion are left out at first..."""
-NEAR = 0.9
-"""...and, once a motion is known, those that came less near to it in an interval and beside it."""
 
 
 class _Margins(NamedTuple):
@@ -104,7 +77,7 @@ class _Tight:
     def of(cls, window: Window) -> _Tight:
         """What every window begins with."""
         count, rows = window.last - window.first, window.rows[0]
-        margins, times = (_Margins.all_of(value, count, rows) for value in (1 - ROOM, 0.0))
+        margins, times = (_Margins.all_of(value, count, rows) for value in (1 - SETTINGS.room, 0.0))
         held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
@@ -120,7 +93,7 @@ class _Tight:
             used, values: What was demanded.
             jerks: Coefficients of the jerk in the rows of it. Shape (N, P).
         """
-        near = used > NEAR
+        near = used > SETTINGS.near
         near[:, 1:] |= near[:, :-1].copy()
         near[:, :-1] |= near[:, 1:].copy()
         self.held[[0, -1]] |= near
@@ -133,7 +106,7 @@ class _Tight:
         Where the window before or the next one is held to them too, all stay.
         """
         own = slice(self.inherited, seam)
-        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > NEAR
+        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
         self.bend(jerks)
 
     def bend(self, jerks: Array) -> None:
@@ -160,12 +133,12 @@ class _Tight:
             seam: Interval at which the next window begins.
         """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
-        most = np.where(held, np.minimum(used, MOST), 0.0).max(axis=0)
-        most[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], MOST)
+        most = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
+        most[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
         for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
             over = most[:, a:z] if margin.ndim == 2 else most[:, a:z].max(axis=1, initial=0.0)
             at = np.nonzero(over > 1)
-            margin[at] /= np.minimum(1 + (over[at] - 1 + ROOM / 2) * 2.0 ** times[at], MOST)
+            margin[at] /= np.minimum(1 + (over[at] - 1 + SETTINGS.room / 2) * 2.0 ** times[at], SETTINGS.lowered)
             times[at] += 1
             if margin.ndim == 2:
                 # the next window begins on this motion, and has the margins: it must keep them at all places
@@ -184,9 +157,9 @@ def fastest_over(stretch: Stretch) -> SpeedProfile:
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
-        end = stretch.last if stretch.last - begin < WINDOW + OVERLAP else begin + WINDOW
+        end = stretch.last if stretch.last - begin < SETTINGS.window + SETTINGS.overlap else begin + SETTINGS.window
         last = end == stretch.last
-        seam = end if last else end - OVERLAP
+        seam = end if last else end - SETTINGS.overlap
         goal = stretch.ends[1] if last else (0.0, 0.0)
         window = Window.of(stretch, begin, end, (state, goal))
         part, state, behind = _settled(window, seam, behind)
@@ -214,7 +187,7 @@ def _settled(window: Window, seam: int, before: _Tight | None) -> tuple[SpeedPro
         tight.held[:, :, : before.held.shape[2]] = before.held
         tight.speeds[:, : before.held.shape[2]] = before.speeds
         tight.inherited = before.held.shape[2]
-    kept, seen = seam - window.first, min(seam + OVERLAP // 2, window.last) - window.first
+    kept, seen = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tightened(window, tight, seam, seen)
     state = float(x[kept]), 0.0 if slope is None else float(slope[kept])
     return profile_of(window, x[: kept + 1], slope), state, tight.part(kept, window.last - window.first)
@@ -232,9 +205,10 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Arr
     """
     every = np.arange(window.last - window.first)
     sharp = window.grid.sharp
+    accuracies = SETTINGS.accuracies if sharp else SETTINGS.accuracies[-1:]
     start, free = None, every
-    for number in range(ROUNDS):
-        accuracy = ACCURACIES[min(number, len(ACCURACIES) - 1)] if sharp else ACCURACIES[-1]
+    for number in range(SETTINGS.rounds):
+        accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
             x, slope = _solved(window, tight, seam, start, accuracy, free)
         except ProblemError:
@@ -250,7 +224,7 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Arr
             continue
         passed = used > 1 + ROUNDING_SHARE
         over = np.asarray(passed.any(axis=(0, 2)))
-        if not over[:seen].any() and accuracy == ACCURACIES[-1]:
+        if not over[:seen].any() and accuracy == accuracies[-1]:
             return x, slope
         if slope is not None and number == 1:
             tight.let_go(values, window.rows[1].jerk[:, :, 0], seam - window.first)
@@ -258,60 +232,17 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Arr
         if slope is None:
             continue
         start = x, slope
-        near = np.flatnonzero(maximum_filter1d(over, 2 * AROUND + 1))
-        free = near if accuracy == ACCURACIES[-1] and len(near) < FEW * len(every) else every
+        near = np.flatnonzero(maximum_filter1d(over, 2 * SETTINGS.around + 1))
+        free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
     worst = used[:, :seen].max(axis=(0, 2))
     place, most = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are passed by {most - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=most, limit=1.0, time=place)
 
 
-def _coarse(window: Window) -> Window:
-    """A window with every second node of another one, whose rows there are those inside its intervals.
-
-    Near ends at which it moves it has all nodes: there the motion is bound to what is known.
-    """
-    count, grid = window.last - window.first, window.grid
-    begin, end = (AROUND if x > 0 else 0 for x, _ in window.ends)
-    parts = np.arange(begin), np.arange(begin, count - end, 2), np.arange(count - end, count + 1)
-    at = np.unique(np.concatenate(parts))
-    left, right = window.rows[0].of(at[:-1]), window.rows[-1].of(at[1:] - 1)
-    whole = np.diff(at) == 1
-    between = window.rows[0].of(at[:-1] + 1 - whole)
-
-    def inside(rows: Rows) -> Rows:
-        kinds = zip(rows.of(at[:-1]), between, strict=True)
-        return Rows(*(np.where(whole.reshape(-1, *(1,) * (own.ndim - 1)), own, other) for own, other in kinds))
-
-    asked = np.minimum.reduceat(grid.asked[window.first : window.last], at[:-1])
-    own = replace(grid, distance=window.nodes[at], asked=asked)
-    return Window(own, 0, len(asked), window.ends, (left, *map(inside, window.rows[1:-1]), right))
-
-
-def _roughly(window: Window, tight: _Tight, seam: int) -> Motion:
-    """Squared speeds and slopes at the nodes of a motion that is next to the fastest; limits are kept all but."""
-    every = np.arange(window.last - window.first)
-    if len(every) < MANY:
-        return _with_jerk(window, tight, seam, None, ACCURACIES[0], every)
-    few = _coarse(window)
-    try:
-        x, slope = _with_jerk(few, _Tight.of(few), few.last, None, ACCURACIES[0], every[: few.last])
-    except ProblemError:  # too coarse to leave a known motion
-        return _with_jerk(window, tight, seam, None, ACCURACIES[0], every)
-    at = np.minimum(np.searchsorted(few.nodes, window.nodes, side="right") - 1, len(x) - 2)
-    way, h = window.nodes - few.nodes[at], np.diff(few.nodes)[at]
-    bend = np.diff(slope)[at] / h
-    found = x[at] + way * (slope[at] + way * bend / 2), slope[at] + way * bend
-    for rest, next_to, near in ((0, 1, at == 0), (-1, -2, at == len(x) - 2)):
-        if x[rest] == 0:
-            share = np.abs(window.nodes - few.nodes[rest])[near] / h[near]
-            found[0][near], found[1][near] = x[next_to] * share ** (4 / 3), slope[next_to] * np.cbrt(share)
-    return np.maximum(found[0], 0.0), found[1]
-
-
 def _room(window: Window, seam: int) -> Array:
     """Share of the limits that the intervals of a window may use. Shape (N,)."""
-    return np.where(np.arange(window.first, window.last) < seam, 1.0, SEAM)
+    return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
 def _solved(
@@ -319,9 +250,7 @@ def _solved(
 ) -> tuple[Array, Array | None]:
     """Squared speeds at the nodes, and their slopes where jerks are limited; new in the free intervals alone."""
     if window.grid.sharp:
-        return (
-            _roughly(window, tight, seam) if start is None else _with_jerk(window, tight, seam, start, accuracy, free)
-        )
+        return _with_jerk(window, tight, seam, start, accuracy, free)
     return _without_jerk(window, tight.margins), None
 
 
@@ -406,7 +335,7 @@ def _with_jerk(
     program = Program(spline, rows, most, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
         if known is None:
-            b = least_time(program, b, accuracy=accuracy, center=CENTER)
+            b = least_time(program, b, accuracy=accuracy, center=SETTINGS.center)
         elif len(free) == end - begin:
             b = _again(program, b, accuracy)
         else:
@@ -425,10 +354,12 @@ def _again(program: Program, known: Array, accuracy: float) -> Array:
     """Solve a program from a solution of one like it; where that leads nowhere, from further inside."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
+    start = np.where(free, SETTINGS.again, 1.0) * known
     try:
-        return least_time(program, np.where(free, AGAIN, 1.0) * known, accuracy=accuracy, center=CENTER_AGAIN)
+        return least_time(program, start, accuracy=accuracy, center=SETTINGS.center_again)
     except SolveError:
-        return least_time(program, np.where(free, 0.3 * AGAIN, 1.0) * known, accuracy=accuracy, center=CENTER)
+        start[free] *= SETTINGS.again_inside
+        return least_time(program, start, accuracy=accuracy, center=SETTINGS.center)
 
 
 def _start(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
@@ -437,7 +368,7 @@ def _start(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Ar
     From rest x^(3/4) grows by the square root of 9/2 of the jerk times the distance; from a motion it may fall so too.
     """
     steady = np.minimum(left.steady()[0], right.steady()[0])
-    y = (START * np.minimum(most, _beside(steady) ** 2)) ** 0.75
+    y = (SETTINGS.start * np.minimum(most, _beside(steady) ** 2)) ** 0.75
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
     away = np.concatenate([[0.0], np.cumsum(np.sqrt(4.5 * sharp) * np.diff(nodes))])
@@ -485,7 +416,7 @@ def _rows(
     nodes = np.flatnonzero((caps < implied * (1 - ROUNDING_SHARE)) & np.isfinite(caps))
     nodes = nodes[(nodes >= int(moving[0])) & (nodes <= count - int(moving[1]))]
     parts = [_speeds(np.minimum(nodes, count - 1), (nodes == count).astype(float), 1 / caps[nodes])]
-    slow = np.flatnonzero(shares.speed < SEAM * (1 - ROOM))
+    slow = np.flatnonzero(shares.speed < SETTINGS.seam * (1 - SETTINGS.room))
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speeds(slow, np.full(len(slow), inside), most))
@@ -526,7 +457,7 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
 
     def at(inside: float) -> Array:
         way = inside * spline.h
-        return np.asarray(np.maximum(x[:-1] + way * (slope[:-1] + way * bend / 2), LEAST_BESIDE * x[:-1]))
+        return np.asarray(np.maximum(x[:-1] + way * (slope[:-1] + way * bend / 2), SETTINGS.dive * x[:-1]))
 
     places = [(0.0, *INSIDE, 1.0)[k] for k in HELD]
     return np.sqrt([at(inside) / at(_jerk_of(inside)) for inside in places])
@@ -553,6 +484,6 @@ def _reached(rows: Rows, up: Array, rates: Array, shares: _Margins) -> NDArray[n
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = np.where(j[:, :, 0] > 0, (1 + bent) / j[:, :, 0], np.inf).min(axis=1, initial=np.inf)
         of_j = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + bent
-    return np.concatenate(
-        [np.zeros(rows.speed.shape, dtype=bool), of_a > NEVER * shares.acceleration, of_j > NEVER * shares.jerk], axis=1
-    )
+    none = np.zeros(rows.speed.shape, dtype=bool)
+    most = SETTINGS.binding
+    return np.concatenate([none, of_a > most * shares.acceleration, of_j > most * shares.jerk], axis=1)

@@ -11,21 +11,14 @@ from numpy.typing import NDArray
 from ocp.schedule.grid import Grid
 from ocp.schedule.profile import Array, LineMotion, SpeedProfile, through
 from ocp.schedule.rows import Rows, rows_at, torque_rows
+from ocp.schedule.settings import SETTINGS
 
-__all__ = ["HELD", "INSIDE", "ROOM", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
+__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
 
-ROOM = 5e-4
-"""Share of the limits that is left for what lies between the places where rows are held."""
-BEND = 1e-4
-"""Share of the limits by which a demand may bend away from a parabola before more places are looked at."""
 INSIDE = (0.25, 0.5, 0.75)
 """Where each interval is looked at between its ends, as shares of its length."""
-LOOKED = 0.75
-"""Share of a bound that is used at one of these places where it may be passed between them."""
 HELD = (0, 1, 3, 4)
 """Which of the places, ends included, rows are held at: not the middle, where the jerk of the motion may change."""
-FINE = 16
-"""Parts of an interval at whose ends demands are looked at where they bend sharply; the middle is one of them."""
 
 Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 """Squared speed and its slope by the distance, at the beginning and at the end."""
@@ -79,17 +72,20 @@ class Window(Stretch):
         return cls(grid, first, last, ends, all_of_them, bends)
 
     def closely(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Rows at the ends of the `FINE` parts of some intervals but for their own, place by place.
+        """Rows at the ends of the `fine` parts of some intervals but for their own, place by place.
 
-        Shape ((FINE - 1) B,); those of torques, which take longest, where they are asked for.
+        Shape ((SETTINGS.fine - 1) B,); those of torques, which take longest, where they are asked for.
         """
+        parts = SETTINGS.fine
         new = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
         if new:
             grid, begin, h = self.grid, self.nodes[new], np.diff(self.nodes)[new]
-            places = begin[:, None] + np.arange(1, FINE) / FINE * h[:, None]
+            places = begin[:, None] + np.arange(1, parts) / parts * h[:, None]
             rows = rows_at(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
             for k, at in enumerate(new):
-                self.close[self.first + at, torques] = rows.of(slice(k * (FINE - 1), (k + 1) * (FINE - 1)))
+                self.close[self.first + at, torques] = rows.of(
+                    slice(k * (SETTINGS.fine - 1), (k + 1) * (SETTINGS.fine - 1))
+                )
         found = [self.close[self.first + at, torques] for at in intervals.tolist()]
         return Rows(*(np.stack(kind, axis=1).reshape(-1, *kind[0].shape[1:]) for kind in zip(*found, strict=True)))
 
@@ -160,7 +156,7 @@ def demanded(
     values = np.stack([rows.demands(motion) for half in halves for rows, motion in half])
     used = np.stack([values.max(axis=0), -values.min(axis=0)])
     # a parabola is beyond the greatest of three of its values by at most a quarter of these
-    at_row = np.nonzero(np.maximum(*used) > LOOKED)
+    at_row = np.nonzero(np.maximum(*used) > SETTINGS.looked)
     high = np.stack([value[at_row] for value in values])
     shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
     places_of = [place[at_row[0]] for place in shares]
@@ -208,7 +204,7 @@ def _missed(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, 
         of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
     ]
     missed = np.concatenate(miss, axis=1)
-    return np.asarray((missed > BEND) & (used.max(axis=0) + missed > 1))
+    return np.asarray((missed > SETTINGS.bend) & (used.max(axis=0) + missed > 1))
 
 
 def _closely(
@@ -223,12 +219,11 @@ def _closely(
         known: Demands at their beginning, before and after that change, and at their end. Shape (4, B, R).
         torques: Whether those of torques are asked for.
     """
-    half = FINE // 2
-    places = window.nodes[bent] + np.arange(1, FINE)[:, None] / FINE * np.diff(window.nodes)[bent]
-    demands = (
-        window.closely(bent, torques).demands(profile.at_distance(places.ravel())).reshape(FINE - 1, len(bent), -1)
-    )
-    fine = np.arange(FINE + 1)[:, None] / FINE + np.zeros(len(bent))
+    parts, half = SETTINGS.fine, SETTINGS.fine // 2
+    places = window.nodes[bent] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[bent]
+    demands = window.closely(bent, torques).demands(profile.at_distance(places.ravel()))
+    demands = demands.reshape(parts - 1, len(bent), -1)
+    fine = np.arange(parts + 1)[:, None] / parts + np.zeros(len(bent))
     fine[half] = f
     begin, before, after, end = known[:, None]
     used = np.zeros((2, *begin.shape[1:]))

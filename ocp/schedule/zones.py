@@ -15,28 +15,10 @@ from ocp.errors import ProblemError
 from ocp.schedule.limits import LineLimits, PathLike, curvature_along
 from ocp.schedule.profile import Array, SpeedProfile, piece_of
 from ocp.schedule.ramps import Zones, plan
+from ocp.schedule.settings import SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["ramps_below_the_curve"]
-
-KEPT_BACK = 2e-4
-"""Share of the permitted speed kept back for what lies between two points of the grid."""
-MINIMUM_ERROR = 2e-4
-"""Largest relative error of a minimum of the permitted speed, estimated by its second difference."""
-LARGEST_CHANGE = 0.1
-"""Largest relative change of it between two points; the lower one counts for what lies between."""
-HALVINGS = 12
-SMALLEST_INTERVAL = 1e-12
-"""Intervals below this share of the path are not cut further."""
-JUST_BEFORE = 1e-9
-AT_ONCE = 20_000
-"""Pieces whose curve is made at once."""
-PLACES = 500_000
-"""Of the curve, looked at at once."""
-SPREAD = 1.2
-"""A stretch of one speed spans permitted speeds up to this ratio."""
-ROUNDS, THOROUGH_FROM = 200, 40
-"""Rounds after which no plan is found, and after which every place gets its own permitted speed."""
 
 
 def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
@@ -47,11 +29,11 @@ def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
     """
     s, permitted, asked = _curve(path, limits)
     speed, memory = asked.copy(), dict[tuple[float, ...], tuple[tuple[float, float], ...]]()
-    for number in range(ROUNDS):
+    for number in range(SETTINGS.zone_rounds):
         profile = plan(_zones(s, speed, limits), memory)
-        if not _lowered(s, permitted, speed, profile, number >= THOROUGH_FROM):
+        if not _lowered(s, permitted, speed, profile, number >= SETTINGS.thorough_from):
             return profile
-    message = f"no plan below the speed that centripetal acceleration permits, after {ROUNDS} rounds"
+    message = f"no plan below the speed that centripetal acceleration permits, after {SETTINGS.zone_rounds} rounds"
     raise ProblemError(message, name="centripetal", value=limits.centripetal)
 
 
@@ -60,16 +42,16 @@ def _curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.dense(8, 2), bounds]))
     parts = []
-    for begin in range(0, len(of_pieces), AT_ONCE):
-        ends = bounds[begin : begin + AT_ONCE + 1]
+    for begin in range(0, len(of_pieces), SETTINGS.block):
+        ends = bounds[begin : begin + SETTINGS.block + 1]
         low, high = np.searchsorted(first, ends[[0, -1]])
-        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + AT_ONCE]))
+        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + SETTINGS.block]))
     s = np.concatenate([part[0][:-1] for part in parts] + [first[-1:]])
     permitted = np.concatenate([part[1][:-1] for part in parts] + [parts[-1][1][-1:]])
     # where two parts meet, both sides count
     seams = np.cumsum([len(part[0]) - 1 for part in parts])[:-1]
     permitted[seams] = np.minimum(permitted[seams], [part[1][-1] for part in parts[:-1]])
-    return s, permitted * (1 - KEPT_BACK), np.concatenate([part[2] for part in parts])
+    return s, permitted * (1 - SETTINGS.speed_error), np.concatenate([part[2] for part in parts])
 
 
 def _refined(
@@ -83,10 +65,10 @@ def _refined(
 
     permitted = most(s)
     inner = bounds[1:]
-    before = inner - np.minimum(JUST_BEFORE * path.length, np.diff(bounds) / 2)
+    before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(bounds) / 2)
     at = np.searchsorted(s, inner)
     permitted[at] = np.minimum(most(before), permitted[at])
-    for _ in range(HALVINGS):
+    for _ in range(SETTINGS.curve_halvings):
         asked = of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)]
         cut = np.flatnonzero(_coarse(path.length, s, permitted, asked, limits.acceleration))
         if not cut.size:
@@ -106,14 +88,14 @@ def _coarse(length: float, s: Array, permitted: Array, asked: Array, acceleratio
     within = np.minimum.accumulate(permitted**2 - gain) + gain
     within = np.minimum.accumulate((within + gain)[::-1])[::-1] - gain
     within = np.sqrt(np.maximum(within[:-1], within[1:]))
-    matters = (low < 1.1 * np.minimum(asked, within)) & (np.diff(s) > SMALLEST_INTERVAL * length)
+    matters = (low < 1.1 * np.minimum(asked, within)) & (np.diff(s) > ROUNDING_SHARE * length)
     value = np.log(np.minimum(permitted, 2 * asked.max()))
     step, slope = np.diff(s), np.diff(value) / np.diff(s)
     bend, least = np.zeros(len(s)), np.zeros(len(s), dtype=bool)
     bend[1:-1] = 2 * np.abs(np.diff(slope)) / (step[:-1] + step[1:])
     least[1:-1] = (slope[:-1] <= 0) & (slope[1:] >= 0) & (bend[1:-1] > 0)
     error = np.where(least[:-1] | least[1:], step**2 / 8 * np.maximum(bend[:-1], bend[1:]), 0.0)
-    return np.asarray(matters & ((np.abs(np.diff(value)) > LARGEST_CHANGE) | (error > MINIMUM_ERROR)))
+    return np.asarray(matters & ((np.abs(np.diff(value)) > SETTINGS.speed_change) | (error > SETTINGS.speed_error)))
 
 
 def _zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
@@ -125,7 +107,7 @@ def _zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, thoroughly: bool) -> bool:
     """Lower speeds, in place, where a plan is faster than permitted; False when it is nowhere."""
-    here = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // PLACES + 1)])
+    here = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // SETTINGS.block + 1)])
     top = np.maximum(here[:-1], here[1:])
     peaks = profile.peaks()
     np.maximum.at(top, piece_of(s, peaks.distance), peaks.speed)
@@ -143,7 +125,7 @@ def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, th
     here = most[inside]
     least = np.minimum.reduceat(here, starts)
     slowest = np.minimum.reduceat(np.where(here == least[run], inside, len(most)), starts)
-    apart = np.concatenate([[-1], inside[here > SPREAD * least[run]], [len(most)]])
+    apart = np.concatenate([[-1], inside[here > SETTINGS.spread * least[run]], [len(most)]])
     after = np.searchsorted(apart, slowest)
     near = (inside > apart[after - 1][run]) & (inside < apart[after][run])
     speed[inside[near]] = np.minimum(speed[inside[near]], least[run[near]])

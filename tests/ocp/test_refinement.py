@@ -27,7 +27,7 @@ from ocp import (
     refinement,
     solve,
 )
-from ocp.refinement import MOST_PIECES, split
+from ocp.refinement import SETTINGS, split
 from tests.ocp.problems import (
     SWING,
     LogarithmicRegulator,
@@ -452,7 +452,7 @@ def test_the_cost_that_is_lost_falls_with_twice_the_order_of_the_controls(method
     """
     past = refined(method).refinement
     assert past is not None
-    assert past.intervals[1] == MOST_PIECES * past.intervals[0]
+    assert past.intervals[1] == SETTINGS.pieces * past.intervals[0]
     assert order(1 / np.array(past.intervals[:2]), np.array(past.errors["cost"][:2])) > least
 
 

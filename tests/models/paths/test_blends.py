@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -223,8 +224,8 @@ def test_no_blends_cross(seed: int, exponent: float) -> None:
 def test_corners_in_parts_are_rounded_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     path = random_path(np.random.default_rng(11), 12, arcs=0.3, helices=0.4)
     whole = smooth(path, deviation=1e-3)
-    monkeypatch.setattr(rounding, "CORNERS_AT_ONCE", 2)
-    monkeypatch.setattr(shape_factor, "AT_ONCE", 2)
+    monkeypatch.setattr(rounding, "SETTINGS", replace(rounding.SETTINGS, block=2))
+    monkeypatch.setattr(shape_factor, "SEARCH", replace(shape_factor.SEARCH, block=2))
     parts = smooth(path, deviation=1e-3)
     assert parts.remaining == pytest.approx(whole.remaining, rel=1e-9)
     assert parts.shape == pytest.approx(whole.shape, rel=1e-9)

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from ocp.schedule import LineLimits, schedule
 from ocp.schedule.grid import make_grid
 from ocp.schedule.profile import LineMotion, through
-from ocp.schedule.program import ALIKE, Program, Spline, SplineRows, _Rows, least_time
+from ocp.schedule.program import INTERIOR, Program, Spline, SplineRows, _Rows, least_time
 from ocp.schedule.rows import rows_at
+from ocp.schedule.settings import SETTINGS
 from ocp.schedule.stretch import _jerk_of
-from ocp.schedule.window import ROOM, Stretch, Window, demanded, profile_of
+from ocp.schedule.window import Stretch, Window, demanded, profile_of
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
 
@@ -76,7 +77,7 @@ def test_steps_keep_what_is_positive_so(seed: int, count: int, share: float, of_
     assert gone.max() <= 1 + 1e-12
     assert steps.max() <= 1
     assert steps.min() == pytest.approx(1 / max(1.0, float((-rates / most).max())))
-    assert np.abs(np.diff(steps)).max(initial=0.0) <= 1 / ALIKE
+    assert np.abs(np.diff(steps)).max(initial=0.0) <= 1 / INTERIOR.block
 
 
 @settings(max_examples=40)
@@ -175,5 +176,5 @@ def test_what_is_demanded_is_what_dense_samples_demand() -> None:
         near = most > 0.9
         assert near.sum() > 50
         # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
-        assert (side - most)[near].min() > -2 * ROOM
-        assert (side - most)[side > 1 - 2 * ROOM].max() < 2 * ROOM
+        assert (side - most)[near].min() > -2 * SETTINGS.room
+        assert (side - most)[side > 1 - 2 * SETTINGS.room].max() < 2 * SETTINGS.room

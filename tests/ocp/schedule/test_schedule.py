@@ -27,6 +27,7 @@ from ocp.schedule import (
     schedule,
     zones,
 )
+from ocp.schedule.settings import SETTINGS
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 
@@ -346,7 +347,7 @@ def test_about_the_slowest_place_of_each_run_a_stretch_gets_its_speed(seed: int,
         if k == first + most[first : last + 1].argmin():
             for way in (range(k, first - 1, -1), range(k, last + 1)):
                 for at in way:
-                    if most[at] > zones.SPREAD * most[k]:
+                    if most[at] > SETTINGS.spread * most[k]:
                         break
                     expected[at] = min(speed[at], most[k])
     assert zones._lowered(s, permitted, speed, even, False) == fast.any()
