@@ -228,7 +228,7 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _simple(self) -> Any:
-        """Function (target, previous, best) -> (best, seen) of the simple ends and of the stationary points of I1."""
+        """Function (target, previous, best) -> (best, seen) of the simple ends and the stationary points of I1."""
         target, previous = _given(ca.SX)
         first = ca.SX.sym("best", BEST_SIZE)
         points = simple_ends(self.rig, target, self.branch)

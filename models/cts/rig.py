@@ -301,7 +301,7 @@ def joints_of(rig: Rig, target: Expression, roll: Expression, posture: RigPostur
     """Joint positions of a posture, each in the turn nearest to the middle of its limits. Shape (6, 1)."""
     q2 = ca.atan2(posture.sin2, posture.cos2)
     q4 = ca.atan2(posture.sin4, posture.cos4)
-    angles = [q2, target[3] - q2 - q4, target[4] - q4 + np.pi / 2]
+    angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]
     for k, angle in enumerate(angles):
         if np.isfinite(rig.limit(k + 2, False)):
             angles[k] = in_nearest_turn(angle, rig.middle_and_half(k + 2)[0])
