@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass
+from threading import Thread
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +45,28 @@ class Hull:
 def convex_hull(points: Array) -> Hull:
     """Return the convex hull of points, by qhull (Barber, Dobkin & Huhdanpaa 1996).
 
+    Qhull takes seconds for some hundred thousand corners and hears nothing meanwhile. It works in a thread of its own,
+    so that Ctrl-C ends the wait for it at once.
+
     Args:
         points: Shape (n, 3), m.
 
     Raises:
         ModelError: Points in a plane, on a line, at one place.
     """
+    hull: Future[Hull] = Future()
+
+    def compute() -> None:
+        try:
+            hull.set_result(_convex_hull(points))
+        except Exception as error:
+            hull.set_exception(error)
+
+    Thread(target=compute, daemon=True).start()
+    return hull.result()
+
+
+def _convex_hull(points: Array) -> Hull:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     size = float(np.abs(points - middle).max()) or 1.0
     centred = (points - middle) / size

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import ModelError
+from models.shapes import hull as hull_module
 from models.shapes.hull import convex_hull
 
 CUBE = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
@@ -71,3 +76,20 @@ def test_points_without_a_volume_are_refused(rank: int) -> None:
     with pytest.raises(ModelError, match="lie in a plane") as caught:
         convex_hull(flat)
     assert (caught.value.name, caught.value.value) == ("vertices", 40)
+
+
+def test_ctrl_c_ends_the_wait_for_a_hull_that_is_still_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Event()
+
+    def endless(points: np.ndarray) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        ended.wait()
+
+    monkeypatch.setattr(hull_module, "_convex_hull", endless)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            convex_hull(CUBE)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        ended.set()
