@@ -8,17 +8,22 @@ from typing import NamedTuple
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 BLOCK = re.compile(r"(?P<before>[^\n]*)\n```(?P<kind>\w*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
+EXTRAS = re.compile(r'`pip install "\.\[([\w,]+)\]"`')
 NAMED = re.compile(r"`([\w.]+\.(?:py|toml))`")
 MADE = "make "
 """Commands of a clone, which have tests of their own."""
 
 
 class Step(NamedTuple):
-    """A file to write, or the words of a program to run; what it says of how it ends is its status 0."""
+    """A file to write, or the words of a program to run; what it says of how it ends is its status 0.
+
+    ``extras``: What the line before the block says that it needs beside `pip install .`, with commas.
+    """
 
     file: str
     text: str
     words: tuple[str, ...]
+    extras: str = ""
 
 
 def steps() -> list[Step]:
@@ -28,7 +33,7 @@ def steps() -> list[Step]:
     """
     found = []
     for block in BLOCK.finditer(README.read_text(encoding="utf-8")):
-        text, name = block["text"], NAMED.search(block["before"])
+        text, name, extras = block["text"], NAMED.search(block["before"]), EXTRAS.search(block["before"])
         if text.startswith(MADE):
             continue
         if text.startswith("selfmotion "):
@@ -38,5 +43,5 @@ def steps() -> list[Step]:
         if file == "places.py":
             assert text.count("range(100)") == 2
             text = text.replace("range(100)", "range(1)")
-        found.append(Step(file, text, ("python", file) if file.endswith(".py") else ()))
+        found.append(Step(file, text, ("python", file) if file.endswith(".py") else (), extras[1] if extras else ""))
     return found

@@ -84,10 +84,12 @@ metadata.MetadataPathFinder.find_distributions = lambda *context: (
 """Of an environment without extras: modules and distributions that the package's own dependencies do not bring."""
 
 
-def core() -> set[str]:
-    """The distributions that `pip install .` brings, by their normal names."""
-    told = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    found, waiting = set[str](), list(told["project"]["dependencies"])
+def distributions(extras: str) -> set[str]:
+    """What `pip install .` brings, with extras that commas part, by the normal names of the distributions."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    found, waiting = set[str](), list(project["dependencies"])
+    for extra in filter(None, extras.split(",")):
+        waiting += project["optional-dependencies"][extra]
     while waiting:
         words = re.match(r"([\w.-]+)([^;]*)(;.*)?", waiting.pop())
         assert words is not None
@@ -103,43 +105,51 @@ def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_the_readme_runs_from_first_to_last_without_extras(tmp_path: Path) -> None:
-    """In a folder that is empty, with what `pip install .` installs alone, in processes of their own."""
-    kept = core()
-    own = {"models", "ocp"}
-    for one in metadata.distributions():
-        if normal(one.metadata["Name"]) in kept:
-            own |= {file.parts[0].partition(".")[0] for file in one.files or ()}
-    installed = [place for place in sys.path if Path(place).name == "site-packages"]
-    hidden = sorted({module.name for module in pkgutil.iter_modules(installed)} - own)
-    lost = [one.metadata["Name"] for one in metadata.distributions() if normal(one.metadata["Name"]) not in kept]
-    assert {"pinocchio", "coal", "yaml", "distributed", "pyarrow", "mcap"} <= set(hidden)
+def test_the_readme_runs_from_first_to_last_with_what_it_says_that_it_needs(tmp_path: Path) -> None:
+    """In a folder that is empty, in processes of their own: without extras but those that a block is said to need."""
     (tmp_path / "hiding").mkdir()
     (tmp_path / "hiding" / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
     home = tmp_path / "home"
     home.mkdir()
     there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "hiding"), str(ROOT)]), "MPLBACKEND": "Agg"}
-    there["HIDDEN"] = json.dumps([hidden, lost])
     command = [sys.executable, "-c", "import sys; from ocp.app.command import main; sys.exit(main(sys.argv[1:]))"]
     programs = {"python": [sys.executable], "selfmotion": command}
 
-    def run(*words: str) -> subprocess.CompletedProcess[str]:
-        program = [*programs[words[0]], *words[1:]]
-        return subprocess.run(program, cwd=home, env=there, capture_output=True, text=True, check=False)
+    def run(extras: str, *words: str) -> subprocess.CompletedProcess[str]:
+        program, hidden = [*programs[words[0]], *words[1:]], json.dumps(missing(extras))
+        environment = {**there, "HIDDEN": hidden}
+        return subprocess.run(program, cwd=home, env=environment, capture_output=True, text=True, check=False)
 
+    assert {"pinocchio", "coal", "yaml", "distributed", "pyarrow", "mcap"} <= set(missing("")[0])
     for gone in ("import coal", "from importlib.metadata import files; files('example-robot-data')"):
-        told = run("python", "-c", gone)
+        told = run("", "python", "-c", gone)
         assert "ModuleNotFoundError" in told.stderr or "PackageNotFoundError" in told.stderr, told
     for step in steps():
         if step.file:
             (home / step.file).write_text(step.text, encoding="utf-8")
+        if step.extras:
+            told = run("", *step.words)
+            assert f"selfmotion[{step.extras}]" in told.stderr, (step.words, told.stdout, told.stderr)
         if step.words:
-            told = run(*step.words)
+            told = run(step.extras, *step.words)
             assert told.returncode == 0, (step.words, told.stdout, told.stderr)
     rows = list(csv.DictReader((home / "places.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["status"] for row in rows] == ["done"]
     made = {path.name for path in home.iterdir()}
     assert {"plan.csv", "six_axis.urdf", "seam.npz", "seam.html", "report.html", "places"} <= made
+
+
+def missing(extras: str) -> tuple[list[str], list[str]]:
+    """Modules and distributions that are installed here and are not brought by the package with these extras."""
+    kept, own = distributions(extras), {"models", "ocp"}
+    for one in metadata.distributions():
+        if normal(one.metadata["Name"]) in kept:
+            own |= {file.parts[0].partition(".")[0] for file in one.files or ()}
+    installed = [place for place in sys.path if Path(place).name == "site-packages"]
+    hidden = sorted({module.name for module in pkgutil.iter_modules(installed)} - own)
+    return hidden, [
+        one.metadata["Name"] for one in metadata.distributions() if normal(one.metadata["Name"]) not in kept
+    ]
 
 
 def test_the_readme_shows_what_its_text_says_it_does() -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = "completion,gallery,mcap,yaml"
+EXTRAS = "completion,gallery,mcap,meshes,yaml"
 PATIENCE = 1200
 """s, for any one command."""
 ROBOT = """
@@ -116,13 +116,16 @@ def main() -> int:
 
 
 def read_on(folder: Path, wheel: Path) -> list[str]:
-    """Do what the README says, in an environment without extras and a folder that is empty; what did not hold."""
+    """Do what the README says, with the extras that it names alone, in a folder that is empty; what did not hold."""
     venv.create(folder / "core", with_pip=True)
     user = User(folder / "reader", folder / "core" / "bin")
     user.home.mkdir()
     done = user.run("python", "-m", "pip", "install", "--quiet", str(wheel))
     user.holds(f"pip install {wheel.name}, without extras", done.returncode == 0, done.stderr)
     for step in steps():
+        if step.extras:
+            done = user.run("python", "-m", "pip", "install", "--quiet", f"{wheel}[{step.extras}]")
+            user.holds(f"pip install {wheel.name}[{step.extras}]", done.returncode == 0, done.stderr)
         if step.file:
             (user.home / step.file).write_text(step.text, encoding="utf-8")
         if step.words:
