@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import minimize
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
 from models.cache import keep, kept, key_of, version_of
@@ -34,9 +35,10 @@ GROWTH = 1e-9
 THINNEST = 1e-6
 """Share of the mesh's size that a box is thick at least."""
 DIRECTIONS, EXTREMES = 48, 256
-POPULATION, CHOSEN, GENERATIONS, LEARNING = 32, 8, 45, 0.4
 SPREAD = np.array([0.25, 0.25, 0.05, 0.05, 0.2])
+"""Of the first simplex of a search: slopes, places across as a share of the mesh's size, root of the excess radius."""
 FATTER = np.array([1.0, 1.02, 1.06, 1.15, 1.3])
+"""Radii at which searches may begin, of that of the cylinder around all."""
 SIFTED = 1500
 """Triangles that cuts are tried on: the largest, and the corners that are farthest out."""
 GRID = 6000  # points, of which those in a cover tell its volume
@@ -127,55 +129,27 @@ def inside(shape: Covering, points: Array) -> Array:
 
 
 def _capsule(points: Array) -> Capsule:
-    """The capsule of least volume around points, as far as the search finds it.
-
-    Only points that are farthest in some direction count at first, and then those that were left outside.
-    """
+    """The capsule of least volume around points, as far as the search finds it; those farthest out tell it."""
     frame = _principal(points)
     few = points[_farthest(points, frame)]
-    best = _searched(few, frame)
-    for _ in range(3):
-        outside = inside(best, points)
-        worst = np.argsort(outside, kind="stable")[-16:]
-        if outside[worst[-1]] <= 1e-7:
-            break
-        few = np.concatenate([few, points[worst]])
-        best = _searched(few, frame)
-    return _grown(best, points)
-
-
-def _searched(points: Array, frame: Array) -> Capsule:
-    """Axes all around, the best of them varied in direction, place and radius."""
     bases = _bases(np.concatenate([frame.T, _sphere(DIRECTIONS, half=True) @ frame.T]))
-    volumes, centres, excess = _quick(points, bases)
-    found: list[tuple[float, Array, Array]] = []
+    volumes, centres, excess = _quick(few, bases)
+    found = []
     for k in np.argsort(volumes, kind="stable")[:2]:
-        start = np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
-        found.append((*_evolved(points @ bases[k], start, SPREAD), bases[k]))
-    _, best, basis = min(found, key=lambda each: each[0])
-    _, best = _evolved(points @ basis, best, SPREAD / 12)
-    return _capsule_of(_measured(points @ basis, best[None]), basis)
-
-
-def _evolved(points: Array, start: Array, spread: Array) -> tuple[float, Array]:
-    """Volume and parameters after an evolution strategy that learns the covariance of what succeeds; seeded."""
-    rng = np.random.default_rng(0)
-    mean, covariance = start, np.diag(spread**2)
-    best, least = start, float(_measured(points, start[None])[0][0])
-    weights = np.log(CHOSEN + 0.5) - np.log(np.arange(1, CHOSEN + 1))
-    weights /= weights.sum()
-    for _ in range(GENERATIONS):
-        root = np.linalg.cholesky(covariance + 1e-18 * np.eye(len(start)))
-        tried = mean + rng.normal(size=(POPULATION, len(start))) @ root.T
-        tried[0] = best
-        volumes = _measured(points, tried)[0]
-        order = np.argsort(volumes, kind="stable")[:CHOSEN]
-        if volumes[order[0]] < least:
-            least, best = float(volumes[order[0]]), tried[order[0]]
-        steps = tried[order] - mean
-        covariance = (1 - LEARNING) * covariance + LEARNING * (steps.T * weights) @ steps
-        mean = mean + weights @ steps
-    return least, best
+        own, start = few @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
+        result = minimize(
+            lambda x, own=own: float(_measured(own, x[None])[0][0]),
+            start,
+            method="Nelder-Mead",
+            options={
+                "initial_simplex": start + np.vstack([np.zeros(5), np.diag(SPREAD)]),
+                "xatol": 2e-3,
+                "fatol": 2e-4 * float(volumes[k]),
+            },
+        )
+        found.append((float(result.fun), int(k), result.x))
+    _, k, best = min(found, key=lambda each: each[:2])
+    return _grown(_capsule_of(few, best, bases[k]), points)
 
 
 def _measured(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
@@ -229,11 +203,11 @@ def _quick_capsule(points: Array, bases: Array) -> Capsule:
     volumes, centres, excess = _quick(points, bases)
     k = int(volumes.argmin())
     start = np.array([[0.0, 0.0, *centres[k], np.sqrt(excess[k])]])
-    return _capsule_of(_measured(points @ bases[k], start), bases[k])
+    return _capsule_of(points, start[0], bases[k])
 
 
-def _capsule_of(measured: tuple[Array, ...], basis: Array) -> Capsule:
-    _, radius, low, high, axis, place = (each[0] for each in measured)
+def _capsule_of(points: Array, parameters: Array, basis: Array) -> Capsule:
+    _, radius, low, high, axis, place = (each[0] for each in _measured(points @ basis, parameters[None]))
     return Capsule(float(radius) + GROWTH, basis @ (place + low * axis), basis @ (place + high * axis))
 
 
