@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_flag, checked_indices, checked_nonnegative
+from models.arrays import Array, checked_flag, checked_indices, checked_nonnegative
 from models.errors import ModelError
+from models.input_files import INPUT_LIMITS
 from models.machines.machine import Machine
 from models.machines.moving import Moving
 from models.machines.pair_gradients import WORLD, Placed, distance_gradients
@@ -403,9 +404,9 @@ def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tupl
 
 
 def _listed(values: Any, what: str) -> tuple[Any, ...]:
-    if not isinstance(values, list | tuple) or len(values) > MOST:
-        message = f"surroundings: {what} must be a list of at most {MOST}, not {repr(values)[:80]}"
-        raise ModelError(message, name=what, value=values, limit=MOST)
+    if not isinstance(values, list | tuple) or len(values) > INPUT_LIMITS.count:
+        message = f"surroundings: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
+        raise ModelError(message, name=what, value=values, limit=INPUT_LIMITS.count)
     return tuple(values)
 
 

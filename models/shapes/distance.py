@@ -20,8 +20,9 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_array, checked_instance, checked_nonnegative, checked_number
+from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
 from models.errors import ModelError
+from models.input_files import INPUT_LIMITS
 from models.shapes.cores import (
     Block,
     Hold,
@@ -230,9 +231,9 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     Raises:
         ModelError: No value, or a width that is not positive.
     """
-    if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST:
-        message = f"soft_minimum of no values, or not of a list of at most {MOST}: {repr(values)[:80]}"
-        raise ModelError(message, name="values", value=values, limit=MOST)
+    if not isinstance(values, list | tuple) or not 0 < len(values) <= INPUT_LIMITS.count:
+        message = f"soft_minimum of no values, or not of a list of at most {INPUT_LIMITS.count}: {repr(values)[:80]}"
+        raise ModelError(message, name="values", value=values, limit=INPUT_LIMITS.count)
     checked_number(width, "soft_minimum", "width", positive=True)
     for value in values:
         if not isinstance(value, ca.SX | ca.MX | ca.DM):

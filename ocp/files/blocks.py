@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from models.input_files import INPUT_LIMITS
 from ocp.files.lines import FileName, wrong_line
 
 __all__ = ["Block", "blocks"]
@@ -22,7 +23,6 @@ CHECKSUM = re.compile(r"\*\d+$")
 EXPONENT = re.compile(r"[\d.]E[+-]?\d+(?![\d.])", re.IGNORECASE)
 CONTROL, PROGRAM_NUMBER = re.compile(r"(N\d+)?O[\d<]"), re.compile(r"(N\d+)?O\d+")
 NOT_RUN = "O-words (subroutines, loops, conditions) are not run; post the program without them"
-LONGEST_NUMBER = 32  # characters
 
 
 class Block(NamedTuple):
@@ -83,8 +83,9 @@ def blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
             elif letter != "N":
                 if letter in values:
                     raise wrong_line(file, number, text, f"{letter} stands twice in one line; leave one")
-                if len(value) > LONGEST_NUMBER:
-                    raise wrong_line(file, number, text, f"{letter} has more than {LONGEST_NUMBER} digits")
+                if len(value) > INPUT_LIMITS.number_characters:
+                    why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
+                    raise wrong_line(file, number, text, why)
                 values[letter] = float(value)
         if codes or values:
             yield Block(number, text, tuple(codes), values, skipped)
