@@ -22,8 +22,6 @@ from ocp.tasks.limits import JointBounds
 __all__ = ["ORDERS", "Row", "floating_torques", "limit_rows", "states_along", "torque_rows"]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
-PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of a piece, where torques are looked at."""
 
 
 @dataclass(frozen=True)
@@ -210,8 +208,9 @@ def states_along(motion: Motion) -> tuple[Array, Array, Array, Array]:
         left, right = h[:-1, None], h[1:, None]
         v = (slope[:-1] * right + slope[1:] * left) / (left + right)
         return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
-    piece = np.repeat(np.arange(len(h)), len(PLACES))
-    place = np.tile(PLACES, len(h))
+    places = np.linspace(0.0, 1.0, 5)
+    piece = np.repeat(np.arange(len(h)), len(places))
+    place = np.tile(places, len(h))
     q, v, a = (one.within(piece, place) for one in (motion.position, motion.velocity, motion.acceleration))
     least = np.broadcast_to(motion.needed("acceleration")[0], (len(h), a.shape[1]))[piece]
     return t[piece] + place * h[piece], q, v, np.clip(a, -least, least)

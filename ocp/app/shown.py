@@ -32,16 +32,43 @@ from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, in_order_of
 from ocp.tasks.targets import Target
 
-__all__ = ["Near", "Shown", "shown_local", "shown_plan", "shown_solution", "shown_trajectory"]
+__all__ = [
+    "PAGE_SETTINGS",
+    "Near",
+    "PageSettings",
+    "Shown",
+    "shown_local",
+    "shown_plan",
+    "shown_solution",
+    "shown_trajectory",
+]
 
-PER_SECOND, LEAST, MOST = 50, 200, 600
-"""Times at which a motion is sampled."""
-SAME = 1e-3
-"""Relative: costs that end nearer to each other are told once."""
 FOOT = "zero moment point"
 """What problems of standing machines call the constraint that keeps it in the foot."""
-LOOKS = 161
-"""Times at which the nearest bodies are looked for."""
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """How finely a page shows a motion.
+
+    Attributes:
+        per_second, least, most: Times at which a motion is sampled.
+        poses: Of them those at which poses are told, at most; between them they are interpolated.
+        near: Times at which the nearest bodies are looked for, which takes longer.
+        same_cost: Relative: costs that end nearer to each other are told once.
+        most_bytes: Of a page.
+    """
+
+    per_second: int = 50
+    least: int = 200
+    most: int = 600
+    poses: int = 301
+    near: int = 161
+    same_cost: float = 1e-3
+    most_bytes: int = 8_000_000
+
+
+PAGE_SETTINGS = PageSettings()
 
 
 class Near(NamedTuple):
@@ -162,7 +189,7 @@ def shown_solution(
     about: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
     about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
-        looks = np.linspace(0.0, solution.horizon, LOOKS)
+        looks = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
         about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
     smooth = _torque_like(solution, joints)
     told = _told(solution, fractions, times)
@@ -238,7 +265,9 @@ def _shown(
     effort = so_far(t, (rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "half the squared joint rates, so far", "", effort)]
     own = [one for one in told if one.group == "Cost"]
-    curves += [one for one in own if abs(one.values[-1] - effort[-1]) > SAME * max(abs(effort[-1]), 1e-12)]
+    curves += [
+        one for one in own if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
+    ]
     curves += machine_curves(machine, base, joints, rates, base_rates)
     near = about.get("near")
     if near is not None:
@@ -254,7 +283,7 @@ def _shown(
 
 
 def _times(horizon: float) -> Array:
-    count = int(np.clip(np.ceil(PER_SECOND * horizon), LEAST, MOST))
+    count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
     return np.linspace(0.0, horizon, count + 1)
 
 
@@ -318,7 +347,7 @@ def _near(plan: Plan) -> Near | None:
     problem = plan.solution.problem
     if problem is None:
         return None
-    looks = np.linspace(0.0, plan.horizon, LOOKS)
+    looks = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
     found = []
     for suffix, times in looks_of(plan, looks):
         found += nearest_along(problem, plan.solution, times, suffix)

@@ -11,6 +11,7 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, Support, Surroundings, footprint
 from models.arrays import Array, ArrayInput
+from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
 from ocp.app.bases import floating_base, momentum_rows, standing_rows
@@ -41,8 +42,6 @@ __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_tra
 BaseKind: TypeAlias = Literal["fixed", "standing", "floating"]
 Limit: TypeAlias = float | Mapping[str, float] | None
 """One number for all joints, or numbers by name; "" is the name of all others. None: the robot's own."""
-
-GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False)
