@@ -18,6 +18,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
+ROUNDING = 1e-9
+"""Share of the largest of its kind, or m or rad, below which a difference is rounding, after many operations."""
 MAX_LISTED = 12
 """Entries of a vector, or names, that a message lists."""
 

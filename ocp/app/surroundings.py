@@ -23,10 +23,6 @@ __all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]
 
 SHOWN = 20
 """Pairs that are named."""
-MOST_LOOKS = 1000
-"""Samples at which the beginning of a touch is looked for."""
-BETWEEN = 4
-"""Places of every piece where the tip is looked at."""
 
 
 def within_limits(machine: Machine, motion: Motion) -> Machine:
@@ -114,7 +110,7 @@ def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) 
     if not faults:
         return []
     worst = np.array([fault.time for fault in faults])
-    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // MOST_LOOKS + 1], worst]))
+    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // 1000 + 1], worst]))
     base = around.machine.base_home()
     apart = distances_along(around, base, motion.position.at(times), times, around.clearance)
     columns = {f"{one} and {other}": k for k, (one, other) in enumerate(around.labels)}
@@ -172,8 +168,9 @@ def path_rows(
     base, q = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose = machine.tip_pose(base, q)
     sampler = Sampler([base, q], [pose.position, pose.rotation[:, 2]])
-    piece = np.repeat(np.arange(len(motion.t) - 1), BETWEEN)
-    place = np.tile(np.arange(BETWEEN) / BETWEEN, len(motion.t) - 1)
+    quarters = np.arange(4) / 4
+    piece = np.repeat(np.arange(len(motion.t) - 1), len(quarters))
+    place = np.tile(quarters, len(motion.t) - 1)
     times = np.append(motion.t[piece] + place * np.diff(motion.t)[piece], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
