@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.errors import ProblemError
-from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Along", "Indices", "Motion", "Pieces", "Rule", "half_digits", "highest"]
 
@@ -76,7 +75,7 @@ def highest(coefficients: Array) -> tuple[Array, Array]:
     """Greatest values of polynomials by their Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, place = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
-    enough = ROUNDING_SHARE * np.abs(coefficients).max(axis=1, initial=0.0)
+    enough = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below what any limit is known to
     owner = np.arange(len(coefficients))
     begin, width, part = np.zeros(len(owner)), 1.0, coefficients
     for _ in range(40):  # a part is then 1e-12 of its piece
