@@ -34,7 +34,7 @@ def test_numbers_stay_numbers(value: object) -> None:
 @pytest.mark.parametrize("name", ["=1+1", "+a", "-a", "@SUM(A1)", "%3D"])
 def test_a_trajectory_is_a_table_without_formulas(name: str, tmp_path: Path) -> None:
     values = np.array([[0.0], [-1.0]])
-    JointTrajectory((name,), [0.0, 1.0], values, values, values).write_csv(tmp_path / "a.csv")
+    JointTrajectory((name,), np.array([0.0, 1.0]), values, values, values).write_csv(tmp_path / "a.csv")
     with open(tmp_path / "a.csv", newline="") as stream:
         head, *rows = csv.reader(stream)
     assert all(text[0] not in SIGNS for text in head)
