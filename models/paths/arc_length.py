@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from models.errors import ModelError
 
-__all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
+__all__ = ["GAUSS_NODES", "GAUSS_WEIGHTS", "Cells", "arc_length", "cells", "gauss_rule", "parameter", "speed"]
 
 
-def _gauss_rule(count: int) -> tuple[Array, Array]:
+def gauss_rule(count: int) -> tuple[Array, Array]:
     """Nodes and weights of the rule of Gauss and Legendre on 0 to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 
 
-GAUSS_NODES, GAUSS_WEIGHTS = _gauss_rule(10)
+GAUSS_NODES, GAUSS_WEIGHTS = gauss_rule(10)
 MOST_STEPS = 4
 
 

@@ -24,7 +24,7 @@ from models.arrays import (
     checked_instance,
 )
 from models.errors import ModelError
-from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, speed
+from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
 from models.paths.orientation import orientation_function
 from models.paths.segments import screw_axes
 from models.paths.smooth_path import SmoothPath
@@ -205,10 +205,8 @@ def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
     u, step = state[1], steps[1]
     guess = _predicted(state, steps, rate(u))
     for number in nodes:
-        points, weights = np.polynomial.legendre.leggauss(number)
-        points, weights = (points + 1) / 2, weights / 2
         width = guess - u
-        mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(points, weights, strict=True))
+        mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
         guess = guess - (width * mean - step) / rate(guess)
     return ca.Function("gauss_newton", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 

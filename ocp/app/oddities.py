@@ -405,9 +405,8 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
                 words = f"times look like {unit}: velocities are {whole:.4g} times those of the positions over them"
-                faults.append(
-                    Fault("units", "time", f"{words}; what follows is of times in {unit}", None, value=float(whole))
-                )
+                words += f"; what follows is of times in {unit}"
+                faults.append(Fault("units", "time", words, value=float(whole)))
                 return t / power
     for k, ratio in ratios.items():
         near = next((words for factor, words in FACTORS.items() if abs(ratio / factor - 1) < 0.1), "")
@@ -415,9 +414,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         if np.isnan(ratio):
             words = "velocities are not those of its positions"
         else:
-            words = f"velocities are {ratio:.4g} times those of its positions" + (
-                f": they look like {near}" if near else ""
-            )
+            words = f"velocities are {ratio:.4g} times those of its positions" + (near and f": they look like {near}")
         text = f"{words}, most so at {t[at]:.6g} s: {told[at, k]:.4g} told, {by_positions[at, k]:.4g} by positions"
         kind = "units" if near else "velocities"
         found = float(told[at, k]), float(by_positions[at, k])
@@ -458,19 +455,9 @@ def _jumps(
             + (", a whole turn: it was wrapped, and this joint cannot turn on" if turn else "")
             + (f"; {len(where)} such steps, the first at {t[where[0]]:.6g} s" if len(where) > 1 else "")
         )
-        usual_step = float(abs(usual[worst]) * h[worst])
-        faults.append(
-            Fault(
-                "jump",
-                name,
-                words,
-                float(t[worst + 1]),
-                float(t[where[0] + 1]),
-                float(steps[worst, k]),
-                usual_step,
-                unit,
-            )
-        )
+        times = float(t[worst + 1]), float(t[where[0] + 1])
+        step, usual_step = float(steps[worst, k]), float(abs(usual[worst]) * h[worst])
+        faults.append(Fault("jump", name, words, *times, step, usual_step, unit))
 
 
 def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fault]) -> None:
@@ -487,8 +474,6 @@ def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fau
         k = int(np.nanargmax(off)) if np.isfinite(off).any() else 0
         room = 1e-3 * max(1e-3, float(np.nanmax(np.abs(told), initial=0.0)))
         if not off[k] <= room:
-            words = (
-                f"follows {leader} and is {off[k]:.4g} {joint.unit} from where that takes it at {raw.t[rows[k]]:.6g} s"
-            )
             time = float(raw.t[rows[k]])
+            words = f"follows {leader} and is {off[k]:.4g} {joint.unit} from where that takes it at {time:.6g} s"
             faults.append(Fault("follower", joint.name, words, time, time, float(off[k]), room, joint.unit))

@@ -1,4 +1,4 @@
-"""A motion as it is shown: a plan, a solution of a problem of one's own, a local motion or anybody's trajectory.
+"""A motion as it is shown: a plan, a solution of a problem of one's own or anybody's trajectory.
 
 Whatever it was made by, it is sampled once, with what is known of it: what was asked, limits, costs, the bodies that
 come nearest, the audit.
@@ -26,22 +26,12 @@ from ocp.audit.clearance import nearest_along
 from ocp.builders.tool_motion import CLOCK
 from ocp.errors import ProblemError, unknown_name
 from ocp.files import RawTrajectory
-from ocp.local.rates import LocalSolution
 from ocp.planning import Plan
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, in_order_of
 from ocp.tasks.targets import Target
 
-__all__ = [
-    "PAGE_SETTINGS",
-    "Near",
-    "PageSettings",
-    "Shown",
-    "shown_local",
-    "shown_plan",
-    "shown_solution",
-    "shown_trajectory",
-]
+__all__ = ["PAGE_SETTINGS", "Near", "PageSettings", "Shown", "shown_plan", "shown_solution", "shown_trajectory"]
 
 FOOT = "zero moment point"
 """What problems of standing machines call the constraint that keeps it in the foot."""
@@ -194,15 +184,6 @@ def shown_solution(
     smooth = _torque_like(solution, joints)
     told = _told(solution, fractions, times)
     return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
-
-
-def shown_local(local: LocalSolution, machine: Machine, name: str = "pseudo-inverse") -> Shown:
-    """A motion by instantaneous resolution."""
-    times = _times(float(local.t[-1]))
-    at = [local.at(time) for time in times]
-    base, joints, rates = (np.array([one[what] for one in at]) for what in ("base", "joints", "joint_rates"))
-    moves = _between(times, local.t, local.base_rates) if machine.base_size else base
-    return _shown(name, machine, times, base, joints, rates, None, moves, [])
 
 
 def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Shown:

@@ -87,10 +87,7 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         elif near.missed > CLEARANCE_TOLERANCE_M:
             verdict, note = "not decided", f"at least {near.least:.4g} m is proven"
         else:
-            verdict, note = (
-                "ok",
-                f"proven: at no time are any two nearer than {proven:.4g} m" if not faults else "proven",
-            )
+            verdict, note = "ok", "proven" + ("" if faults else f": at no time are any two nearer than {proven:.4g} m")
         rows.append(Row(f"clearance of {one} and {other}", near.distance, near.asked, "m", time, verdict, note))
         if verdict == "ok":
             break  # what is farther is proven as well, or told as not decided
@@ -134,18 +131,8 @@ def _sampled(around: Surroundings, motion: Motion, bases: Array) -> tuple[list[R
         one, other = around.labels[pair]
         value, time = float(apart[k, pair]), float(times[k])
         failed = value < around.clearance - CLEARANCE_TOLERANCE_M
-        note = "at samples and middles; not proven between them"
-        rows.append(
-            Row(
-                f"clearance of {one} and {other}",
-                value,
-                around.clearance,
-                "m",
-                time,
-                "FAILED" if failed else "ok",
-                note,
-            )
-        )
+        told = "FAILED" if failed else "ok", "at samples and middles; not proven between them"
+        rows.append(Row(f"clearance of {one} and {other}", value, around.clearance, "m", time, *told))
         if not failed:
             break
         how = f"overlap by {-value:.4g} m" if value < 0 else f"are {value:.4g} m apart"

@@ -39,14 +39,14 @@ from models import (
 )
 from models.arrays import Array
 from models.robot.kinematics import centers_of_mass
-from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
+from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, solve
 from ocp.app import appearance, main, serving
 from ocp.app.appearance import appearance_of
 from ocp.app.frames import frames_along
 from ocp.app.player import page, unpacked
 from ocp.app.quantities import Curve, footing_of
 from ocp.app.serving import Served
-from ocp.app.shown import PAGE_SETTINGS, shown_local, shown_plan, shown_solution, shown_trajectory
+from ocp.app.shown import PAGE_SETTINGS, shown_plan, shown_solution, shown_trajectory
 from ocp.files import read_trajectory
 from ocp.local.touching import distances_along
 from ocp.planning.motion import Part
@@ -395,7 +395,7 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     assert not rest.forces
 
 
-def test_solutions_local_motions_and_files_are_shown_as_plans_are(
+def test_solutions_and_files_are_shown_as_plans_are(
     plans: dict[str, Plan], machines: dict[str, Machine], tmp_path: Path
 ) -> None:
     for kind, plan in plans.items():
@@ -403,24 +403,18 @@ def test_solutions_local_motions_and_files_are_shown_as_plans_are(
         wanted = shown_plan(plan)
         plan.solution.save(tmp_path / "solution.npz")
         plan.write_csv(tmp_path / "motion.csv", 0.01)
-        local = resolve(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), START, 1.5)
         raw = read_trajectory(tmp_path / "motion.csv", joints=plan.names)
-        shown = [
-            shown_solution(Solution.load(tmp_path / "solution.npz"), machine),
-            shown_trajectory(raw, machine),
-            shown_local(local, machine),
-        ]
-        for one in shown[:2]:
+        shown = [shown_solution(Solution.load(tmp_path / "solution.npz"), machine), shown_trajectory(raw, machine)]
+        for one in shown:
             np.testing.assert_allclose(one.t, wanted.t, atol=1e-12)
             np.testing.assert_allclose(one.joints, wanted.joints, atol=1e-4)
             np.testing.assert_allclose(one.base, wanted.base, atol=1e-4)
         assert shown[0].verdict == wanted.verdict
         assert shown[0].passed is wanted.passed is True
         assert shown[1].passed is None
-        np.testing.assert_allclose(shown[2].joints[0], START)
-        told, _ = unpacked(page([wanted, *shown], title="four").text)
+        told, _ = unpacked(page([wanted, *shown], title="three").text)
         assert len(told["robots"]) == 1  # the same robot is held once
-        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0, 0]
+        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0]
     with pytest.raises(ProblemError, match="elbows"):
         shown_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
     with pytest.raises(ProblemError, match="base"):
