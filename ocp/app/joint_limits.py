@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import StrEnum
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -17,12 +18,30 @@ from models import FixedBase, FreeFloating, Robot, inverse_dynamics, simplified
 from models.arrays import Array
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Along, Indices, Motion, highest
+from ocp.audit.audit import Audit
 from ocp.problem.formulation import Sampler
 from ocp.tasks.limits import JointBounds
 
-__all__ = ["ORDERS", "Row", "floating_torques", "limit_rows", "states_along", "torque_rows"]
+__all__ = ["ORDERS", "Row", "RowVerdict", "floating_torques", "limit_rows", "rows_of", "states_along", "torque_rows"]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
+
+
+class RowVerdict(StrEnum):
+    """What is said of what was looked at."""
+
+    OK = "ok"
+    FAILED = "FAILED"
+    UNDECIDED = "not decided"
+    """The file has too few digits, or the proof went not far enough."""
+    UNLIMITED = "unlimited"
+    TOLD = "told"
+    """There is nothing to hold it against."""
+
+    @classmethod
+    def of(cls, failed: Any) -> RowVerdict:
+        """Of what is held against something."""
+        return cls.FAILED if failed else cls.OK
 
 
 @dataclass(frozen=True)
@@ -32,8 +51,7 @@ class Row:
     Attributes:
         name: What was looked at, of which joint or bodies.
         value: The worst found. limit: What it may be; None: nothing limits it. Both in `unit`; time: s.
-        verdict: "ok", "FAILED", "unlimited", "told" (nothing to hold it against) or "not decided" (the file has too few
-            digits to say).
+        verdict: What is said of it.
         note: How it was looked at, where that is not plain.
     """
 
@@ -42,7 +60,7 @@ class Row:
     limit: float | None
     unit: str
     time: float | None
-    verdict: str
+    verdict: RowVerdict
     note: str = ""
 
 
@@ -73,6 +91,15 @@ def limit_rows(
             rows.append(Row(f"{what} of {name}", *row, "; ".join(filter(None, (slight, note)))))
             faults += fault
     return rows, faults, unseen
+
+
+def rows_of(audit: Audit) -> list[Row]:
+    """The findings of an audit as rows of a table."""
+    verdicts = [RowVerdict.TOLD if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
+    return [
+        Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
+        for f, verdict in zip(audit.findings, verdicts, strict=True)
+    ]
 
 
 class _Side(NamedTuple):
@@ -118,21 +145,21 @@ class _Side(NamedTuple):
 
 def _looked(
     along: Along, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
-) -> tuple[tuple[float, float | None, str, float | None, str], str, list[Fault]]:
+) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
     """Value, limit, unit, time and verdict of a row, that it is slightly beyond, and the fault it is."""
     t, blur = along.pieces.t, np.asarray(along.blur)[:, column]
     room = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
     sides = [_Side.of(along, column, *one, room) for one in ((1.0, high), (-1.0, -low))]
     if not np.isfinite([low, high]).any():
         worst = max(sides, key=lambda side: float(side.values.max()))
-        return (worst.found, None, unit, worst.time, "unlimited"), "", []
+        return (worst.found, None, unit, worst.time, RowVerdict.UNLIMITED), "", []
     sides.sort(key=lambda side: side.excess, reverse=True)
     worst = sides[0]
     beyond = np.any([side.values > side.limit + room for side in sides], axis=0)
     sure = [side.values > side.limit + room + blur for side in sides]
     over = sure[0] | sure[1]
-    verdict = "FAILED" if over.any() else "not decided" if beyond.any() else "ok"
-    if verdict == "FAILED" and not sure[0].any():
+    verdict = RowVerdict.FAILED if over.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
+    if verdict is RowVerdict.FAILED and not sure[0].any():
         worst = sides[1]
     found, allowed, time = worst.found, worst.sign * worst.limit, worst.time
     row = found, allowed, unit, time, verdict
@@ -140,7 +167,7 @@ def _looked(
         slight = f"beyond, by less than the {100 * share:g} % allowed" if worst.excess > 0 else ""
         if any(side.eased for side in sides):
             slight = "the interpolant is beyond, which no motion through the samples needs"
-        return row, slight if verdict == "ok" else "", []
+        return row, slight if verdict is RowVerdict.OK else "", []
     starts = np.flatnonzero(over & ~np.concatenate([[False], over[:-1]]))
     first = float(t[starts[0]])
     between = ", between two samples" if along.closed and time not in t else ""
@@ -188,11 +215,11 @@ def torque_rows(
         unit, limit = robot.joint(name).effort_unit, float(bounds.torque[k])
         at = int(np.abs(found[:, k]).argmax())
         value, time = float(found[at, k]), float(times[at])
-        verdict = "unlimited"
+        verdict = RowVerdict.UNLIMITED
         if np.isfinite(limit):
             beyond = np.abs(found[:, k]) > limit * (1 + share)
             sure = beyond & (np.abs(found[:, k]) > limit * (1 + share) + blur[k])
-            verdict = "FAILED" if sure.any() else "not decided" if beyond.any() else "ok"
+            verdict = RowVerdict.FAILED if sure.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
             if sure.any():
                 first = float(times[np.flatnonzero(sure)[0]])
                 text = f"{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"

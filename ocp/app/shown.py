@@ -15,7 +15,7 @@ import numpy as np
 from models import FreeFloating, Machine, Standing
 from models.arrays import Array
 from ocp.app.bases import floating_base
-from ocp.app.joint_limits import Row
+from ocp.app.joint_limits import Row, rows_of
 from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.oddities import readable
 from ocp.app.plan_verdict import PlanVerdict, verdict_of
@@ -219,15 +219,6 @@ def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Sh
 def _between(times: Array, t: Array, values: Array) -> Array:
     """Columns of samples, straight between them."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
-
-
-def rows_of(audit: Any) -> list[Row]:
-    """The findings of an audit as rows of a table."""
-    words = {True: "ok", False: "FAILED"}
-    return [
-        Row(f.name, f.value, f.limit, f.unit, f.time, "told" if f.limit is None else words[bool(f.passed)], f.note)
-        for f in audit.findings
-    ]
 
 
 def _shown(

@@ -9,7 +9,7 @@ import numpy as np
 
 from models import Machine, Surroundings
 from models.arrays import Array
-from ocp.app.joint_limits import Row
+from ocp.app.joint_limits import Row, RowVerdict
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Motion
 from ocp.audit.clearance import Clearance
@@ -65,9 +65,10 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     """
     assumed = [f"{pair} ({why})" for pair, why in around.assumed.items()]
     left = f"left out by assumption: {', '.join(assumed)}"
-    told = [Row("pairs not looked at", len(assumed), None, "", None, "told", left)] if assumed else []
+    told = [Row("pairs not looked at", len(assumed), None, "", None, RowVerdict.TOLD, left)] if assumed else []
     if not len(around.pairs):
-        return [Row("clearance", np.inf, around.clearance, "m", None, "told", "no pairs that may touch"), *told], []
+        none = Row("clearance", np.inf, around.clearance, "m", None, RowVerdict.TOLD, "no pairs that may touch")
+        return [none, *told], []
     if bases is not None:
         rows, faults = _sampled(around, motion, bases)
         return [*rows, *told], faults
@@ -79,15 +80,16 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         one, other = near.bodies
         time = start + near.time
         if near.distance < near.asked - CLEARANCE_TOLERANCE_M:
-            verdict, note = "FAILED", "touching" if near.distance < 0 else "too near"
+            verdict, note = RowVerdict.FAILED, "touching" if near.distance < 0 else "too near"
             between = "" if np.isclose(motion.t, time, rtol=0, atol=1e-12).any() else ", between two samples"
             how = f"overlap by {-near.distance:.4g} m" if near.distance < 0 else f"are {near.distance:.4g} m apart"
             text = f"{how} at {time:.6g} s{between}, at least {near.asked:g} m asked"
             faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.asked, "m"))
         elif near.missed > CLEARANCE_TOLERANCE_M:
-            verdict, note = "not decided", f"at least {near.least:.4g} m is proven"
+            verdict, note = RowVerdict.UNDECIDED, f"at least {near.least:.4g} m is proven"
         else:
-            verdict, note = "ok", "proven" + ("" if faults else f": at no time are any two nearer than {proven:.4g} m")
+            least = "" if faults else f": at no time are any two nearer than {proven:.4g} m"
+            verdict, note = RowVerdict.OK, f"proven{least}"
         rows.append(Row(f"clearance of {one} and {other}", near.distance, near.asked, "m", time, verdict, note))
         if verdict == "ok":
             break  # what is farther is proven as well, or told as not decided
@@ -98,7 +100,7 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         touches = near.distance < near.asked - CLEARANCE_TOLERANCE_M
         if near.missed > CLEARANCE_TOLERANCE_M and not touches and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
-            rows.append(Row(name, near.distance, near.asked, "m", start + near.time, "not decided", note))
+            rows.append(Row(name, near.distance, near.asked, "m", start + near.time, RowVerdict.UNDECIDED, note))
     return [*rows, *told], faults
 
 
@@ -131,7 +133,7 @@ def _sampled(around: Surroundings, motion: Motion, bases: Array) -> tuple[list[R
         one, other = around.labels[pair]
         value, time = float(apart[k, pair]), float(times[k])
         failed = value < around.clearance - CLEARANCE_TOLERANCE_M
-        told = "FAILED" if failed else "ok", "at samples and middles; not proven between them"
+        told = RowVerdict.of(failed), "at samples and middles; not proven between them"
         rows.append(Row(f"clearance of {one} and {other}", value, around.clearance, "m", time, *told))
         if not failed:
             break
@@ -202,7 +204,7 @@ def path_rows(
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
     bounded = bool(np.isfinite(limit))
-    verdict = ("FAILED" if value > limit else "ok") if bounded else "told"
+    verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.TOLD
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
